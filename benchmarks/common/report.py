@@ -87,11 +87,6 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in [list(head), rule, *body])
 
 
-def fill(template: str, values: Mapping[str, Any]) -> str:
-    """The text with every {{name}} replaced; raises KeyError for a name that has no value."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: str(values[found[1]]), template)
-
-
 def number(value: float | None, digits: int = 3) -> str:
     """A few significant figures, without exponents from 0.001 to a million; None is empty."""
     if value is None:
@@ -172,7 +167,8 @@ def write_reports(
         plot(result, folder / "images")
         values = result["machine"] | {"minutes": f"{result['seconds'] / 60:.1f}"} | page(result)
         template = (ROOT / "benchmarks" / name / "page.md").read_text(encoding="utf-8")
-        write_text(folder / f"{name}.md", fill(template, values))
+        text = re.sub(r"\{\{(\w+)\}\}", lambda found: str(values[found[1]]), template)
+        write_text(folder / f"{name}.md", text)
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

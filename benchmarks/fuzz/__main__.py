@@ -33,15 +33,8 @@ def run_reader(name: str, seed: int, files: int) -> list[dict[str, Any]]:
     """The outcome of every file; a process that ended or hangs is followed by another at the next file."""
     found: list[dict[str, Any]] = []
     while len(found) < files:
-        command = [
-            sys.executable,
-            "-m",
-            "benchmarks.fuzz.worker",
-            name,
-            str(seed),
-            str(len(found)),
-            str(files),
-        ]
+        arguments = map(str, (name, seed, len(found), files))
+        command = [sys.executable, "-m", "benchmarks.fuzz.worker", *arguments]
         with tempfile.TemporaryFile() as errors:
             # Unbuffered: `select` sees the pipe, not what Python has read ahead.
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, bufsize=0)

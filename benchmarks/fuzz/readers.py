@@ -140,10 +140,6 @@ def pose_tables(folder: Path) -> list[bytes]:
     return files
 
 
-def read_pose_table(path: Path) -> list[Any]:
-    return [read_poses(path)]
-
-
 def point_files(folder: Path) -> list[bytes]:
     """Points with colours of 8 bits and of floats, binary and text."""
     head = "element vertex 3\n" + "".join(f"property float {c}\n" for c in "xyz")
@@ -168,10 +164,6 @@ def disparities(folder: Path) -> list[bytes]:
             Image.fromarray(np.ones((6, 8), dtype)).save(buffer, "TIFF", compression=compression)
             files.append(buffer.getvalue())
     return files
-
-
-def read_disparity(path: Path) -> list[Any]:
-    return [read_tiff(path)]
 
 
 SEED = 0
@@ -497,9 +489,9 @@ READERS = {
         _file("transforms", "json", _transforms, _read_transforms, "transforms_train.json"),
         Reader("colmap", "", colmap_files, read_colmap),
         _file("pickle", "", pickles, read_pickle, "0-camera.pkl"),
-        _file("llff", "", pose_tables, read_pose_table, "poses_bounds.npy"),
+        _file("llff", "", pose_tables, lambda path: [read_poses(path)], "poses_bounds.npy"),
         _file("points", "", point_files, read_point_file, "x.ply"),
-        _file("disparity", "", disparities, read_disparity, "x.tiff"),
+        _file("disparity", "", disparities, lambda path: [read_tiff(path)], "x.tiff"),
         # A method may extend one elsewhere: it is the user's own file.
         _file("method", "toml", _methods, _read_method, "x.toml", inside=False),
         _file("exr", "", _exr_files, lambda path: [read_exr_image(path)], "x.exr"),

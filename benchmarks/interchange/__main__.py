@@ -40,6 +40,8 @@ def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[
     from mi_refgs.formats.gaussians import gaussians
     from mi_refgs.reconstruction.provenance import Provenance
     from mi_refgs.render.display import display_image
+    from mi_refgs.render.pipeline import SurfelScene, render
+    from mi_refgs.shade.shading import Shading
 
     made = mi_refgs.load(run)
     trained = made.trained
@@ -53,13 +55,14 @@ def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[
             found["validator"] = programs.validated(glb, node)
         if "transform" in names:
             found["splat-transform"] = programs.transformed(ply, node)
-        table = gaussians(trained, shots, 3, False)
+        table = gaussians(trained, shots, 3, False)  # for our own splatter, by the formula of 3DGS
         view = trained.renderer(aovs=False)
         for index in views:
             camera = shots[index].camera
             frame = view(camera)
             ours = _image(display_image(list(frame.radiance), frame.alpha, [0.0] * 3), camera)
-            images = {"ours, same file": _blended(table, camera)}
+            ours_again = render(SurfelScene(table, Shading("surfel", "radiance")), camera).radiance
+            images = {"ours, same file": _image(ours_again, camera)}
             if "browser" in names:
                 images["Spark in Chromium"] = programs.in_browser(ply, camera, node)
             if "mitsuba" in names:
@@ -74,14 +77,6 @@ def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[
 def _image(planes: Any, camera: Any) -> np.ndarray:
     flat = np.stack([np.array(plane, dtype=np.float64) for plane in planes], axis=-1)
     return np.clip(flat, 0, 1).reshape(camera.height, camera.width, 3)
-
-
-def _blended(table: Any, camera: Any) -> np.ndarray:
-    """The formula of 3DGS, by our own splatter."""
-    from mi_refgs.render.pipeline import SurfelScene, render
-    from mi_refgs.shade.shading import Shading
-
-    return _image(render(SurfelScene(table, Shading("surfel", "radiance")), camera).radiance, camera)
 
 
 if __name__ == "__main__":

@@ -40,14 +40,9 @@ def cells(every: bool) -> list[tuple[str, int, int, int]]:
     ]
 
 
-def predicted(kind: str, size: int, samples: int, surfels: int) -> float:
-    """Bytes that the cell needs by `mi_refgs.kernels.memory`."""
-    return memory.of_image(size**2, samples, surfels, cell.CHANNELS[kind], kind == "gradient")
-
-
 def measured(kind: str, size: int, samples: int, surfels: int) -> dict[str, Any]:
     """Peak resident bytes and seconds of the cell's process; None for one that is left out or ends early."""
-    needed = predicted(kind, size, samples, surfels)
+    needed = memory.of_image(size**2, samples, surfels, cell.CHANNELS[kind], kind == "gradient")
     row: dict[str, Any] = {"kind": kind, "size": size, "samples": samples, "surfels": surfels}
     row |= {"predicted": needed, "measured": None, "seconds": None}
     if needed > LIMIT:

@@ -124,17 +124,13 @@ class Workload:
 
     def camera(self) -> Camera:
         """The splatter's."""
-        return device_camera(self.pinhole)
+        p = self.pinhole
+        return Camera.from_pose(p.width, p.height, p.fx, p.fy, p.cx, p.cy, p.to_world, p.near)
 
     def weights(self, maps: int) -> np.ndarray:
         """Adjoints (maps, H·W) float32 of the maps: what a loss would send back."""
         rng = np.random.default_rng(1)
         return rng.normal(size=(maps, self.pixels)).astype(np.float32)
-
-
-def device_camera(p: PinholeCamera) -> Camera:
-    """The splatter's camera of the float64 reference's."""
-    return Camera.from_pose(p.width, p.height, p.fx, p.fy, p.cx, p.cy, p.to_world, p.near)
 
 
 def sphere(count: int, size: int, spread: float) -> Workload:

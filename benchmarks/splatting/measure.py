@@ -28,6 +28,7 @@ from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.measure import measure as measure_case
 from mi_refgs.constants import tile_size
+from mi_refgs.profiling.phases import phase_times
 from mi_refgs.profiling.profile import Counts, profile_stage
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.primitives.surfel import Surfel
@@ -156,7 +157,7 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         for count, size in shown(settings.errors, f"errors at {spread:g}")
     ]
     dr.flush_malloc_cache()
-    memory = [process.measure_memory(one) for one in shown(settings.memory, "memory")]
+    memory = [process.measure("memory", one) for one in shown(settings.memory, "memory")]
     result = {
         "settings": asdict(settings),
         "machine": report.machine(),
@@ -166,7 +167,7 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         "errors": wrong,
         "memory": memory,
         "memory_fit": plane(memory, "peak", MEMORY) if len(memory) > len(MEMORY) + 1 else None,
-        "large_step": process.measure_step(settings.large_step),
+        "large_step": process.measure("step", settings.large_step),
         "compile": process.measure_compile(settings.compiled),
         "step": step_times(*settings.step, settings.steps),
     }
@@ -223,7 +224,7 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
     launches = {kind: full.launches(getattr(full, kind)) for kind in ("forward", "both")}
     bound = lower_bound(counts, peaks["gflops"])
     moved = bytes_moved(counts, FEATURES)
-    phases = full.phases(min(PHASE_REPEATS, settings.repeats))
+    phases = phase_times(full.both, min(PHASE_REPEATS, settings.repeats))
     row: Row = {"case": workload.name, "spread": workload.spread, "surfels": count, "size": size}
     names = ("pixels", "covered", "pairs", "evaluated", "contributing")
     row |= {name: getattr(counts, name) for name in names}

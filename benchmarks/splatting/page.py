@@ -37,8 +37,11 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
         "phases": table([CASE, *PHASES], [[label(row), *map(number, _phases(row))] for row in rows]),
         "work": table([CASE, *WORK], [[label(row), *_work(row, peaks["gbytes"])] for row in rows]),
         "errors": table([CASE, *ERRORS], [[label(row), *_errors(row)] for row in result["errors"]]),
-        "memory": table([CASE, *SPACE], [[label(row), *_memory(row)] for row in result["memory"]]),
-        "compile": table(["kernel cache", *COMPILE], _compile(result["compile"])),
+        "memory": table(
+            [CASE, "listed pairs", "process, MiB", "Dr.Jit, MiB"],
+            [[label(row), *_memory(row)] for row in result["memory"]],
+        ),
+        "compile": table(["kernel cache", "forward, ms", "f. + backward, ms"], _compile(result["compile"])),
         "steps": _steps(result["step"]),
         "cost": _sum(result["cost"], "ms", 1, "ns", 1e6, COST),
         "peak": _sum(result["memory_fit"], "MiB", 1 / MIB, "B", 1, MEMORY),
@@ -108,14 +111,8 @@ def _errors(row: Row) -> list[str]:
     return [*(f"{x:.1e}" if x else "0" for x in found), percent(row["left_out"])]
 
 
-SPACE = ("listed pairs", "process, MiB", "Dr.Jit, MiB")
-
-
 def _memory(row: Row) -> list[str]:
     return [f"{row['pairs']:,}", f"{row['peak'] / MIB:.0f}", f"{row['allocated'] / MIB:.0f}"]
-
-
-COMPILE = ("forward, ms", "f. + backward, ms")
 
 
 def _compile(found: Row) -> list[list[str]]:

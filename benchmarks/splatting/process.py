@@ -28,20 +28,10 @@ TINY = (64, 16)
 """Surfels and pixels that compile a view's kernels, so that the compiler's own memory is not counted."""
 
 
-def measure_memory(case: tuple[int, int]) -> dict[str, Any]:
-    """Peak memory of forward and backward for a number of surfels and a size."""
-    return _run("memory", case)
-
-
-def measure_step(case: tuple[int, int]) -> dict[str, Any]:
-    """Peak memory and time of whole training steps."""
-    return _run("step", case)
-
-
 def measure_compile(case: tuple[int, int]) -> dict[str, Any]:
     """Milliseconds of the first forward and the first forward + backward: kernel cache empty, full, warm."""
     with tempfile.TemporaryDirectory() as folder:
-        cold, cached = (_run("compile", case, DRJIT_CACHE_DIR=folder) for _ in range(2))
+        cold, cached = (measure("compile", case, DRJIT_CACHE_DIR=folder) for _ in range(2))
     return {
         "surfels": case[0],
         "size": case[1],
@@ -51,7 +41,11 @@ def measure_compile(case: tuple[int, int]) -> dict[str, Any]:
     }
 
 
-def _run(task: str, case: tuple[int, int], **environment: str) -> dict[str, Any]:
+def measure(task: str, case: tuple[int, int], **environment: str) -> dict[str, Any]:
+    """Run a task in a fresh process, for a number of surfels and a size of the image.
+
+    memory: peak of forward and backward; step: peak and time of training steps; compile: first calls.
+    """
     command = [sys.executable, "-m", "benchmarks.splatting.process", task, *map(str, case)]
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True

@@ -13,7 +13,6 @@ from benchmarks.splatting.cases import COLOUR, Workload
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import listening, phase
-from mi_refgs.profiling.phases import phase_times
 from mi_refgs.profiling.profile import Counts, count
 from mi_refgs.reference.splat import PinholeCamera
 from mi_refgs.splat import Camera, Composited, list_by_tile, project, splat
@@ -66,10 +65,6 @@ class Ours:
         dr.enqueue(dr.ADMode.Backward, maps)
         dr.traverse(dr.ADMode.Backward)
         return [dr.grad(leaf) for leaf in leaves]
-
-    def phases(self, repeats: int) -> dict[str, float]:
-        """Median milliseconds of forward + backward by phase, between barriers."""
-        return phase_times(self.both, repeats)
 
     def counts(self) -> Counts:
         """The work of a view."""

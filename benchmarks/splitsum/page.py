@@ -19,11 +19,6 @@ PICTURE_METALLIC = 0.5
 """Plots of speed against error show this metal: half diffuse, half mirror."""
 
 
-def worst(rows: list[Row]) -> Row | None:
-    """The row of the largest relMSE."""
-    return max(rows, key=lambda row: float(row["relmse"]), default=None)
-
-
 def shown_relmse(row: Row) -> float:
     """relMSE, or the floor it hides below."""
     return float(max(row["relmse"], CLEAR * row["relmse_floor"]))
@@ -57,19 +52,11 @@ def view_bins(result: dict[str, Any]) -> list[str]:
     return sorted(names, key=lambda name: float(name.partition("-")[0]))
 
 
-def trust(result: dict[str, Any], light: str, roughness: float, view: str) -> Row | None:
-    """The split sum's worst case, over shapes and metals, for the finest light."""
-    return worst(
-        where(
-            result["rows"],
-            method="split_sum",
-            setting=best_height(result),
-            light=light,
-            roughness=roughness,
-            n_dot_v=view,
-            shape=convex(result),
-        )
-    )
+def trust(result: dict[str, Any], light: str, roughness: float, view: str = "all") -> Row | None:
+    """The split sum's row of the largest relMSE, over shapes and metals, for the finest light."""
+    chosen = {"method": "split_sum", "setting": best_height(result), "n_dot_v": view}
+    rows = where(result["rows"], light=light, roughness=roughness, shape=convex(result), **chosen)
+    return max(rows, key=lambda row: float(row["relmse"]), default=None)
 
 
 BUDGET_SHOWN = (0.1, 0.3, 0.8)
@@ -84,7 +71,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     slopes = [row["path_exponent"] for row in result["speed_ups"] if row["path_exponent"] is not None]
     varying = [name for name in names if result["frequencies"][name] > 0]
     ratios = [row["speed_up"] for row in where(result["speed_ups"], height=height, light=varying)]
-    worst = {light: [_trust(result, light, r) for r in s["roughness"]] for light in names}
+    worst = {light: [trust(result, light, r) for r in s["roughness"]] for light in names}
     clear = above_noise(budgets)
     return {
         "lights": table(
@@ -95,7 +82,9 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
         "metallic": ", ".join(f"{m:g}" for m in s["metallic"]),
         "trust": _by_roughness(result, ((f"`{x}`", worst[x]) for x in names), cell),
         "bias": _by_roughness(
-            result, ((f"`{x}`", [_bias(result, x, r) for r in s["roughness"]]) for x in names), _signed
+            result,
+            ((f"`{x}`", [_bias(result, x, r) for r in s["roughness"]]) for x in names),
+            lambda row: signed(row["bias"], CLEAR * row["bias_floor"]),
         ),
         "speed": _by_roughness(
             result,
@@ -149,20 +138,12 @@ def _by_roughness(
     return table(head, [[label, *map(show, cells)] for label, cells in cases])
 
 
-def _trust(result: dict[str, Any], light: str, roughness: float) -> Row | None:
-    return trust(result, light, roughness, "all")
-
-
 def _bias(result: dict[str, Any], light: str, roughness: float) -> Row:
     """The convex shape and metal of the largest bias, for the finest light."""
     chosen = {"method": "split_sum", "setting": best_height(result), "n_dot_v": "all"}
     shapes = convex(result)
     rows = where(result["rows"], light=light, roughness=roughness, shape=shapes, **chosen)
     return max(rows, key=lambda row: abs(float(row["bias"])))
-
-
-def _signed(row: Row) -> str:
-    return signed(row["bias"], CLEAR * row["bias_floor"])
 
 
 def _price(result: dict[str, Any]) -> str:
@@ -233,14 +214,8 @@ Result = dict[str, Any]
 
 def plot(result: Result, folder: Path) -> None:
     """Write splitsum_NAME.png for each image of the page."""
-    made = {
-        "pareto": pareto_plot,
-        "lights": over_lights,
-        "trust": trust_plot,
-        "speedup": speedup_plot,
-        "budget": budget_plot,
-    }
-    for name, draw in made.items():
+    made = {"pareto": pareto_plot, "lights": over_lights, "trust": trust_plot, "speedup": speedup_plot}
+    for name, draw in (made | {"budget": budget_plot}).items():
         figures.save(draw(result), folder / f"splitsum_{name}.png")
 
 
@@ -399,7 +374,7 @@ def _percent(row: Row | None) -> str:
 
 
 def least_speed_up(result: Result, shape: str, light: str, roughness: float) -> Row:
-    """Plot the metals, for the finest light."""
+    """The least speed-up of the metals, for the finest light."""
     found = where(
         result["speed_ups"], shape=shape, light=light, roughness=roughness, height=best_height(result)
     )

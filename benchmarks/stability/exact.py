@@ -38,14 +38,9 @@ def _operator(height: int) -> list[Array]:
     return matrices
 
 
-def softplus(raw: Array) -> Array:
-    """log(1 + exp x), float64."""
-    return np.logaddexp(0, np.asarray(raw, np.float64))
-
-
 def light_of(raw: Array) -> oracle.Light:
     """The float64 reference's light."""
-    radiance = softplus(raw)
+    radiance = np.logaddexp(0, np.asarray(raw, np.float64))  # softplus
     flat = radiance.reshape(-1, 3)
     levels = [(m @ flat) for m in _operator(len(raw))]
     shaped = [x.reshape(h := int(np.sqrt(len(x) / 2)), 2 * h, 3) for x in levels]

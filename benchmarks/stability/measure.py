@@ -98,11 +98,6 @@ class Found:
     non_finite: int
 
 
-def occluder_of(case: Case) -> Occluder | None:
-    """The case's mesh as an occluder; None without one."""
-    return None if case.mesh is None else Occluder(case.mesh())
-
-
 def product(case: Case, weights: dict[str, Array]) -> Found:
     """Render, and differentiate Σ weights · maps (H·W, …)."""
     surfels = Surfels({name: upload_tensor(x) for name, x in case.raw.items()})
@@ -111,7 +106,7 @@ def product(case: Case, weights: dict[str, Array]) -> Found:
     dr.enable_grad(light.raw)
     camera = fast_camera(case)
     shading: Any = Shading(case.at, case.reflectance, case.diffuse, case.mesh is not None)  # type: ignore[arg-type]
-    occluder = occluder_of(case)
+    occluder = None if case.mesh is None else Occluder(case.mesh())
     used = light.prefilter() if case.reflectance == "split_sum" else None
     scene = SurfelScene(surfels, shading, used, occluder)
     frame = render(scene, camera, Request(scene.all_aovs if used is not None else ("normal",)))

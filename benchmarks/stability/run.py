@@ -34,11 +34,6 @@ from mi_refgs.methods.method import LIGHT
 SURFELS, SIZE, VIEWS, STEPS = 300, 32, 3, 24
 
 
-def measure_fits() -> list[dict[str, Any]]:
-    """One row a case: loss of the first and the last step, values that are not finite."""
-    return [fit(name) for name in FITS]
-
-
 def _with_peak(view: Any) -> dict[str, Any]:
     image = view.image.copy()
     image[SIZE // 2, SIZE // 2] = 1e6
@@ -60,7 +55,10 @@ FITS: dict[str, dict[str, Any]] = {
 
 
 def fit(name: str) -> dict[str, Any]:
-    """STEPS steps in each stage of the full method; images change after the start, which needs masks."""
+    """STEPS steps in each stage of the full method: first and last loss, values that are not finite.
+
+    Images change after the start, which needs masks.
+    """
     trainer, method = make_trainer(SURFELS, sphere_data(SIZE, VIEWS, np.random.default_rng(0)))
     case = FITS[name]
     if "view" in case:
@@ -105,7 +103,7 @@ def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = Fa
     else:
         result |= {"curve": [], "losses": []}
     more = not (only or quick)
-    result["fits"] = measure_fits() if more else []
+    result["fits"] = [fit(name) for name in FITS] if more else []
     result |= bias.measure() if more else {"rules": [], "gradient": []}
     return result | {"seconds": time.perf_counter() - begin}
 

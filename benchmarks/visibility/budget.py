@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.errors import Step, decompose, noise_floor
 from benchmarks.common.view import Points, rows
-from benchmarks.visibility.cases import PAPER, Rule, Settings
+from benchmarks.visibility.cases import PAPER, Rule
 from benchmarks.visibility.setup import Setup
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.points import reflect
@@ -117,11 +117,6 @@ def _split_sum(exact: Exact) -> list[Step]:
     return [Step(SPLIT, exact.visibility * exact.free.mean + exact.indirect.mean), Step(APART, exact.whole)]
 
 
-def bounces_shown(settings: Settings) -> list[int]:
-    """Numbers of traced bounces that have a budget."""
-    return sorted({settings.bounces[0], settings.bounces[-1]})
-
-
 def budgets(
     setup: Setup, roughness: float, references: Mapping[str, np.ndarray], depth: int
 ) -> list[dict[str, Any]]:
@@ -135,7 +130,7 @@ def budgets(
     # Half the difference of two images of half the samples each is one standard error of that of all.
     first, second = (setup.image(PAPER, half) for half in fitted.halves)
     chains = {"harmonics": (by_harmonics(shipped, exact, fitted), 0.5 * (first - second))}
-    for bounces in bounces_shown(setup.settings):
+    for bounces in sorted({setup.settings.bounces[0], setup.settings.bounces[-1]}):
         light = (setup.reference(2 + bounces) - references["direct"]).mean(0)
         traced = Traced(
             setup.image(Rule(1, bounces)), setup.image(Rule(setup.settings.counts[-1], bounces)), light

@@ -186,16 +186,12 @@ MARKERS = {False: "o", True: "^"}
 SHADES = ("#9ecae1", "#4292c6", "#08306b")
 
 
-def middle(values: list[float]) -> float:
-    """The roughness that the plot of error over time shows."""
-    return values[len(values) // 2]
-
-
 def plot(result: dict[str, Any], folder: Path) -> Path:
     """Write visibility_convergence.png."""
     scenes = list(result["scenes"])
     figure, axes = figures.new(2, len(scenes), 3.9, 3.2)
-    roughness = middle(list(result["settings"]["roughness"]))
+    values = list(result["settings"]["roughness"])
+    roughness = values[len(values) // 2]  # of the plot of error over time
     for column, scene in enumerate(scenes):
         _speed(axes[0, column], result, scene, roughness)
         _convergence(axes[1, column], result, scene)

@@ -6,7 +6,7 @@ import ast
 from functools import cache
 
 from benchmarks.mutation.planting import catalogue, mutated
-from tests.benchmarks.benchmark_runs import ROOT
+from tests.helpers import ROOT
 
 MUTANTS = catalogue()
 WITHOUT_MUTANTS = {"reference"}

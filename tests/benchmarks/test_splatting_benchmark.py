@@ -25,24 +25,9 @@ from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import rotation_matrix
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.table import Surfels
-from tests.benchmarks.benchmark_runs import (  # first: it lets `benchmarks` be found
-    read_result,
-    small_instance,
-)
 
+BENCHMARK = "splatting"
 Row = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output of the small instance."""
-    return small_instance("splatting", tmp_path_factory.mktemp("splatting"))
-
-
-@pytest.fixture(scope="module")
-def result(folder: Path) -> dict[str, Any]:
-    """Its JSON."""
-    return read_result("splatting", folder)
 
 
 def opaque(count: int, size: int, spread: float = 1.5) -> Workload:

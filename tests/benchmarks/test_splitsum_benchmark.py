@@ -22,21 +22,10 @@ from benchmarks.splitsum import budget, measure, setup
 from mi_refgs.errors import InputError
 from mi_refgs.reference.shade import lobe_average, split_sum
 from mi_refgs.shade.light import lobe_matrices
-from tests.benchmarks.benchmark_runs import read_result, run_benchmark, small_instance
+from tests.benchmarks.benchmark_runs import run_benchmark
 
+BENCHMARK = "splitsum"
 Row = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output of the small instance."""
-    return small_instance("splitsum", tmp_path_factory.mktemp("splitsum"))
-
-
-@pytest.fixture(scope="module")
-def result(folder: Path) -> dict[str, Any]:
-    """Its JSON."""
-    return read_result("splitsum", folder)
 
 
 def cases(

@@ -20,22 +20,10 @@ from benchmarks.visibility import cases, page
 from benchmarks.visibility.__main__ import main
 from benchmarks.visibility.cases import SMALL, Rule
 from benchmarks.visibility.setup import Setup
-from tests.benchmarks.benchmark_runs import read_result, small_instance
 from tests.helpers import ROOT
 
+BENCHMARK = "visibility"
 Row = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output of the small instance."""
-    return small_instance("visibility", tmp_path_factory.mktemp("visibility"))
-
-
-@pytest.fixture(scope="module")
-def result(folder: Path) -> dict[str, Any]:
-    """Its JSON."""
-    return read_result("visibility", folder)
 
 
 def errors_of(result: dict[str, Any], scene: str, depth: str) -> dict[str, float]:

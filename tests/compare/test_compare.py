@@ -7,6 +7,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from html.parser import HTMLParser
@@ -188,9 +190,6 @@ def test_crash_is_retried_and_becomes_a_row(
 
 def test_worker_ends_with_its_parent(ball: Path, variants: tuple[Path, Path]) -> None:
     """It ends when its standard input closes."""
-    import subprocess
-    import sys
-
     code = (
         "import os, time\nfrom mi_refgs.compare import worker\nimport threading\n"
         "threading.Thread(target=worker._end_with_parent, daemon=True).start()\ntime.sleep(60)\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import time
 from pathlib import Path
 from typing import Any
@@ -78,8 +79,6 @@ def test_same_seed_makes_same_file(tmp_path: Path) -> None:
 
 def test_structures_are_changed(tmp_path: Path) -> None:
     """Every kind of mutation makes files that differ from their sample."""
-    import random
-
     for name in ("transforms", "method", "scene", "ply"):
         reader = READERS[name]
         sample = reader.samples(tmp_path)[0]

@@ -23,10 +23,8 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.benchmarks.benchmark_runs import ROOT  # first: it lets `benchmarks` be found
 from tests.scenes.integrator import scattered_discs
 
-assert ROOT
 CASES = [("pixel", "sh"), ("surfel", "irradiance")]
 MAPS = ["radiance", "alpha", "depth", "normal", "object_alpha", "albedo", "metallic", "roughness"]
 MAPS += ["background"]

@@ -1,0 +1,26 @@
+"""The small instance of the benchmark that a test module names as its BENCHMARK."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.benchmarks.benchmark_runs import run_benchmark
+
+
+@pytest.fixture(scope="module")
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with its output."""
+    output = tmp_path_factory.mktemp(request.module.BENCHMARK)
+    done = run_benchmark(request.module.BENCHMARK, "--small", "--quiet", "-o", output)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return output
+
+
+@pytest.fixture(scope="module")
+def result(request: pytest.FixtureRequest, folder: Path) -> Any:
+    """Its JSON."""
+    return json.loads((folder / f"{request.module.BENCHMARK}.json").read_text())
