@@ -78,10 +78,10 @@ def test_json_output_contains_nothing_else(
     """Neither Python's nor C++'s chatter on standard output gets between a pipe and the object."""
     original = Trainer.__init__
 
-    def noisy(self: Trainer, *args: object) -> None:
+    def noisy(self: Trainer, *args: object, **more: object) -> None:
         print("from Python")
         os.write(1, b"from C++\n")
-        original(self, *args)  # type: ignore[arg-type]
+        original(self, *args, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Trainer, "__init__", noisy)
     dataset = json.loads((run / "dataset.json").read_text())["path"]
