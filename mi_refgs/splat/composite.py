@@ -49,8 +49,8 @@ class Composited:
     @staticmethod
     def nothing(features: int, camera: Camera, depth: bool = True) -> Composited:
         """Maps of a view without surfels."""
-        blank = [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(features + 2)]
-        return Composited(blank[2:], blank[0] if depth else None, blank[1])
+        *maps, z, alpha = _blank(features + 2, camera)
+        return Composited(maps, z if depth else None, alpha)
 
 
 @phase("splat forward")
@@ -198,12 +198,12 @@ class _Composite(dr.CustomOp):
             lanes = self._lanes()
             self.out = lanes.to_raster(camera, self.loop.forward(lanes, self.loop.features + 2)[1])
         else:  # Dr.Jit refuses to gather from an empty list, even fully masked
-            self.out = self._blank()
+            self.out = _blank(self.loop.features + 2, camera)
         return self.out
 
     def forward(self) -> None:
         if not self.loop.lists.pairs:
-            self.set_grad_out(self._blank())
+            self.set_grad_out(_blank(self.loop.features + 2, self.loop.camera))
             return
         lanes, drows = self._lanes(), PackedRows.pack(self.grad_in("columns"))
         self.set_grad_out(lanes.to_raster(self.loop.camera, self.loop.tangent(lanes, drows)))
@@ -222,6 +222,7 @@ class _Composite(dr.CustomOp):
     def _lanes(self) -> Lanes:
         return Lanes.of(Grid(self.loop.lists, self.loop.camera))
 
-    def _blank(self) -> list[Any]:
-        pixels = self.loop.camera.width * self.loop.camera.height
-        return [dr.zeros(mi.Float, pixels) for _ in range(self.loop.features + 2)]
+
+def _blank(count: int, camera: Camera) -> list[Float]:
+    """Maps (H·W,) of a view without surfels."""
+    return [dr.zeros(mi.Float, camera.width * camera.height) for _ in range(count)]
