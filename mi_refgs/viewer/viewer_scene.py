@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -50,7 +51,7 @@ class SampleResult(NamedTuple):
     depth: Float | None = None  # (H*W,) along the camera's z axis, 0 where nothing is seen; None if unknown
 
 
-class ViewerScene:
+class ViewerScene(ABC):
     """A scene that a page displays. The methods are called on the render thread."""
 
     variables: tuple[str, ...]  # `tonemap.IMAGE` and the types of `plugins.aovs` that the scene has
@@ -59,13 +60,13 @@ class ViewerScene:
     radius: float  # of the object around it, scene units
     square_pixels = False  # whether its pixels must be square, whatever sizes that gives
 
+    @abstractmethod
     def draw(self, sample: SampleRequest) -> SampleResult:
         """Render one sample per pixel."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cost(self) -> tuple[Shading, int]:
         """Return the shading and the number of surfels, which decide about passes."""
-        raise NotImplementedError
 
     def fine(self, request: SampleRequest) -> list[Float]:
         """Render an image to save, of square pixels: planes, means over GRID × GRID samples per pixel.

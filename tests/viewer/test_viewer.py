@@ -29,6 +29,7 @@ from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.comparison import BORDER, GAP, side_by_side
@@ -166,6 +167,9 @@ class Plain(ViewerScene):
         self.samples.append(sample)
         self.during()
         return SampleResult([mi.Float(self.grey)] * 3 + [mi.Float(1)])
+
+    def cost(self) -> tuple[Shading, int]:
+        return Shading(), 1
 
 
 class Clock:
