@@ -97,7 +97,7 @@ def fit(
         )
 
     with run.alone():
-        if not resumed:
+        if not resumed:  # asked again: another process may have begun a run while the data was read
             run.require_none()
         return _fit(chosen, views, run, progress, find_points)
 
