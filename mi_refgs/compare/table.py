@@ -39,7 +39,7 @@ COLUMNS = (
     Column("lpips", "LPIPS", "", ".4f", False, "lpips_reason"),
     Column("normal_mae_deg", "normal error", "°", ".2f", False, "normal_reason"),
     Column("normal_mae_deg_full", "normal error, whole image", "°", ".2f", False, "normal_reason"),
-    Column("env_correlation", "light correlation", "", ".3f", True, "env_reason"),
+    Column("env_correlation", "environment correlation", "", ".3f", True, "env_reason"),
     Column("train_seconds", "training", "s", ".0f", False),
     Column("surfels", "surfels", "", ".0f", None),
     Column("ms_per_frame", "frame", "ms", ".1f", False),

@@ -1,4 +1,4 @@
-"""Errors of the recovered materials on the foreground, and on its concave pixels.
+"""Errors of the fitted materials on the foreground, and on its concave pixels.
 
 Light and albedo share an unknown per-channel scale: twice the light on half the albedo gives the same images.
 So albedo is compared after one least-squares scale per channel, the same for all pixels of all views, and the
@@ -150,7 +150,7 @@ def panels(
     concave: np.ndarray | None,
     scale: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Return ours and the ground truth side by side, map by map, by title; albedo after its scale."""
+    """Return fitted and ground-truth maps side by side, by title; albedo after its scale."""
     pairs, covered = {"image": [rendered.image, view.displayed]}, view.covered()
     if view.normal is not None:
         shown = normal_colours(rendered.normal, rendered.alpha), normal_colours(view.normal, covered)
@@ -162,7 +162,8 @@ def panels(
             if name in view.materials:
                 true = view.materials[name]
                 pairs[name].append(material_colours(true[..., :-1], true[..., -1]))
-    found = {f"{n}: ours{' | true' if len(p) > 1 else ''}": side_by_side(p) for n, p in pairs.items()}
+    sides = {1: "fitted", 2: "fitted | ground truth"}
+    found = {f"{name}: {sides[len(pair)]}": side_by_side(pair) for name, pair in pairs.items()}
     if concave is not None:
         found["concave"] = on_white(np.repeat(0.75 * concave[..., None], 3, axis=-1) * [1, 0.4, 0], covered)
     return {title: np.clip(image, 0, 1) for title, image in found.items()}

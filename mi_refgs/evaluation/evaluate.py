@@ -200,7 +200,7 @@ def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:
         result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
     for name, key, reason in (
         ("region", "psnr_region", "the data set has no region of interest"),
-        ("normal", "normal_mae_deg", "the data set has no true normals"),
+        ("normal", "normal_mae_deg", "the data set has no ground-truth normals"),
     ):
         result[f"{name}_reason"] = reason if result[key] is None else None
     return result

@@ -72,7 +72,7 @@ def panels(rendered: RenderedView, view: View) -> dict[str, np.ndarray]:
     """Return all images of a view by title."""
     found = {"ground truth": view.displayed, "render": rendered.image}
     if view.normal is not None:
-        found["true normals"] = normal_colours(view.normal, np.linalg.norm(view.normal, axis=-1))
+        found["ground-truth normals"] = normal_colours(view.normal, np.linalg.norm(view.normal, axis=-1))
     found["normals"] = normal_colours(rendered.normal, rendered.alpha)
     for name in (*(name for name, attribute in ATTRIBUTES.items() if attribute.aov), "visibility"):
         if name in rendered.maps:
@@ -110,28 +110,25 @@ def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """Tone-map a recovered environment (h, w, 3), linear, and the ground truth at one exposure, by title.
+    """Tone-map a fitted environment map (h, w, 3), linear, and the ground truth at one exposure, by title.
 
-    The recovered one is first scaled per channel to the ground truth by least squares.
+    The fitted one is first scaled per channel to the ground truth by least squares.
     """
     if truth is None:
-        return {"recovered light": tonemap(light, _exposure(light))}
+        return {"fitted environment": tonemap(light, light)}
     fitted = light * np.array(environment(light, truth)["env_scale"])
-    exposure = _exposure(truth)
-    return {"recovered light": tonemap(fitted, exposure), "true light": tonemap(truth, exposure)}
+    return {"fitted environment": tonemap(fitted, truth), "ground-truth environment": tonemap(truth, truth)}
 
 
-def tonemap(radiance: np.ndarray, exposure: float) -> np.ndarray:
-    """Map radiance of any range to an image: x / (1 + x) [Reinhard et al. 2002, eq. 3], sRGB-encoded."""
-    scaled = np.maximum(radiance, 0) * exposure
+def tonemap(radiance: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Map radiance of any range to an image: x / (1 + x) [Reinhard et al. 2002, eq. 3], sRGB-encoded.
+
+    The exposure maps the average luminance of `reference` (h, w, 3) over the sphere to LIGHT_KEY.
+    """
+    rows = np.sin((np.arange(len(reference)) + 0.5) / len(reference) * np.pi)
+    mean = float(np.average((reference @ LUMINANCE).mean(axis=1), weights=rows))
+    scaled = np.maximum(radiance, 0) * (LIGHT_KEY / max(mean, 1e-8))
     return np.clip(srgb_from_linear(scaled / (1 + scaled)), 0, 1)
-
-
-def _exposure(radiance: np.ndarray) -> float:
-    """Return the scale that maps the average luminance over the sphere to LIGHT_KEY."""
-    rows = np.sin((np.arange(radiance.shape[0]) + 0.5) / radiance.shape[0] * np.pi)
-    mean = float(np.average((radiance @ LUMINANCE).mean(axis=1), weights=rows))
-    return LIGHT_KEY / max(mean, 1e-8)
 
 
 # ---------------- contact sheets ----------------

@@ -1,4 +1,4 @@
-"""Metrics of images, normals and recovered environment maps, in NumPy; and the time of a frame.
+"""Metrics of images, normals and fitted environment maps, in NumPy; and the time of a frame.
 
 Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the
 mean over its images. Normals are (H, W, 3) world vectors. Environment maps are (h, w, 3) linear lat-long
@@ -108,8 +108,8 @@ def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
     """Compute the mean angle in degrees between normal maps, over the foreground and over the whole image.
 
-    `normal` is recovered, of any length; `truth` (H, W, 3) is 0 where nothing is hit; `alpha` (H, W) is true.
-    Foreground is alpha > 0.5 with a true normal; a missing recovered normal counts 90° there.
+    `normal` is rendered, of any length; `truth` (H, W, 3) is 0 where nothing is hit; `alpha` (H, W) is true.
+    Foreground is alpha > 0.5 with a true normal; a missing rendered normal counts 90° there.
     `normal_mae_deg` is the mean over the foreground; `normal_mae_deg_full` divides the same sum by all
     pixels, so the background counts as 0°, as in most papers. Both are 0 for an image without foreground.
     """
@@ -137,15 +137,15 @@ def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Compare a recovered environment with the true one after a least-squares scale per channel.
+    """Compare a fitted environment map with the ground truth after a least-squares scale per channel.
 
     Pixels are weighted by solid angle. Light and albedo share an unknown per-channel scale. The true map is
-    resampled to the recovered one's grid (`shade.lobe_matrices`: first and last row on the poles) by
+    resampled to the fitted one's grid (`shade.lobe_matrices`: first and last row on the poles) by
     averaging. Keys: `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after
     sRGB encoding and clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
-    for name, array in (("recovered", light), ("true", truth)):
+    for name, array in (("fitted", light), ("ground-truth", truth)):
         if array.ndim != 3 or array.shape[2] != 3 or array.shape[0] < 2 or not np.all(np.isfinite(array)):
             need = "need finite (h, w, 3) values, h ≥ 2; write the map again"
             raise InputError(f"metrics: {name} environment: {need}")

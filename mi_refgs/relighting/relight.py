@@ -6,7 +6,7 @@ The folder contains
     turntable/t_000.png     or these, of cameras around the object
     scene.xml, surfels.ply, envmap.exr, mesh.ply, model.json    from which `mi.load_file` renders the same
     relight.json            the settings, and the score where the data set has ground truth under this light
-    sheet.png               ours and the ground truth, or the frames; and the light
+    sheet.png               relit images and the ground truth, or the frames; and the environment map
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import contact_sheet, image_array, light_panels
+from mi_refgs.evaluation.images import contact_sheet, image_array, tonemap
 from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
@@ -138,8 +138,9 @@ def relight(
         truth = _truth(provenance.method, truth_folder, light.exposure, views)
         result |= score([view.name for view in views.views], ours, truth, background) | {"score_reason": None}
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
-    panorama = light_panels(new_light.radiance().numpy())["recovered light"]
-    write_png(output.path / SHEET, contact_sheet(rows, {"light": panorama}))
+    radiance = new_light.radiance().numpy()
+    sheet = contact_sheet(rows, {"environment map": tonemap(radiance, radiance)})
+    write_png(output.path / SHEET, sheet)
     write_json(output.path / RESULT, result)
     warning = ""
     if fitted.shading.diffuse == "sh":
@@ -197,13 +198,13 @@ def _truth(method: Method, folder: Path, exposure: float, views: Dataset) -> lis
 def _rows(
     ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], scale: np.ndarray, background: np.ndarray
 ) -> list[dict[str, np.ndarray]]:
-    """Return the rows of the sheet: ours, ours after the scale and the ground truth; or all frames."""
+    """Return the rows of the sheet: relit, relit after the scale, and ground truth; or all frames."""
     if truth:
         return [
             {
                 "relit": displayed_over(ours[i], background),
-                "relit, scaled per channel": displayed_over(ours[i], background, scale),
-                "path traced": displayed_over(truth[i], background),
+                "relit, per-channel scale": displayed_over(ours[i], background, scale),
+                "ground truth": displayed_over(truth[i], background),
             }
             for i in evenly_spread(len(ours), SHEET_VIEWS)
         ]

@@ -166,8 +166,8 @@ def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path)
         ("albedo_psnr", "defines no albedo"),
         ("surface_distance", "the run has no mesh"),
         ("concave_share", "has no surface.ply"),
-        ("normal_mae_deg", "no true normals"),
-        ("normal_mae_deg_full", "no true normals"),
+        ("normal_mae_deg", "no ground-truth normals"),
+        ("normal_mae_deg_full", "no ground-truth normals"),
         ("env_scale", "no environment.exr"),
         ("env_psnr", "no environment.exr"),
     ):

@@ -154,11 +154,11 @@ def test_panels_show_every_map(trainer: Trainer, views: Dataset) -> None:
     shot = images.RenderedView.of(trainer.view(view.camera()), views, view)
     panels = images.panels(shot, view)
     maps = ["albedo", "metallic", "roughness", "visibility"]
-    assert list(panels) == ["ground truth", "render", "true normals", "normals", *maps]
+    assert list(panels) == ["ground truth", "render", "ground-truth normals", "normals", *maps]
     for title, picture in panels.items():
         assert picture.shape == (SIZE, SIZE, 3), title
         assert 0 <= picture.min() and picture.max() <= 1, title
-    assert np.all(panels["true normals"][0, 0] == 1)  # the corner shows no ball, hence white
+    assert np.all(panels["ground-truth normals"][0, 0] == 1)  # the corner shows no ball, hence white
 
 
 def test_render_names_are_unique() -> None:

@@ -10,9 +10,9 @@ from mi_refgs.evaluation import images
 def test_light_panels_have_one_exposure(rng: np.random.Generator) -> None:
     truth = rng.uniform(0.1, 5, (8, 16, 3))
     shown = images.light_panels(truth * [0.5, 2, 1], truth)
-    np.testing.assert_allclose(shown["recovered light"], shown["true light"], atol=1e-6)
+    np.testing.assert_allclose(shown["fitted environment"], shown["ground-truth environment"], atol=1e-6)
     dark = images.light_panels(np.zeros((8, 16, 3)))
-    assert np.all(dark["recovered light"] == 0)
+    assert np.all(dark["fitted environment"] == 0)
 
 
 def test_contact_sheet_accepts_rows_of_different_length() -> None:

@@ -106,7 +106,7 @@ def test_environment_weighs_by_solid_angle() -> None:
     pole, equator = truth.copy(), truth.copy()
     pole[0], equator[8] = 0, 0
     assert metrics.environment(pole, truth)["env_mae"] < 0.15 * metrics.environment(equator, truth)["env_mae"]
-    refused(lambda: metrics.environment(truth, truth * np.nan), "true environment: need finite")
+    refused(lambda: metrics.environment(truth, truth * np.nan), "ground-truth environment: need finite")
 
 
 def test_missing_extras_say_what_to_install(
