@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.stability.cases import Array, Case, Raw, camera, facing, filled, plain, sky, sphere
 from benchmarks.stability.exact import light_of
 from mi_refgs.reference import image as oracle
-from mi_refgs.reference import surfel
 from mi_refgs.reference.camera import camera_frame
+from mi_refgs.reference.splat import sorted_rows
 
 WIDTH, HEIGHT = 48, 40
 SAMPLES = 4
@@ -113,8 +113,7 @@ def _scene(case: Case, light: oracle.Light | None) -> oracle.Scene:
     c = case.camera
     pixels = np.arange(c.width * c.height)
     raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
-    key = surfel.sort_key(raw, c, pixels, (0, 0))
-    order = np.argsort(key, axis=0, kind="stable")
+    order = sorted_rows(raw, c, pixels)
     return oracle.Scene(raw, c, pixels, order, case.at, case.reflectance, case.diffuse, light)
 
 

@@ -32,18 +32,6 @@ class PinholeCamera:
         return self.film or ((0, self.width), (0, self.height))
 
 
-def rotation_matrix(q: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a quaternion (x, y, z, w) of any norm."""
-    x, y, z, w = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def camera_frame(raw: dict[str, Array], camera: PinholeCamera) -> tuple[Array, Array]:
     """Centres (N, 3) and axes (N, 3, 3) — t_u, t_v, n — in the camera's frame."""
     to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]

@@ -68,11 +68,3 @@ class Footprints(Protocol):
 
     def normal(self, raw: dict[str, Array]) -> Array:
         """Which of the three axes (N,) is the normal."""
-
-    def images(
-        self, raw: dict[str, Array], camera: PinholeCamera, band: float
-    ) -> tuple[list[tuple[Array, Array, Array]], Array]:
-        """α, depth and whether it jumps within the `band` (H, W) of each row; and the order (N, H, W).
-
-        α is clamped, and 0 where culled. Written as loops, for `reference.splat`.
-        """

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.camera import PinholeCamera, camera_frame, intrinsics, rotation_matrix, sigmoid
+from mi_refgs.reference.camera import PinholeCamera, camera_frame, intrinsics, sigmoid
 from mi_refgs.reference.footprint import Rules, Sample
 
 Array = np.ndarray
@@ -67,37 +67,3 @@ def _limits(camera: PinholeCamera) -> list[tuple[float, float]]:
         ends = [(first - margin - middle) / focal, (last + margin - middle) / focal]
         limits.append((min(ends), max(ends)))
     return limits
-
-
-# ---------------- by loops ----------------
-
-
-def images(
-    raw: dict[str, Array], camera: PinholeCamera, band: float
-) -> tuple[list[tuple[Array, Array, Array]], Array]:
-    """See `reference.footprint`; one Gaussian after another, with matrices."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    world_to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
-    found, depths = [], []
-    for position, q, log_scale, logit in zip(
-        *(raw[n] for n in ("position", "rotation", "scale", "opacity")), strict=True
-    ):
-        p = world_to_camera @ (position - origin)
-        depths.append(p[2])
-        opacity = sigmoid(logit[0])
-        if p[2] <= camera.near or opacity < c.ALPHA_MIN:
-            found.append((np.zeros_like(x), np.ones_like(x), np.zeros(x.shape, bool)))
-            continue
-        turned = world_to_camera @ rotation_matrix(q) @ np.diag(np.exp(log_scale))
-        a, b = (np.clip(p[i] / p[2], *limits) for i, limits in enumerate(_limits(camera)))
-        jacobian = np.array([[camera.fx, 0, -camera.fx * a], [0, camera.fy, -camera.fy * b]]) / p[2]
-        covariance = jacobian @ turned @ turned.T @ jacobian.T + c.GAUSSIAN_LOW_PASS * np.eye(2)
-        inverse = np.linalg.inv(covariance)
-        offset = np.stack(
-            [x - camera.fx * p[0] / p[2] - camera.cx, y - camera.fy * p[1] / p[2] - camera.cy], -1
-        )
-        rho = np.einsum("hwi,ij,hwj->hw", offset, inverse, offset)
-        alpha = np.minimum(c.ALPHA_MAX, opacity * np.exp(-0.5 * rho))
-        found.append((alpha, np.full(x.shape, p[2]), np.zeros(x.shape, bool)))
-    order = np.argsort(depths, kind="stable")
-    return found, np.broadcast_to(order[:, None, None], (len(order), *x.shape))

@@ -1,8 +1,7 @@
-"""Composite footprints front to back, pixel by pixel, and differentiate the result.
+"""Composite footprints front to back, all primitives at all pixels at once, and differentiate the result.
 
-`splat` is written as loops over primitives. `Blend` treats all primitives at once; derivatives of its
-footprints are complex steps, exact to the last digit: the imaginary part of f(x + ih) is h f'(x). Derivatives
-of compositing follow from its sums. Letters: N primitives, P pixels, K features.
+Derivatives of footprints are complex steps, exact to the last digit: the imaginary part of f(x + ih) is
+h f'(x). Derivatives of compositing follow from its sums. Letters: N primitives, P pixels, K features.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_refgs import constants as c
 from mi_refgs.reference import gaussian, surfel
 from mi_refgs.reference.camera import PinholeCamera
 from mi_refgs.reference.footprint import GEOMETRY, Footprints, Rules, Sample
@@ -34,40 +32,6 @@ class Maps:
     depth: np.ndarray
     alpha: np.ndarray
     band: np.ndarray
-
-
-def splat(
-    raw: dict[str, np.ndarray], features: np.ndarray, camera: PinholeCamera, band: float = 1e-3
-) -> Maps:
-    """Render raw channels with features (N, K); `band` is the relative width of the declared band."""
-    height, width = camera.height, camera.width
-    found, order = primitive_of(raw).images(raw, camera, band)
-    alphas, depths, jumps = (np.stack(values) for values in zip(*found, strict=True))
-    row, column = np.mgrid[0:height, 0:width]
-    out = np.zeros((height, width, features.shape[1]))
-    depth, alpha = np.zeros((height, width)), np.zeros((height, width))
-    transmittance = np.ones((height, width))
-    alive = np.ones((height, width), bool)
-    in_band = np.zeros((height, width), bool)
-
-    for i in order:  # (H, W): the next one of each pixel
-        a, z, jump = (values[i, row, column] for values in (alphas, depths, jumps))
-        after = transmittance * (1 - a)
-        shown = alive & (a >= c.ALPHA_MIN) & (z > camera.near)
-        in_band |= alive & (np.abs(a / c.ALPHA_MIN - 1) < band)
-        in_band |= shown & (np.abs(after / c.TRANSMITTANCE_MIN - 1) < band)
-        in_band |= shown & jump
-        in_band |= alive & (np.abs(z / camera.near - 1) < band)
-        in_band |= shown & (np.abs(a - c.ALPHA_MAX) < band * (a < c.ALPHA_MAX))
-        ends = shown & (after < c.TRANSMITTANCE_MIN)
-        alive &= ~ends
-        shown &= ~ends
-        w = np.where(shown, transmittance * a, 0)
-        out += w[..., None] * features[i]
-        depth += w * np.where(shown, z, 0)
-        alpha += w
-        transmittance = np.where(shown, after, transmittance)
-    return Maps(out, depth, alpha, in_band)
 
 
 @dataclass(frozen=True)
@@ -161,6 +125,13 @@ class Exact:
     shown: Array  # (N, P): whether a row contributes to a pixel
 
 
+def splat(raw: dict[str, Array], features: Array, camera: PinholeCamera, band: float = 1e-3) -> Maps:
+    """Render raw channels with features (N, K); `band` is the relative width of the declared band."""
+    blend, shape = _whole_image(raw, camera), (camera.height, camera.width)
+    sums = blend.sums(features).reshape(*shape, -1)
+    return Maps(sums[..., :-2], sums[..., -2], sums[..., -1], blend.band(band).reshape(shape))
+
+
 def differentiate(
     raw: dict[str, Array], features: Array, camera: PinholeCamera, weights: Array, order: Array | None = None
 ) -> Exact:
@@ -168,13 +139,22 @@ def differentiate(
 
     `order` (N, P) replaces the order by `sort_key`: rows from front to back.
     """
-    pixels = np.arange(camera.width * camera.height)
-    if order is None:
-        key = primitive_of(raw).sort_key(raw, camera, pixels, (0, 0))
-        order = np.argsort(key, axis=0, kind="stable")
-    blend = Blend.of(raw, camera, order, pixels % camera.width + 0.5, pixels // camera.width + 0.5, Rules())
+    blend = _whole_image(raw, camera, order)
     gradients, δfeatures = blend.adjoint(features, weights.T)
     return Exact(blend.sums(features), gradients | {"features": δfeatures}, blend.weight > 0)
+
+
+def sorted_rows(
+    raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: tuple[int, int] = (0, 0)
+) -> Array:
+    """Rows (N, P) from front to back at pixels (raster indices); `corner` as in `Footprints.sort_key`."""
+    return np.argsort(primitive_of(raw).sort_key(raw, camera, pixels, corner), axis=0, kind="stable")
+
+
+def _whole_image(raw: dict[str, Array], camera: PinholeCamera, order: Array | None = None) -> Blend:
+    pixels = np.arange(camera.width * camera.height)
+    order = sorted_rows(raw, camera, pixels) if order is None else order
+    return Blend.of(raw, camera, order, pixels % camera.width + 0.5, pixels // camera.width + 0.5, Rules())
 
 
 def _unsort(values: Array, order: Array) -> Array:

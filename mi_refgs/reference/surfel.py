@@ -5,14 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.camera import (
-    PinholeCamera,
-    camera_frame,
-    intrinsics,
-    ray_slopes,
-    rotation_matrix,
-    sigmoid,
-)
+from mi_refgs.reference.camera import PinholeCamera, camera_frame, intrinsics, ray_slopes, sigmoid
 from mi_refgs.reference.footprint import Rules, Sample, tile_centres
 
 Array = np.ndarray
@@ -77,80 +70,3 @@ def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner
         ]
         share = np.minimum(1, c.SORT_REACH * k / np.hypot(*across))
         return 1 / np.maximum(k + share * lift, k / c.SORT_DEPTH_RANGE)
-
-
-# ---------------- by loops ----------------
-
-
-def images(
-    raw: dict[str, Array], camera: PinholeCamera, band: float
-) -> tuple[list[tuple[Array, Array, Array]], Array]:
-    """See `reference.footprint`; textbook ray-plane intersection."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-    surfels = camera_surfels(raw, camera)
-    found = []
-    for i in range(len(raw["position"])):
-        s = {name: values[i] for name, values in surfels.items()}
-        p = s["p"]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.sum(p * s["n"], -1) / np.sum(ray * s["n"], -1)
-            offset = t[..., None] * ray - p
-            rho_plane = np.sum(offset * s["u"], -1) ** 2 + np.sum(offset * s["v"], -1) ** 2
-        rho_plane = np.where(t > 0, rho_plane, np.inf)
-        rho_screen = c.LOW_PASS_INV_VARIANCE * ((x - s["centre"][0]) ** 2 + (y - s["centre"][1]) ** 2)
-        z = np.where(rho_screen < rho_plane, p[2], t)
-        a = np.minimum(c.ALPHA_MAX, s["opacity"] * np.exp(-0.5 * np.minimum(rho_plane, rho_screen)))
-        found.append((a, z, np.abs(rho_screen - rho_plane) < band * rho_screen))
-    return found, order(surfels, camera)
-
-
-def camera_surfels(raw: dict[str, Array], camera: PinholeCamera) -> dict[str, Array]:
-    """Per surfel: centre p, tangents u and v over their σ, normal n (camera frame), projection, opacity.
-
-    Culled surfels stay, with opacity 0.
-    """
-    to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
-    centres = (raw["position"] - origin) @ to_camera.T
-    axes = np.array([to_camera @ rotation_matrix(q) for q in raw["rotation"]]).reshape(-1, 3, 3)
-    sigma = np.exp(raw["scale"])
-    opacity = sigmoid(raw["opacity"][:, 0])
-    facing = np.abs(np.sum(centres * axes[:, :, 2], axis=1))
-    culled = centres[:, 2] <= camera.near
-    culled |= facing <= c.EDGE_ON_COSINE * np.linalg.norm(centres, axis=1)
-    culled |= opacity < c.ALPHA_MIN
-    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    return {
-        "p": centres,
-        "u": axes[:, :, 0] / sigma[:, :1],
-        "v": axes[:, :, 1] / sigma[:, 1:],
-        "n": axes[:, :, 2],
-        "centre": focal * centres[:, :2] / np.where(culled, 1, centres[:, 2])[:, None] + middle,
-        "opacity": np.where(culled, 0, opacity),
-    }
-
-
-def order(surfels: dict[str, Array], camera: PinholeCamera) -> Array:
-    """Surfel indices (N, H, W), front to back by the depth near the centre of each pixel's tile.
-
-    With the ray (x, y, 1) through that centre, 1/z of a surfel's plane is (ray·n) / (p·n). The point on the
-    plane is brought to within SORT_REACH σ of p along 1/z, which is linear across the screen.
-    """
-    p, n = surfels["p"], surfels["n"]
-    shown = surfels["opacity"] > 0
-    k = 1 / np.where(shown, p[:, 2], 1)
-    pn = np.where(shown, np.sum(p * n, axis=1), 1)
-    out = np.zeros((len(p), camera.height, camera.width), int)
-    width, height = c.tile_size(abs(camera.fx))
-    for top in range(0, camera.height, height):
-        for left in range(0, camera.width, width):
-            x, y = left + width / 2, top + height / 2
-            ray = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1])
-            beside = ray - k[:, None] * p  # in the plane z = 1, from the projected centre
-            across = beside - (np.sum(beside * n, axis=1) / pn)[:, None] * p
-            distance = np.hypot(np.sum(across * surfels["u"], axis=1), np.sum(across * surfels["v"], axis=1))
-            share = np.minimum(1, c.SORT_REACH * k / np.maximum(distance, 1e-10))
-            inverse = np.maximum(k + share * (n @ ray / pn - k), k / c.SORT_DEPTH_RANGE)
-            ranked = np.argsort(1 / inverse, kind="stable")
-            out[:, top : top + height, left : left + width] = ranked[:, None, None]
-    return out

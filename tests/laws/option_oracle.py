@@ -16,7 +16,7 @@ from mi_refgs.reference import image, losses, occlusion
 from mi_refgs.reference.camera import PinholeCamera, look_at, rotation_axes
 from mi_refgs.reference.footprint import GEOMETRY
 from mi_refgs.reference.models import Light, Options, hemisphere, unit
-from mi_refgs.reference.splat import primitive_of
+from mi_refgs.reference.splat import primitive_of, sorted_rows
 from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.render.surroundings import Surroundings, nothing_around
@@ -105,12 +105,7 @@ class Oracle:
         if not around:
             around = {n: np.zeros((0, own[n].shape[1])) for n in (*GEOMETRY, "radiance_sh")}
         both = {n: np.concatenate([own[n], around[n]]) for n in GEOMETRY}
-        order = self._keep(
-            "order",
-            lambda: np.argsort(
-                primitive_of(both).sort_key(both, camera, self.pixels, self.corner), axis=0, kind="stable"
-            ),
-        )
+        order = self._keep("order", lambda: sorted_rows(both, camera, self.pixels, self.corner))
         chosen = shading(case)
         options = Options(
             dominant=chosen.dominant, multiscatter=chosen.multiscatter, directions=chosen.directions

@@ -12,7 +12,7 @@ import pytest
 
 from mi_refgs.reference import shade as reference
 from mi_refgs.reference import splat as oracle
-from mi_refgs.reference.camera import look_at, rotation_matrix
+from mi_refgs.reference.camera import look_at, rotation_axes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
@@ -60,7 +60,7 @@ def attributes(raw: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.n
     """What is blended or shaded, surfel by surfel."""
     direction = raw["position"] - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    normal = np.array([rotation_matrix(q)[:, 2] for q in raw["rotation"]])
+    normal = rotation_axes(raw["rotation"])[2]
     away = np.sum(normal * direction, axis=1) > 0.25
     coefficients = raw["radiance_sh"].reshape(len(normal), -1, 3)
     basis = np.array([reference.sh_basis(d, 1) for d in direction])

@@ -13,7 +13,7 @@ from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.errors import InputError
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference import surfel as oracle_surfel
-from mi_refgs.reference.camera import look_at
+from mi_refgs.reference.camera import look_at, rotation_axes
 from mi_refgs.reference.footprint import Rules
 from mi_refgs.reference.splat import differentiate
 from mi_refgs.splat import Camera, list_by_tile, project, splat, tiles
@@ -67,6 +67,30 @@ def test_image_matches_oracle(seed: int) -> None:
 def test_image_matches_oracle_with_tiles_of_every_size(seed: int, tile: tuple[int, int]) -> None:
     assert make_scene(seed).fast_camera().tile == tile
     check_image(make_scene(seed), IMAGE_TOLERANCE)
+
+
+def test_reference_footprints_match_textbook_intersections() -> None:
+    """Tangent coordinates (a, b) of the point where a ray meets a disc: ray t = p + a σ_u u + b σ_v v."""
+    scene, tested = make_scene(8), 0
+    camera, raw = scene.camera, scene.raw
+    to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
+    at = np.stack([v.ravel() + 0.5 for v in np.meshgrid(range(camera.width), range(camera.height))], axis=1)
+    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    sample = oracle_surfel.footprint(raw, camera, Rules(), *at.T)
+    axes = np.stack(rotation_axes(raw["rotation"]), axis=2)
+    for i in np.flatnonzero(~oracle_surfel.culled(raw, camera, Rules())):
+        p, (u, v, _) = to_camera @ (raw["position"][i] - origin), (to_camera @ axes[i]).T
+        σ, opacity = np.exp(raw["scale"][i]), 1 / (1 + np.exp(-raw["opacity"][i, 0]))
+        pixel = np.argmax(sample.unclamped[i] * (sample.jump[i] > 1e-6))
+        ray = np.array([*(at[pixel] - middle) / focal, 1])
+        a, b, t = np.linalg.solve(np.stack([-σ[0] * u, -σ[1] * v, ray], axis=1), p)
+        screen = constants.LOW_PASS_INV_VARIANCE * np.sum((at[pixel] - focal * p[:2] / p[2] - middle) ** 2)
+        on_disc = t > 0 and a**2 + b**2 < screen
+        rho, z = (a**2 + b**2, t) if on_disc else (screen, p[2])
+        assert sample.alpha[i, pixel] == pytest.approx(min(constants.ALPHA_MAX, opacity * np.exp(-rho / 2)))
+        assert sample.z[i, pixel] == pytest.approx(z)
+        tested += on_disc
+    assert tested > 5
 
 
 def test_exact_gradients_are_slopes_of_the_oracle() -> None:
@@ -231,7 +255,7 @@ def test_tile_lists_hold_what_contributes_and_little_else(seed: int, thinness: f
     assert len(listed) == lists.pairs, "a pair is listed twice"
     y, x = (v.ravel() + 0.5 for v in np.mgrid[0 : camera.height, 0 : camera.width])
     alpha = oracle_surfel.footprint(scene.raw, scene.camera, Rules(), x, y).alpha
-    alpha[oracle_surfel.camera_surfels(scene.raw, scene.camera)["opacity"] == 0] = 0
+    alpha[oracle_surfel.culled(scene.raw, scene.camera, Rules())] = 0
     needed = needed_pairs(alpha, camera, lists)
     assert needed <= listed
     if thinness == 1:  # needles lie between pixels
@@ -245,7 +269,8 @@ def test_tile_lists_are_in_the_oracles_order(seed: int, tile: tuple[int, int]) -
     scene = make_scene(seed)
     camera = scene.fast_camera()
     lists = list_by_tile(project(scene.surfels(), camera), camera)
-    order = oracle_surfel.order(oracle_surfel.camera_surfels(scene.raw, scene.camera), scene.camera)
+    pixels = np.arange(camera.width * camera.height)
+    order = oracle.sorted_rows(scene.raw, scene.camera, pixels).reshape(-1, camera.height, camera.width)
     surfel, compared = lists.surfel_from_pair.numpy(), 0
     for i, (begin, end) in enumerate(zip(lists.pair_begin.numpy(), lists.pair_end.numpy(), strict=True)):
         y, x = (k * size for k, size in zip(divmod(i, lists.tiles_x), camera.tile[::-1], strict=True))
