@@ -63,23 +63,24 @@ GAUSSIAN_LOW_PASS = 0.3
 fitted with it. [3DGS, released code]"""
 
 GAUSSIAN_SLOPE_MARGIN = 0.15
-"""Share of the image's width and height beyond its border from which on the projection of a 3D Gaussian is
-linearised there, and not at its centre: the affine approximation of what lies far beside the view would cover
-all of it. [3DGS, released code: 1.3 tan(fov/2)]"""
+"""Margin around the image, as a part of its width and height. A 3D Gaussian whose centre lies beyond it is
+linearised at the margin's border instead of at the centre: far outside the view, the affine approximation
+would cover the whole image. [3DGS, released code: 1.3 tan(fov/2)]"""
 
 PRUNE_LIMIT = 50.0
 """PSNR in dB of a pruned image against the whole one, at least: a root mean square error of 0.8 of a step of
 an 8-bit image. The default of `refgs export --limit`."""
 
 TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
-"""Focal lengths in pixels, and width and height in pixels of the tiles of cameras below them. The pixels of a
-tile share a list of surfels and its order: large tiles give one order to more of the image, and evaluate
-more surfels that miss a pixel; small ones need more lists. [measured, docs/decisions.md]"""
+"""Rows of (limit of the focal length, (tile width, tile height)), all in pixels: a camera has the tiles of
+the first row whose limit is above its focal length. The pixels of a tile share a list of surfels and its
+order: large tiles give one order to more of the image, and evaluate more surfels that miss a pixel; small
+ones need more lists. [measured, docs/decisions.md]"""
 
-PACKET_EDGE = 8
-"""Pixels along each axis of what a SIMD packet works on: one tile, or as many as fit. 16 lanes, those of
-AVX-512, have 4 pixels each. A packet waits for the longest list of its tiles; those of neighbours are alike,
-and hold the same surfels."""
+PATCH_EDGE = 8
+"""Width and height, in pixels, of the patch that one SIMD vector works on: one tile of 8 × 8, or several
+smaller ones. With AVX-512, each of its 16 lanes has 4 pixels. A vector runs until the longest list of its
+tiles ends, so a patch joins neighbouring tiles, whose lists are alike."""
 
 LANE_PIXELS_PER_AXIS = 2
 """Blocks of a tile along each axis. A lane does the pixel at its place in every block: what it reads of a

@@ -37,8 +37,8 @@ FLOPS = {"forward": 60, "both": 260}
 CHAINS = 16
 """Independent sums per lane: more than latency times ports of any CPU's multiply-add unit."""
 STEPS = 4096
-PACKETS = 256
-"""Packets of 16 lanes: enough blocks for every thread."""
+VECTORS = 256
+"""SIMD vectors of 16 lanes: enough blocks for every thread."""
 TRIES = 12
 FLOAT = 4  # bytes
 LISTED_BYTES = 24
@@ -53,7 +53,7 @@ def measure_peaks(triad: int) -> dict[str, float]:
     factors = [dr.opaque(mi.Float, 0.5 + 0.01 * i) for i in range(CHAINS)]
     steps = dr.opaque(mi.UInt32, STEPS)
     a, b = (dr.opaque(mi.Float, x, triad) for x in (1.0, 2.0))
-    lanes = PACKETS * 16 * dr.thread_count()
+    lanes = VECTORS * 16 * dr.thread_count()
 
     def multiply_add() -> Any:
         def body(i: Any, sums: list[Any]) -> Any:

@@ -136,7 +136,7 @@ def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[
     names = [assignment.name.partition(".")[0] for assignment in change.set]
     placed = joined or change.moves
     indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
-    read = {*shading.channels, *surfels.primitive.widths}
+    read = {*shading.required_attributes, *surfels.primitive.widths}
     read |= {"indirect_sh"} if indirect else set()
     notes = [
         f"{name}: no image of this run depends on it "

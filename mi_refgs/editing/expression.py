@@ -231,7 +231,7 @@ class SurfelValues(Mapping[str, np.ndarray]):
         for name in bright:
             self._compute[f"{name}.luminance"] = partial(lambda name: self.activated(name) @ LUMINANCE, name)
         if bright:
-            fitted = "radiance_sh" in scene.shading.channels
+            fitted = "radiance_sh" in scene.shading.required_attributes
             shaded = COLOUR if fitted and has_colour else "albedo"
             self._compute["luminance"] = lambda: self[f"{shaded}.luminance"]
 

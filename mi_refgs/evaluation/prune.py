@@ -131,7 +131,7 @@ class _Search:
         if shading.occlusion:
             defaults = {name: getattr(ShadingOptions, name) for name in TRACED}
             self.attempt("mesh", mesh=None, shading=replace(shading, occlusion=False, **defaults))
-        needed = {*self.scene.surfels.primitive.widths, *shading.channels}
+        needed = {*self.scene.surfels.primitive.widths, *shading.required_attributes}
         for name in [name for name in self.scene.surfels.raw if name not in needed]:
             raw = {other: values for other, values in self.scene.surfels.raw.items() if other != name}
             self.attempt(name, surfels=Surfels(raw))

@@ -171,7 +171,7 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
         colours[order],
         rng=rng,
         primitive=method.surfels.primitive,
-        channels=["radiance_sh"],
+        attributes=["radiance_sh"],
         degree={"radiance_sh": options.degree},
         largest=options.size * distance,
         opacity=options.opacity,
@@ -232,7 +232,7 @@ def initial_surfels(
         colours[order],
         rng=rng,
         primitive=options.primitive,
-        channels=options.channels,
+        attributes=options.channels,
         degree={name: options.degree_of(name) for name in options.channels},
         **start,
     )

@@ -19,8 +19,8 @@ import numpy as np
 from mi_refgs.errors import InputError
 
 LOOK_AHEAD = 64
-"""Largest number of elements that kernels read beyond the end of an array: a packet of the widest machine."""
-ALIGNMENT = 64  # bytes of the widest packet
+"""Elements that kernels read beyond the end of an array, at most: a SIMD vector of the widest machine."""
+ALIGNMENT = 64  # bytes of the widest SIMD vector
 
 
 def machine() -> dict[str, Any]:
@@ -64,7 +64,7 @@ def require_supported_variant(what: str) -> None:
 
 
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
-    """A flat copy in memory aligned to packets, LOOK_AHEAD zeros after its end.
+    """A flat copy in memory aligned to SIMD vectors, LOOK_AHEAD zeros after its end.
 
     Dr.Jit compiles one kernel for aligned and another for unaligned memory. NumPy's memory is either by
     chance, and cached kernels would fit only some of the later processes.
@@ -80,9 +80,9 @@ def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
 def upload(values: np.ndarray, kind: Any = None) -> Any:
     """A flat mi.Float (or another `kind`) with the values, in memory that Dr.Jit has allocated.
 
-    `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole packets, and so beyond its end:
-    the process crashes if the next page is not mapped. That memory may also be aligned to packets or not:
-    each array has two kernels, and which one a training step compiles changes from view to view. Dr.Jit
+    `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole SIMD vectors, and so beyond its
+    end: the process crashes if the next page is not mapped. That memory may also be aligned to vectors or
+    not: each array has two kernels, and which one a training step compiles changes from view to view. Dr.Jit
     copies arrays of vectors, such as `mi.Point3f(points.T)`, element by element: they need none of this.
     Raises InputError under a variant that is not supported.
     """

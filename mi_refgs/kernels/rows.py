@@ -1,4 +1,4 @@
-"""Arrays of rows that are read and written in packets: a few wide accesses per row, not one per column."""
+"""Rows of floats, read and written in a few wide accesses per row, not in one per column."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import mitsuba as mi
 
 from mi_refgs.types import Float
 
-PACKET = 8
-"""Floats per access: Dr.Jit's LLVM code splits wider packets into these."""
+ACCESS = 8
+"""Floats per access: Dr.Jit's LLVM code splits wider ones into these."""
 
 COPIES_BYTES = 1 << 30
 """Largest memory of the copies per thread that `PackedRows.add` makes; above it, additions are atomic. The
@@ -21,16 +21,16 @@ gradient of a million surfels with 14 features, 24 floats per row, has 96 MB per
 
 @dataclass(frozen=True)
 class PackedRows:
-    """N rows of `width` floats, each padded with zeros to whole packets; no derivative."""
+    """N rows of `width` floats, each padded with zeros to whole accesses; no derivative."""
 
-    data: Float  # (N · packets · PACKET,)
+    data: Float  # (N · accesses · ACCESS,)
     count: int
     width: int
 
     @property
-    def packets(self) -> int:
-        """Packets per row."""
-        return _padded(self.width) // PACKET
+    def accesses(self) -> int:
+        """Accesses per row."""
+        return _padded(self.width) // ACCESS
 
     @staticmethod
     def zeros(count: int, width: int) -> PackedRows:
@@ -43,9 +43,9 @@ class PackedRows:
         count, width = dr.width(columns[0]), len(columns)
         rows = PackedRows(dr.empty(mi.Float, count * _padded(width)), count, width)
         values = [dr.detach(column) for column in columns]
-        for place, packet in rows._packets(dr.arange(mi.UInt32, count), values):
-            # Without the promise of no conflicts every packet would be a kernel of its own.
-            dr.scatter(rows.data, packet, place, mode=dr.ReduceMode.NoConflicts)
+        for place, group in rows._groups(dr.arange(mi.UInt32, count), values):
+            # Without the promise of no conflicts every group would be a kernel of its own.
+            dr.scatter(rows.data, group, place, mode=dr.ReduceMode.NoConflicts)
         return rows
 
     def columns(self) -> list[Any]:
@@ -56,14 +56,14 @@ class PackedRows:
         """The rows without their padding, (N · width,)."""
         entry = dr.arange(mi.UInt32, self.count * self.width)
         row = entry // self.width
-        return dr.gather(mi.Float, self.data, row * (self.packets * PACKET) + (entry - row * self.width))
+        return dr.gather(mi.Float, self.data, row * (self.accesses * ACCESS) + (entry - row * self.width))
 
     def fetch(self, row: Any, active: Any = True) -> list[Any]:
         """Values of rows, one array per column, then per column of the padding."""
-        shape = (PACKET, dr.width(row))
-        places = [row * self.packets + i for i in range(self.packets)]
-        packets = [dr.gather(mi.ArrayXf, self.data, place, active, shape=shape) for place in places]
-        return [value for packet in packets for value in packet]
+        shape = (ACCESS, dr.width(row))
+        places = [row * self.accesses + i for i in range(self.accesses)]
+        groups = [dr.gather(mi.ArrayXf, self.data, place, active, shape=shape) for place in places]
+        return [value for group in groups for value in group]
 
     def add(self, row: Any, values: list[Any], active: Any) -> None:
         """Add values, one array per column, to rows.
@@ -73,18 +73,18 @@ class PackedRows:
         # Dr.Jit itself always adds atomically to more than a million entries.
         copies = 4 * dr.width(self.data) * dr.thread_count()
         mode = dr.ReduceMode.Expand if copies <= COPIES_BYTES else dr.ReduceMode.Local
-        for place, packet in self._packets(row, values):
-            dr.scatter_add(self.data, packet, place, active, mode=mode)
+        for place, group in self._groups(row, values):
+            dr.scatter_add(self.data, group, place, active, mode=mode)
 
-    def _packets(self, row: Any, values: list[Any]) -> list[tuple[Any, Any]]:
-        padded = values + [mi.Float(0)] * (self.packets * PACKET - len(values))
-        groups = [padded[i : i + PACKET] for i in range(0, len(padded), PACKET)]
-        return [(row * self.packets + i, mi.ArrayXf(group)) for i, group in enumerate(groups)]
+    def _groups(self, row: Any, values: list[Any]) -> list[tuple[Any, Any]]:
+        padded = values + [mi.Float(0)] * (self.accesses * ACCESS - len(values))
+        groups = [padded[i : i + ACCESS] for i in range(0, len(padded), ACCESS)]
+        return [(row * self.accesses + i, mi.ArrayXf(group)) for i, group in enumerate(groups)]
 
 
 def _padded(width: int) -> int:
     """Floats of a row with its padding."""
-    return -(-width // PACKET) * PACKET
+    return -(-width // ACCESS) * ACCESS
 
 
 def columns_of(array: Any, width: int) -> list[Any]:
@@ -114,30 +114,30 @@ class _Columns(dr.CustomOp):
         return "columns"
 
     @property
-    def packet(self) -> int:
-        """Floats per access: the widest packet that divides a row."""
-        return math.gcd(self.width, PACKET)
+    def access(self) -> int:
+        """Floats per access: the most that divide a row."""
+        return math.gcd(self.width, ACCESS)
 
     def _split(self, array: Any) -> list[Any]:
-        count, packets = dr.width(array) // self.width, self.width // self.packet
-        row = dr.arange(mi.UInt32, count) * packets
-        if self.packet == 1:
+        count, accesses = dr.width(array) // self.width, self.width // self.access
+        row = dr.arange(mi.UInt32, count) * accesses
+        if self.access == 1:
             return [dr.gather(mi.Float, array, row + i) for i in range(self.width)]
-        shape = (self.packet, count)
-        return [x for i in range(packets) for x in dr.gather(mi.ArrayXf, array, row + i, shape=shape)]
+        shape = (self.access, count)
+        return [x for i in range(accesses) for x in dr.gather(mi.ArrayXf, array, row + i, shape=shape)]
 
     def _join(self, columns: list[Any]) -> Any:
         if self.width == 1:
             return columns[0]
-        if self.packet == 1 and self.width > PACKET:
+        if self.access == 1 and self.width > ACCESS:
             # To write column by column, 16 cache lines each time, takes four times as long.
             return PackedRows.pack(columns).unpadded()
-        count, packets = dr.width(columns), self.width // self.packet
-        flat, row = dr.empty(mi.Float, count * self.width), dr.arange(mi.UInt32, count) * packets
-        for i in range(packets):
-            group = columns[i * self.packet : (i + 1) * self.packet]
-            value = group[0] if self.packet == 1 else mi.ArrayXf(group)
-            # Without the promise of no conflicts every packet would be a kernel of its own.
+        count, accesses = dr.width(columns), self.width // self.access
+        flat, row = dr.empty(mi.Float, count * self.width), dr.arange(mi.UInt32, count) * accesses
+        for i in range(accesses):
+            group = columns[i * self.access : (i + 1) * self.access]
+            value = group[0] if self.access == 1 else mi.ArrayXf(group)
+            # Without the promise of no conflicts every group would be a kernel of its own.
             dr.scatter(flat, value, row + i, mode=dr.ReduceMode.NoConflicts)
         dr.eval(flat)  # it may become the gradient itself, which others write into
         return flat

@@ -182,7 +182,7 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     default = Shading.default_reflectance(surfels.raw)
     reflectance = _choice(props, "reflectance", default, tuple(MODELS))
     diffuse = _choice(props, "diffuse", Shading.default_diffuse(reflectance, surfels.raw), DIFFUSE)
-    at: Any = _choice(props, "shade_at", MODELS[reflectance].orders[0], ("pixel", "surfel"))
+    at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
     shading = Shading(at, reflectance, diffuse)
     occlusion = _flag(props, "occlusion", mesh is not None and shading.traceable)

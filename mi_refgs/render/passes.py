@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import PACKET_EDGE
+from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.kernels.memory import PASS_SAMPLES, require_image
 from mi_refgs.splat.camera import Camera
 
@@ -42,7 +42,7 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
     """Divide an image into bands of at most `most` samples (default: PASS_SAMPLES), factor² per pixel.
 
     `margin`: pixels of neighbours on which a pixel depends. Without one, the last band may reach below the
-    image, as high as the others. A band has PACKET_EDGE rows of samples at least.
+    image, as high as the others. A band has PATCH_EDGE rows of samples at least.
     """
     most = PASS_SAMPLES if most is None else most
     width, height = camera.width, camera.height
@@ -50,7 +50,7 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
     left, right = min(margin, offset[0]), min(margin, film[0] - offset[0] - width)
     high = height
     if width * height * factor**2 > most:
-        step = PACKET_EDGE // math.gcd(PACKET_EDGE, factor)  # tiles of all bands begin at their first row
+        step = PATCH_EDGE // math.gcd(PATCH_EDGE, factor)  # tiles of all bands begin at their first row
         highest = max(most // (width * factor**2) // step * step, step)
         count = -(-height // highest)
         high = -(-height // (count * step)) * step

@@ -1,7 +1,7 @@
 """Render surfels to an image, in the two orders that every method is made of.
 
-    forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.order` is "surfel")
-    deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.order` is "pixel")
+    forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.shaded_at` is "surfel")
+    deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.shaded_at` is "pixel")
 
 Both use the same splatter and the same `shade`. Everything is traced by Dr.Jit. No derivative: visibility,
 the side to which a normal is turned, the camera, and those that `mi_refgs.splat.composite` lists.
@@ -113,7 +113,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     require_known_primitive(scene.surfels.raw)
     scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
     view = _View.of(*_without_empty_tables(scene, request), camera)
-    frame, buffer = _shade_at_surfels(view) if scene.shading.order == "surfel" else _shade_at_pixels(view)
+    frame, buffer = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
     if request.forward_only:
         frame = _in_raster_order(frame.only(request.aovs), buffer.pixels)
     return boundary(frame, "shade backward")
@@ -177,7 +177,7 @@ class _View:
     def of(scene: SurfelScene, request: Request, camera: Camera) -> _View:
         surfels, surroundings = scene.surfels, scene.surroundings
         seen = _seen(surfels, camera, request.sh_degree)
-        attributes = {**scene.shading.model.attributes(surfels, seen, scene.shading)}
+        attributes = {**scene.shading.model.values(surfels, seen, scene.shading)}
         normal = attributes.pop("normal", seen.normal)  # the model's own, or the surfels'
         others: dict[str, Any] = {}
         geometry, background = surfels, None

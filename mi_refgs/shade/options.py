@@ -1,6 +1,6 @@
 """How light becomes radiance, as data: the one declaration of every shading option.
 
-To add an option, add a field here and name it in `Reflectance.options` of the models that honour it. Method
+To add an option, add a field here and name it in `Reflectance.honoured` of the models that honour it. Method
 files, the plugin's properties, `scene.xml` and `model.json` read and write it from then on.
 """
 
@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_type_hints
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 
-Order = Literal["pixel", "surfel"]
+ShadedAt = Literal["pixel", "surfel"]
 """Deferred shading of blended attributes per pixel, or forward shading per surfel before blending."""
 
 Diffuse = Literal["sh", "irradiance"]
@@ -45,7 +45,7 @@ class ShadingOptions:
     Raises InputError for a value of another type or out of range; `Shading` refuses combinations.
     """
 
-    at: Order = "pixel"  # deferred shading per pixel or forward shading per surfel
+    at: ShadedAt = "pixel"  # deferred shading per pixel or forward shading per surfel
     reflectance: str = "split_sum"  # a name in `reflectance.MODELS`
     diffuse: Diffuse = "sh"  # fitted SH radiance, or albedo times the irradiance of the light
     occlusion: bool = field(default=False, metadata=NOT_A_SETTING)  # trace visibility; follows from a mesh

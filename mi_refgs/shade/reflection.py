@@ -111,7 +111,7 @@ class MeshRadiance:
         surface = occluder.surface(surfels)
         coefficients = surfels.value("radiance_sh") if options.diffuse == "sh" else []
         # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose adjoint
-        # writes packets, must not be written to in the same kernel.
+        # writes several columns at a time, must not be written to in the same kernel.
         harmonics = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c])) if coefficients else mi.Float()
         dr.eval(surface.rows, harmonics)
         return MeshRadiance(occluder, surface, light, options, harmonics, len(coefficients), ambient)

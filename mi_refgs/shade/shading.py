@@ -11,7 +11,7 @@ from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.lobe_matrices import Levels
-from mi_refgs.shade.options import DIFFUSE, TRACED, Diffuse, Order, ShadingOptions
+from mi_refgs.shade.options import DIFFUSE, TRACED, Diffuse, ShadedAt, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import MODELS, Reflectance
 
@@ -27,8 +27,8 @@ class Shading(ShadingOptions):
         # (what is not allowed, the message)
         rules = [
             (
-                self.order not in model.orders,
-                f"reflectance: {self.reflectance} needs shade_at = {model.orders[0]}; set it",
+                self.shaded_at not in model.shaded_at,
+                f"reflectance: {self.reflectance} needs shade_at = {model.shaded_at[0]}; set it",
             ),
             (
                 self.occlusion and not self.traceable,
@@ -43,7 +43,7 @@ class Shading(ShadingOptions):
                 f"{', '.join(TRACED)}: need occlusion; trace a `mesh`",
             ),
             (
-                self.antialias and self.order != "pixel",
+                self.antialias and self.shaded_at != "pixel",
                 "antialias: needs shade_at = pixel; set it, or leave it out",
             ),
         ]
@@ -74,14 +74,14 @@ class Shading(ShadingOptions):
     def default_reflectance(attributes: Collection[str]) -> str:
         """The first model whose attributes are available, with either diffuse; else the one of fewest."""
         each = [ShadingOptions(diffuse=diffuse) for diffuse in DIFFUSE]
-        needs = {name: min(map(model.channels, each), key=len) for name, model in MODELS.items()}
+        needs = {name: min(map(model.required_attributes, each), key=len) for name, model in MODELS.items()}
         able = (name for name, needed in needs.items() if {*needed} <= {*attributes})
         return next(able, min(needs, key=lambda name: len(needs[name])))
 
     @staticmethod
     def default_diffuse(reflectance: str, attributes: Collection[str]) -> Diffuse:
         """The first diffuse whose attributes are available; else the one of fewest."""
-        needs = {d: {*MODELS[reflectance].channels(ShadingOptions(diffuse=d))} for d in DIFFUSE}
+        needs = {d: {*MODELS[reflectance].required_attributes(ShadingOptions(diffuse=d))} for d in DIFFUSE}
         able = (diffuse for diffuse in DIFFUSE if needs[diffuse] <= {*attributes})
         return next(able, min(DIFFUSE, key=lambda diffuse: len(needs[diffuse])))
 
@@ -91,19 +91,21 @@ class Shading(ShadingOptions):
         return MODELS[self.reflectance]
 
     @property
-    def order(self) -> Order:
+    def shaded_at(self) -> ShadedAt:
         """Where it is shaded: `at`, but "surfel", which blends less, if the image is the same either way."""
         return "surfel" if self.model.order_independent else self.at
 
     @property
-    def channels(self) -> tuple[str, ...]:
+    def required_attributes(self) -> tuple[str, ...]:
         """Attributes beside the geometry that the surfels must have."""
-        return self.model.channels(self)
+        return self.model.required_attributes(self)
 
     @property
     def traceable(self) -> bool:
         """Whether the model can trace visibility where it is shaded."""
-        return self.model.visibility == "own" or (self.model.visibility == "mirror" and self.order == "pixel")
+        return self.model.visibility == "own" or (
+            self.model.visibility == "mirror" and self.shaded_at == "pixel"
+        )
 
     @property
     def neighbours(self) -> int:
@@ -125,7 +127,7 @@ class Shading(ShadingOptions):
 
     def require_inputs(self, attributes: Collection[str], light: bool = True, mesh: bool = True) -> None:
         """Raise InputError if an attribute, the light or the mesh that the model needs is missing."""
-        for name in self.channels:
+        for name in self.required_attributes:
             if name not in attributes:
                 raise InputError(f"shading: {name}: the surfels have no such attribute; add it, or drop it")
         if self.model.light != "none" and not light:

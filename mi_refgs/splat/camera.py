@@ -212,7 +212,7 @@ class Camera:
         """The part of the view from pixel (x, y), which may lie outside the image.
 
         Tiles, random numbers and borders are those of the whole image. Kernels do not depend on x and y, if
-        these are multiples of PACKET_EDGE.
+        these are multiples of PATCH_EDGE.
         """
         cx, cy = self.cx - dr.opaque(mi.Float, x), self.cy - dr.opaque(mi.Float, y)
         offset = self.offset[0] + x, self.offset[1] + y

@@ -65,7 +65,7 @@ def composite(
     """Composite features of surfels; differentiable in these and in the columns of the footprints.
 
     `forward_only`: no derivatives, depth only if `depth` (with derivatives it is always there), and pixels of
-    empty packets left out, so that what shades the others is faster: maps are in the order of `pixels`. Alpha
+    empty patchs left out, so that what shades the others is faster: maps are in the order of `pixels`. Alpha
     is then 1 - T instead of one more sum, and equal to rounding.
     """
     if not forward_only:

@@ -10,9 +10,9 @@ and its 8 lanes a … h:
     a b c d | a b c d
     e f g h | e f g h
 
-A packet of PACKET_EDGE² pixels, one tile or several, fills a SIMD vector with its lanes (here 2 tiles, one
-above the other: 16 lanes). It ends with the last pixel of its tiles. Lanes are in the order of packets, then
-tiles of the packet, then places in the block, each row by row.
+A patch of PATCH_EDGE² pixels, one tile or several, fills a SIMD vector with its lanes (here 2 tiles, one
+above the other: 16 lanes). The vector ends with the last pixel of its tiles. Lanes are in the order of
+patches, then tiles of the patch, then places in the block, each row by row.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PACKET_EDGE, TRANSMITTANCE_MIN
+from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PATCH_EDGE, TRANSMITTANCE_MIN
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
 from mi_refgs.types import Bool, Float, Point2f, UInt32
 
 BLOCKS = LANE_PIXELS_PER_AXIS**2
 """Pixels of a lane."""
-PACKET_LANES = PACKET_EDGE**2 // BLOCKS
-"""Lanes of a packet."""
+PATCH_LANES = PATCH_EDGE**2 // BLOCKS
+"""Lanes of a patch."""
 NOWHERE = 0xFFFFFFFF
-"""Slot of a packet that was not chosen."""
+"""Slot of a patch that was not chosen."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Packets of tiles over an image, row by row."""
+    """Patches of tiles over an image, row by row."""
 
     lists: TileLists
     camera: Camera
@@ -52,24 +52,24 @@ class Grid:
 
     @property
     def tiles(self) -> tuple[int, int]:
-        """Tiles of a packet along each axis."""
-        return PACKET_EDGE // self.camera.tile[0], PACKET_EDGE // self.camera.tile[1]
+        """Tiles of a patch along each axis."""
+        return PATCH_EDGE // self.camera.tile[0], PATCH_EDGE // self.camera.tile[1]
 
     @property
     def columns(self) -> int:
-        """Packets per row of packets."""
+        """Patches per row of patches."""
         return -(-self.lists.tiles_x // self.tiles[0])
 
     @property
-    def packets(self) -> int:
-        """Number of packets."""
+    def patches(self) -> int:
+        """Number of patches."""
         return self.columns * -(-self.lists.tiles_y // self.tiles[1])
 
     def filled(self) -> UInt32:
-        """The packets with a tile that lists a surfel; waits for the device."""
+        """The patches with a tile that lists a surfel; waits for the device."""
         lanes = Lanes.of(self)
         listed = dr.select(lanes.begin < lanes.end, mi.UInt32(1), 0)
-        return dr.compress(dr.block_reduce(dr.ReduceOp.Or, listed, PACKET_LANES) > 0)
+        return dr.compress(dr.block_reduce(dr.ReduceOp.Or, listed, PATCH_LANES) > 0)
 
 
 @dataclass(frozen=True)
@@ -84,17 +84,17 @@ class Lanes:
 
     @staticmethod
     def of(grid: Grid, chosen: UInt32 | None = None) -> Lanes:
-        """The lanes of all packets, or of those `chosen`."""
+        """The lanes of all patches, or of those `chosen`."""
         camera, lists, (lanes_x, lanes_y), (side_x, side_y) = grid.camera, grid.lists, grid.lanes, grid.tiles
-        # Packet, tile in the packet, place in the block.
-        count = grid.packets if chosen is None else dr.width(chosen)
-        lane = dr.arange(mi.UInt32, count * PACKET_LANES)
-        packet, lane = lane // PACKET_LANES, lane % PACKET_LANES
+        # Patch, tile in the patch, place in the block.
+        count = grid.patches if chosen is None else dr.width(chosen)
+        lane = dr.arange(mi.UInt32, count * PATCH_LANES)
+        patch, lane = lane // PATCH_LANES, lane % PATCH_LANES
         if chosen is not None:
-            packet = dr.gather(mi.UInt32, chosen, packet)
+            patch = dr.gather(mi.UInt32, chosen, patch)
         tile, lane = lane // (lanes_x * lanes_y), lane % (lanes_x * lanes_y)
-        tile_x = packet % grid.columns * side_x + tile % side_x
-        tile_y = packet // grid.columns * side_y + tile // side_x
+        tile_x = patch % grid.columns * side_x + tile % side_x
+        tile_y = patch // grid.columns * side_y + tile // side_x
         there = (tile_x < lists.tiles_x) & (tile_y < lists.tiles_y)
         tile = tile_y * lists.tiles_x + tile_x
         # Pixels. Those before the image wrap round to huge numbers, and are not inside either.
@@ -130,7 +130,7 @@ class Lanes:
 
 @dataclass(frozen=True)
 class CompactedPixels:
-    """The P pixels of the packets that list a surfel, packet by packet and block by block.
+    """The P pixels of the patches that list a surfel, patch by patch and block by block.
 
     What a SIMD vector reads is then a square of the image, not a line: neighbours' rays are traced together.
     """
@@ -141,38 +141,38 @@ class CompactedPixels:
 
     @staticmethod
     def of(grid: Grid, chosen: UInt32, lanes: Lanes) -> CompactedPixels:
-        """The pixels of the `chosen` packets, to which these lanes belong."""
-        camera, (lanes_x, lanes_y), packets = grid.camera, grid.lanes, dr.width(chosen)
-        raster = dr.empty(mi.UInt32, BLOCKS * packets * PACKET_LANES)
-        for index, of_block in zip(CompactedPixels._indices(packets), lanes.raster, strict=True):
+        """The pixels of the `chosen` patches, to which these lanes belong."""
+        camera, (lanes_x, lanes_y), patches = grid.camera, grid.lanes, dr.width(chosen)
+        raster = dr.empty(mi.UInt32, BLOCKS * patches * PATCH_LANES)
+        for index, of_block in zip(CompactedPixels._indices(patches), lanes.raster, strict=True):
             dr.scatter(raster, of_block, index, mode=dr.ReduceMode.NoConflicts)
-        slot = dr.full(mi.UInt32, NOWHERE, grid.packets)
-        dr.scatter(slot, dr.arange(mi.UInt32, packets), chosen, mode=dr.ReduceMode.NoConflicts)
+        slot = dr.full(mi.UInt32, NOWHERE, grid.patches)
+        dr.scatter(slot, dr.arange(mi.UInt32, patches), chosen, mode=dr.ReduceMode.NoConflicts)
         dr.eval(raster, slot)
 
-        # From a pixel of the image to its packet, tile, block and lane.
+        # From a pixel of the image to its patch, tile, block and lane.
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         x, y = pixel % camera.width + camera.tile_offset[0], pixel // camera.width + camera.tile_offset[1]
-        slot = dr.gather(mi.UInt32, slot, y // PACKET_EDGE * grid.columns + x // PACKET_EDGE)
-        x, y = x % PACKET_EDGE, y % PACKET_EDGE
+        slot = dr.gather(mi.UInt32, slot, y // PATCH_EDGE * grid.columns + x // PATCH_EDGE)
+        x, y = x % PATCH_EDGE, y % PATCH_EDGE
         tile = y // camera.tile[1] * grid.tiles[0] + x // camera.tile[0]
         x, y = x % camera.tile[0], y % camera.tile[1]
         block = y // lanes_y * LANE_PIXELS_PER_AXIS + x // lanes_x
         lane = tile * (lanes_x * lanes_y) + y % lanes_y * lanes_x + x % lanes_x
-        return CompactedPixels(raster, (slot * BLOCKS + block) * PACKET_LANES + lane, slot != NOWHERE)
+        return CompactedPixels(raster, (slot * BLOCKS + block) * PATCH_LANES + lane, slot != NOWHERE)
 
     @staticmethod
-    def _indices(packets: int) -> list[UInt32]:
+    def _indices(patches: int) -> list[UInt32]:
         """Index among the P pixels of each lane's pixel in each block."""
-        lane = dr.arange(mi.UInt32, packets * PACKET_LANES)
-        first = lane // PACKET_LANES * (BLOCKS * PACKET_LANES) + lane % PACKET_LANES
-        return [first + block * PACKET_LANES for block in range(BLOCKS)]
+        lane = dr.arange(mi.UInt32, patches * PATCH_LANES)
+        first = lane // PATCH_LANES * (BLOCKS * PATCH_LANES) + lane % PATCH_LANES
+        return [first + block * PATCH_LANES for block in range(BLOCKS)]
 
     @staticmethod
-    def scattered(values: list[list[Float]], packets: int) -> list[Float]:
+    def scattered(values: list[list[Float]], patches: int) -> list[Float]:
         """Maps (P,) of values per block, written in the kernel of the loop that made them."""
-        maps = [dr.empty(mi.Float, BLOCKS * packets * PACKET_LANES) for _ in values[0]]
-        for index, of_block in zip(CompactedPixels._indices(packets), values, strict=True):
+        maps = [dr.empty(mi.Float, BLOCKS * patches * PATCH_LANES) for _ in values[0]]
+        for index, of_block in zip(CompactedPixels._indices(patches), values, strict=True):
             for image, value in zip(maps, of_block, strict=True):
                 dr.scatter(image, value, index, mode=dr.ReduceMode.NoConflicts)
         dr.eval(maps)

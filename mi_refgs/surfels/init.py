@@ -30,7 +30,7 @@ def from_points(
     *,
     rng: np.random.Generator,
     primitive: str = "surfel",
-    channels: Sequence[str] | None = None,
+    attributes: Sequence[str] | None = None,
     degree: Mapping[str, int] | None = None,
     scale_factor: float = 1.0,
     largest: np.ndarray | None = None,  # (N,)
@@ -38,7 +38,7 @@ def from_points(
 ) -> Surfels:
     """Surfels at points: scale from the 3 nearest neighbours, normal as given or uniform at random.
 
-    largest: bound of the scales. The tangents are turned at random about the normal. channels: attributes
+    largest: bound of the scales. The tangents are turned at random about the normal. attributes: those
     beside the geometry (default: all). degree: of spherical harmonics by attribute, 0 by default. initial:
     activated values by attribute, such as `roughness=0.3`; defaults are those of `surfels.attributes`.
     `colours` fill the constant coefficient of radiance_sh (grey 0.5 by default). Rotations are uniform over
@@ -47,7 +47,7 @@ def from_points(
     """
     points = _check("points", points, np.shape(points)[:1])
     count = len(points)
-    for name in (*(channels or ()), *(degree or ()), *initial):
+    for name in (*(attributes or ()), *(degree or ()), *initial):
         attribute(name)
     for name, wanted in (degree or {}).items():
         if not 0 <= wanted <= MAX_SH_DEGREE:
@@ -60,7 +60,7 @@ def from_points(
     spacing = spacing if largest is None else np.minimum(spacing, largest)
     raw |= kind.start(spacing, quaternions(normals, count, rng))
     for name, declared in ATTRIBUTES.items():
-        chosen = not declared.geometry if channels is None else name in channels
+        chosen = not declared.geometry if attributes is None else name in attributes
         if name not in raw and (name in kind.widths or chosen):
             width = declared.width((degree or {}).get(name, 0))
             raw[name] = declared.start(count, width, rng, initial.get(name))

@@ -449,7 +449,7 @@ def test_shading_options_of_joined_runs_are_those_of_the_first(option: Any) -> N
 
     def shading(occlusion: bool, value: Any) -> Shading:
         value = option.default if of_rays and not occlusion else value
-        return Shading(model.orders[0], model.name, "irradiance", occlusion, **{option.name: value})
+        return Shading(model.shaded_at[0], model.name, "irradiance", occlusion, **{option.name: value})
 
     traces = [True, False] if model.visibility != "none" else [False]
     for pair, values in product(product(traces, traces), ((option.default, other), (other, option.default))):

@@ -260,12 +260,12 @@ def test_every_channel_of_image_gets_its_gradient(name: str) -> None:
     model, light = MODELS[name], EnvironmentLight.from_radiance(MAP)
     dr.enable_grad(light.raw)
     extra = ("indirect_sh",) if name == "monte_carlo" else ()
-    surfels = table(*model.channels(ShadingOptions()), *extra)
+    surfels = table(*model.required_attributes(ShadingOptions()), *extra)
     surfels.enable_grad()
     pose = np.eye(4)
     pose[2, 3] = -4
     camera = Camera.from_pose(24, 24, 30.0, 30.0, 12, 12, pose)
-    shading = Shading(model.orders[0], name)
+    shading = Shading(model.shaded_at[0], name)
     scene = SurfelScene(surfels, shading, shading.light_of(light))
     frame = render(scene, camera, Request(scene.all_aovs))
     assert frame.terms is not None
@@ -274,7 +274,7 @@ def test_every_channel_of_image_gets_its_gradient(name: str) -> None:
     for channel, tensor in (surfels.raw | {"light": light.raw}).items():
         gradient = dr.grad(tensor).numpy()
         assert np.isfinite(gradient).all() and gradient.any(), channel
-    for missing in model.channels(ShadingOptions()):
+    for missing in model.required_attributes(ShadingOptions()):
         with pytest.raises(InputError, match=missing):
             shading.require_inputs([other for other in surfels.raw if other != missing])
 

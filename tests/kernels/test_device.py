@@ -128,7 +128,7 @@ np.testing.assert_array_equal(numbers.numpy(), expected.ravel())
     ],
 )
 def test_nothing_is_read_beyond_the_end_of_an_array(array: str, dtype: str, tmp_path: Path) -> None:
-    """Kernels read whole packets of flat arrays; arrays of vectors are copied by Dr.Jit itself."""
+    """Kernels read whole SIMD vectors of flat arrays; arrays of vectors are copied by Dr.Jit itself."""
     run_python(GUARDED, array, dtype, folder=tmp_path)
 
 

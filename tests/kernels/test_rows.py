@@ -1,4 +1,4 @@
-"""Tables read and written in packets: values, both derivative modes, accumulation."""
+"""Rows read and written several floats at a time: values, both derivative modes, accumulation."""
 
 from __future__ import annotations
 

@@ -44,11 +44,11 @@ def shadings() -> list[str]:
     stages = [stage.shading for method in names() for stage in load(method).stage.values()]
     found = [(stage.reflectance, stage.at, stage.diffuse) for stage in stages]
     used = {reflectance for reflectance, _, _ in found}
-    found += [(name, model.orders[0], DIFFUSE[0]) for name, model in MODELS.items() if name not in used]
+    found += [(name, model.shaded_at[0], DIFFUSE[0]) for name, model in MODELS.items() if name not in used]
     every: dict[str, None] = {}
     for name, at, diffuse in found:
         model = MODELS[name]
-        split = len({model.channels(ShadingOptions(diffuse=d)) for d in DIFFUSE}) > 1
+        split = len({model.required_attributes(ShadingOptions(diffuse=d)) for d in DIFFUSE}) > 1
         order = "surfel" if model.order_independent else at
         every[f"{name}/{order}/{diffuse if split else DIFFUSE[0]}"] = None
     return [*every]

@@ -46,7 +46,7 @@ def every_channel(model: str, diffuse: Any, gaussians: bool) -> dict[str, np.nda
     raw, rng = raw_channels(COUNT), np.random.default_rng(5)
     if gaussians:
         raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
-    wanted = MODELS[model].channels(ShadingOptions(diffuse=diffuse))
+    wanted = MODELS[model].required_attributes(ShadingOptions(diffuse=diffuse))
     for name in wanted:
         raw.setdefault(name, rng.normal(size=(COUNT, attribute(name).widths[0])).astype(np.float32))
     kept = {"position", "rotation", "scale", "opacity", *wanted}

@@ -73,11 +73,11 @@ def shadings() -> list[tuple[Shading, str]]:
         method = read.load(name, "quick")
         for (_, stage), meshed in itertools.product(method.stages(), {False, method.mesh is not None}):
             shading = Shading.resolve(stage.shading, meshed)
-            found[replace(shading, at=shading.order), method.surfels.primitive] = None
+            found[replace(shading, at=shading.shaded_at), method.surfels.primitive] = None
     for name, model in MODELS.items():
-        for order in model.orders:
-            found[Shading(Shading(order, name).order, name), "surfel"] = None
-        plain = Shading(Shading(model.orders[0], name).order, name, diffuse="irradiance")
+        for order in model.shaded_at:
+            found[Shading(Shading(order, name).shaded_at, name), "surfel"] = None
+        plain = Shading(Shading(model.shaded_at[0], name).shaded_at, name, diffuse="irradiance")
         traced = replace(plain, occlusion=plain.traceable)
         options = {key: OTHER_OPTIONS[key] for key in model.honours if traced.occlusion or key not in TRACED}
         if options:

@@ -181,7 +181,7 @@ def test_all_views_and_regions_share_one_kernel() -> None:
 def sheet(normal: np.ndarray, points: np.ndarray, size: float) -> Surfels:
     """Opaque round surfels of one normal."""
     normals, rng = np.tile(normal, (len(points), 1)), np.random.default_rng(0)
-    raw = from_points(points, normals, rng=rng, channels=["radiance_sh"], opacity=0.99).to_numpy()
+    raw = from_points(points, normals, rng=rng, attributes=["radiance_sh"], opacity=0.99).to_numpy()
     raw["scale"] = np.full_like(raw["scale"], np.log(size))
     return Surfels.from_numpy(raw)
 

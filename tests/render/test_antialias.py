@@ -102,7 +102,7 @@ def mirror_ball() -> tuple[Surfels, EnvironmentLight]:
     direction = rng.normal(size=(4000, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     names = ("albedo", "metallic", "roughness", "radiance_sh")
-    raw = from_points(direction, direction, rng=rng, channels=names).to_numpy()
+    raw = from_points(direction, direction, rng=rng, attributes=names).to_numpy()
     raw["opacity"][:] = 3.0
     raw["albedo"][:], raw["metallic"][:], raw["roughness"][:] = 3.0, 6.0, -2.5
     stripes = np.tile(np.where(np.arange(128) % 8 < 4, 2.0, 0.1)[None, :, None], (64, 1, 3))

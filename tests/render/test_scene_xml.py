@@ -39,10 +39,8 @@ from tests.scenes.integrator import (
 
 def shading_with(option: str) -> Shading:
     """A shading whose model honours the option, with OTHER_OPTIONS's value."""
-    name = next(name for name, model in MODELS.items() if option in model.honours)
-    return Shading(
-        MODELS[name].orders[0], name, diffuse="irradiance", occlusion=True, **{option: OTHER_OPTIONS[option]}
-    )
+    model = next(model for model in MODELS.values() if option in model.honours)
+    return Shading(model.shaded_at[0], model.name, "irradiance", True, **{option: OTHER_OPTIONS[option]})
 
 
 def fitted(folder: Path, shading: Shading) -> TrainedScene:

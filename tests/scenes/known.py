@@ -83,7 +83,7 @@ def known_surfels() -> Surfels:
     points = CENTRES[ball] + RADII[ball, None] * normals
     channels = ["radiance_sh", "albedo", "metallic", "roughness"]
     rng = np.random.default_rng(0)
-    surfels = from_points(points, normals, rng=rng, channels=channels, scale_factor=0.8, opacity=0.999)
+    surfels = from_points(points, normals, rng=rng, attributes=channels, scale_factor=0.8, opacity=0.999)
     raw = surfels.to_numpy()
     for name in ("albedo", "metallic", "roughness"):
         values = np.array([np.atleast_1d(material[name]) for material in (METAL, CLAY)])

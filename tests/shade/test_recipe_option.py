@@ -39,7 +39,7 @@ def test_recipe_of_a_shading_option(tmp_path: Path) -> None:
         copy(ROOT / name, tmp_path / name)
     for path, before, after in (
         (OPTION, "    antialias: bool", "    gloss: int = number(1, 1, 5)\n    antialias: bool"),
-        (MODEL, '    light = "radiance"', '    light = "radiance"\n    options = ("gloss",)'),
+        (MODEL, '    light = "radiance"', '    light = "radiance"\n    honoured = ("gloss",)'),
         (MODEL, "share * light.radiance(mirror)", "options.gloss * share * light.radiance(mirror)"),
     ):
         text = (tmp_path / path).read_text()

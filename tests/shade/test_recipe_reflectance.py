@@ -35,11 +35,11 @@ class Phong(Reflectance):
 
     name = "phong"
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("albedo", "shininess")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
-        return {name: surfels.value(name) for name in self.channels(options)}
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+        return {name: surfels.value(name) for name in self.required_attributes(options)}
 
     def shade(self, points: ShadingPoints, light: Any, options: ShadingOptions) -> RadianceTerms:
         normal, view = safe_normalize(points.normal), safe_normalize(points.view)

@@ -16,7 +16,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.light.light import ConstantLight
-from mi_refgs.shade.options import Diffuse, Order, ShadingOptions
+from mi_refgs.shade.options import Diffuse, ShadedAt, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
 from mi_refgs.shade.shading import Shading
@@ -77,7 +77,7 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
     surfels = "[surfels]\nchannels = ['radiance_sh']\n"
     path.write_text(f"iterations = 100\n{surfels}{STAGE}reflectance = 'radiance'")
     stage = load(str(path)).stage["only"]
-    assert stage.shading.at == "pixel" and Shading.resolve(stage.shading, mesh=True).order == "surfel"
+    assert stage.shading.at == "pixel" and Shading.resolve(stage.shading, mesh=True).shaded_at == "surfel"
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_rendering_without_what_it_needs_is_refused() -> None:
 def test_every_mode_that_is_not_refused_renders() -> None:
     """Each reflectance, order and diffuse with the attributes that `require_inputs` requires only."""
     raw = raw_channels()
-    for reflectance, diffuse, at in product(("radiance", "split_sum"), get_args(Diffuse), get_args(Order)):
+    for reflectance, diffuse, at in product(("radiance", "split_sum"), get_args(Diffuse), get_args(ShadedAt)):
         shading = Shading(at, reflectance, diffuse)
         few = {name: values for name, values in raw.items() if name not in needless(shading)}
         options: dict = {"shade_at": at, "reflectance": reflectance, "diffuse": diffuse}
@@ -147,10 +147,10 @@ class Complete(Reflectance):
 
     name = "complete"
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("albedo",)
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         return {"albedo": surfels.value("albedo")}
 
     def shade(self, points: ShadingPoints, light: Any, options: ShadingOptions) -> RadianceTerms:
@@ -158,15 +158,15 @@ class Complete(Reflectance):
 
 
 INCOMPLETE: dict[str, tuple[dict[str, Any], str]] = {
-    "no channels": ({"channels": Reflectance.channels}, "channels is missing; write that method"),
-    "no attributes": ({"attributes": Reflectance.attributes}, "attributes is missing"),
+    "no needs": ({"required_attributes": Reflectance.required_attributes}, "required_attributes is missing"),
+    "no values": ({"values": Reflectance.values}, "values is missing; write that method"),
     "no shade": ({"shade": Reflectance.shade}, "shade is missing"),
     "rays of its own, and none": ({"visibility": "own"}, "trace is missing"),
     "no such rays": ({"visibility": "many"}, "visibility: 'many' is not allowed; use none or mirror or own"),
     "no such lookup": ({"light": "sharp"}, "light: 'sharp' is not allowed"),
-    "no order": ({"orders": ()}, "orders: () is not allowed; use pixel or surfel"),
-    "a name in place of orders": ({"orders": "pixel"}, "orders: 'pixel' is not allowed"),
-    "no such option": ({"options": ("speed",)}, "options: ('speed',) is not allowed; use dominant"),
+    "no order": ({"shaded_at": ()}, "shaded_at: () is not allowed; use pixel or surfel"),
+    "a name in place of several": ({"shaded_at": "pixel"}, "shaded_at: 'pixel' is not allowed"),
+    "no such option": ({"honoured": ("speed",)}, "honoured: ('speed',) is not allowed; use dominant"),
     "no name": ({"name": ""}, "the name is empty or in use"),
     "another's name": ({"name": "split_sum"}, "'split_sum': the name is empty or in use"),
 }

@@ -152,13 +152,13 @@ def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pyt
     assert blended == [deferred if at == "pixel" else 3 + (more | {"depth": 1}).get(name, 0)]
 
 
-def test_compacted_pixels_contain_each_pixel_of_chosen_packets_once() -> None:
+def test_compacted_pixels_contain_each_pixel_of_chosen_patches_once() -> None:
     view = camera_at(30.0, (3, 2))
     footprints = splat.project(things(), view)
     lists = splat.list_by_tile(footprints, view)
     grid = Grid(lists, view)
     chosen = grid.filled()
-    assert 0 < dr.width(chosen) < grid.packets
+    assert 0 < dr.width(chosen) < grid.patches
     pixels = CompactedPixels.of(grid, chosen, Lanes.of(grid, chosen))
     there, raster = np.array(pixels.there), np.array(pixels.raster)
     back = raster[np.array(pixels.index)[there]]
@@ -168,7 +168,7 @@ def test_compacted_pixels_contain_each_pixel_of_chosen_packets_once() -> None:
 
 
 def test_second_view_reuses_kernels() -> None:
-    """The number of packets that hold something changes from view to view."""
+    """The number of patches with surfels changes from view to view."""
     shading = Shading(reflectance="radiance")
 
     def frame(distance: float) -> None:

@@ -44,7 +44,7 @@ GRADIENT_TOLERANCE = 3e-4  # relative L2; observed 1e-6 … 1.4e-4 (float32 of t
 
 @pytest.fixture
 def tile(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
-    """Tiles of this size, whatever the camera; smaller ones share a packet."""
+    """Tiles of this size, whatever the camera; smaller ones share a patch."""
     monkeypatch.setattr(constants, "TILE_SIZES", ((np.inf, request.param),))
     return request.param
 

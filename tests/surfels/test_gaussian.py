@@ -216,7 +216,7 @@ def test_rendered_3dgs_file_matches_the_oracle(tmp_path: Path) -> None:
         colours=rng.uniform(size=(60, 3)),
         rng=rng,
         primitive="gaussian",
-        channels=["radiance_sh"],
+        attributes=["radiance_sh"],
         degree={"radiance_sh": 2},
         opacity=0.7,
     )

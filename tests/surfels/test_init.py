@@ -36,14 +36,15 @@ def test_from_points(rng: np.random.Generator) -> None:
 
 def test_random_rotations_are_uniform(rng: np.random.Generator) -> None:
     """The mean normal of 20000 uniform rotations is 0 to 3 / √20000, its second moment 1/3."""
-    normal = np.array(init.from_points(rng.random((20000, 3)), rng=rng, channels=()).frame()[2])
+    normal = np.array(init.from_points(rng.random((20000, 3)), rng=rng, attributes=()).frame()[2])
     assert np.abs(normal.mean(axis=1)).max() < 0.02
     np.testing.assert_allclose(normal @ normal.T / 20000, np.eye(3) / 3, atol=0.02)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_few_or_doubled_points_have_finite_scales(count: int, rng: np.random.Generator) -> None:
-    surfels = init.from_points(np.ones((count, 3)), np.zeros((count, 3)), rng=rng, channels=("radiance_sh",))
+    points, normals = np.ones((count, 3)), np.zeros((count, 3))
+    surfels = init.from_points(points, normals, rng=rng, attributes=("radiance_sh",))
     surfels.validate()
     assert surfels.count == count
     assert list(surfels.raw) == ["position", "rotation", "scale", "opacity", "radiance_sh"]
@@ -56,7 +57,7 @@ def test_few_or_doubled_points_have_finite_scales(count: int, rng: np.random.Gen
         ({"points": np.full((4, 3), np.nan)}, "points: 12 values are NaN"),
         ({"degree": {"radiance_sh": 4}}, "degree of radiance_sh: 4"),
         ({"opacity": 1.5}, r"opacity: 1\.5"),
-        ({"channels": ("albdeo",)}, "albdeo.* is unknown"),
+        ({"attributes": ("albdeo",)}, "albdeo.* is unknown"),
     ],
 )
 def test_bad_points_are_refused(change: dict[str, object], message: str, rng: np.random.Generator) -> None:

@@ -129,7 +129,8 @@ def registered() -> Iterator[None]:
 
 def balls(count: int = 30) -> Surfels:
     rng = np.random.default_rng(0)
-    made = from_points(0.4 * rng.normal(size=(count, 3)), rng=rng, primitive="ball", channels=[], opacity=0.6)
+    points = 0.4 * rng.normal(size=(count, 3))
+    made = from_points(points, rng=rng, primitive="ball", attributes=[], opacity=0.6)
     return Surfels.from_numpy({n: v + 0.3 * rng.normal(size=v.shape) for n, v in made.to_numpy().items()})
 
 

@@ -3,7 +3,7 @@
     radiance ─ analyse ─► Fourier rows ─ mix rows ─► Fourier rows of every level ─ synthesise ─► levels
     δradiance ◄ synthesise ─ Fourier rows ◄ mix rows (transposed) ─ Fourier rows ◄ analyse ─ δlevels
 
-A texel buffer is flat, TEXEL floats per texel: RGBA, A unused, so that a lookup is one packet. The levels are
+A texel buffer is flat, TEXEL floats per texel: RGBA, A unused, so that a lookup is one access. The levels are
 one such buffer, the map itself first. A Fourier buffer has COEFFICIENT floats per coefficient: the cosine
 coefficients of R, G and B, the sine coefficients, and two unused. Rows keep only the frequencies they need.
 Analysis and synthesis are each other's transpose and only gather: adjoints use the same kernels, and no
@@ -28,7 +28,7 @@ from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
 BLOCK = 4  # consecutive rows with the same number of frequencies, which `mix_rows` computes in one lane
 
 COEFFICIENT = 8
-"""Floats per coefficient; TEXEL floats per texel. Powers of two, as packets are."""
+"""Floats per coefficient; TEXEL floats per texel. Powers of two, as accesses are."""
 TEXEL = 4
 
 
@@ -99,7 +99,7 @@ def make_rows(firsts: list[int], limits: list[np.ndarray]) -> RowLayout:
 
 
 def write(target: Any, values: list[Any], place: Any, active: Any = True) -> None:
-    """Scatter packets to distinct indices, padded with zeros to TEXEL or COEFFICIENT floats."""
+    """Scatter groups of values to distinct indices, padded with zeros to TEXEL or COEFFICIENT floats."""
     padded = values + [mi.Float(0)] * ((TEXEL if len(values) <= TEXEL else COEFFICIENT) - len(values))
     # Without the promise of no conflicts Dr.Jit runs one kernel, loop and all, per scatter.
     dr.scatter(target, mi.ArrayXf(padded), place, active, mode=dr.ReduceMode.NoConflicts)

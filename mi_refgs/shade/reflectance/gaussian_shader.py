@@ -22,12 +22,12 @@ class GaussianShader(Reflectance):
     """
 
     name = "gaussian_shader"
-    orders = ("surfel",)
+    shaded_at = ("surfel",)
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("radiance_sh", "roughness", "tint", "normal_offset")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         turned = dr.detach(dr.dot(surfels.primitive.normal(surfels), seen.normal)) < 0
         x, y, z = surfels.value("normal_offset")
         offset = type(seen.normal)(x, y, z)

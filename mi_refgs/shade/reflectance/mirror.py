@@ -17,10 +17,10 @@ class Mirror(Reflectance):
     name = "mirror"
     light = "radiance"
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("radiance_sh", "metallic")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         radiance = seen.harmonic_colour(surfels.value("radiance_sh"))
         return {"radiance": radiance, "metallic": surfels.value("metallic")}
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.registry import Registry
 from mi_refgs.shade.light.light import Light
-from mi_refgs.shade.options import QUALITY, Order, ShadingOptions
+from mi_refgs.shade.options import QUALITY, ShadedAt, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflection import TraceContext, mirror_visibility
 from mi_refgs.shade.sh import clamp_positive, eval_sh
@@ -43,23 +43,23 @@ class Reflectance:
     """
 
     name: str = ""
-    orders: tuple[Order, ...] = ("pixel", "surfel")  # where it may be shaded, the default first
+    shaded_at: tuple[ShadedAt, ...] = ("pixel", "surfel")  # where it may be shaded, the default first
     order_independent: bool = False  # both orders give the same image; surfels are shaded, which blends less
     light: Lookup = "filtered"  # lookups that it uses: none, `radiance` only, all
     encoded: bool = False  # its radiance_sh are display-encoded colours and blended as such
     visibility: Rays = "none"  # traced rays: none, mirror rays of pixels, those of its own `trace`
-    options: tuple[str, ...] = ()  # names of the QUALITY options that it honours
+    honoured: tuple[str, ...] = ()  # names of the QUALITY options that it honours
 
     @property
     def honours(self) -> tuple[str, ...]:
         """QUALITY options that have an effect: `options`, and the levels of a light that is prefiltered."""
-        return (*self.options, "light_levels") if self.light == "filtered" else self.options
+        return (*self.honoured, "light_levels") if self.light == "filtered" else self.honoured
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         """Names of the attributes beside the geometry that the surfels must have."""
         raise NotImplementedError
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         """Values (N,) by name (mi.Float, mi.Color3f or mi.Vector3f), under AD.
 
         A "normal" among them replaces the surfel's own, `seen.normal`.
@@ -83,14 +83,14 @@ def require_complete(model: Reflectance) -> None:
             f"reflectance model: {abbreviated(model)}: give an object of a subclass of Reflectance"
         )
     traced = ("trace",) if model.visibility == "own" else ()
-    for name in ("channels", "attributes", "shade", *traced):
+    for name in ("required_attributes", "values", "shade", *traced):
         if getattr(type(model), name) is getattr(Reflectance, name):
             raise InputError(f"reflectance model: {model.name}: {name} is missing; write that method")
     for name, values, allowed in (
-        ("orders", model.orders or (None,), get_args(Order)),
+        ("shaded_at", model.shaded_at or (None,), get_args(ShadedAt)),
         ("light", (model.light,), get_args(Lookup)),
         ("visibility", (model.visibility,), get_args(Rays)),
-        ("options", model.options, QUALITY),
+        ("honoured", model.honoured, QUALITY),
     ):
         if not {*values} <= {*allowed}:
             raise InputError(

@@ -34,15 +34,15 @@ class MonteCarlo(Reflectance):
     """
 
     name = "monte_carlo"
-    orders = ("surfel",)
+    shaded_at = ("surfel",)
     light = "radiance"
     visibility = "own"
-    options = ("directions",)
+    honoured = ("directions",)
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("albedo", "roughness")
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         values = {name: surfels.value(name) for name in ("albedo", "roughness")}
         if surfels.has("indirect_sh"):
             values["incident"] = surfels.value("indirect_sh")

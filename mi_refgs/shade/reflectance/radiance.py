@@ -21,10 +21,10 @@ class Radiance(Reflectance):
     order_independent = True
     light = "none"
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("radiance_sh",)
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         return {"radiance": seen.harmonic_colour(surfels.value("radiance_sh"))}
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
@@ -39,7 +39,7 @@ class Displayed(Radiance):
     """
 
     name = "displayed"
-    orders = ("pixel",)
+    shaded_at = ("pixel",)
     order_independent = False
     encoded = True
 

@@ -22,12 +22,12 @@ class SplitSum(Reflectance):
 
     name = "split_sum"
     visibility = "mirror"
-    options = ("dominant", "multiscatter", "antialias", "visibility_rays", "traced_bounces", "ambient_rays")
+    honoured = ("dominant", "multiscatter", "antialias", "visibility_rays", "traced_bounces", "ambient_rays")
 
-    def channels(self, options: ShadingOptions) -> tuple[str, ...]:
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return (*MATERIALS, "radiance_sh") if options.diffuse == "sh" else MATERIALS
 
-    def attributes(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
+    def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         values = {name: surfels.value(name) for name in MATERIALS}
         if options.diffuse == "sh":
             values["radiance"] = seen.harmonic_colour(surfels.value("radiance_sh"))
