@@ -28,7 +28,7 @@ def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[
     if primitives[0] is not primitives[1]:
         one, other = (primitive.name for primitive in primitives)
         raise InputError(f"--join: one has {one}s, the other {other}s; join runs of one primitive")
-    for what in ("reflectance", "diffuse", "order"):
+    for what in ("reflectance", "diffuse", "shaded_at"):
         pair = getattr(first.shading, what), getattr(second.shading, what)
         if pair[0] != pair[1]:
             raise InputError(
