@@ -10,6 +10,7 @@ import mi_refgs.surfels.attributes
 import mi_refgs.surfels.primitives
 from mi_refgs.data.dataset import Dataset as Dataset
 from mi_refgs.data.dataset import read_dataset as read_dataset
+from mi_refgs.data.images import Pixels as Pixels
 from mi_refgs.data.view import View as View
 from mi_refgs.editing.edit import EditOptions as EditOptions
 from mi_refgs.errors import InputError as InputError

@@ -19,6 +19,8 @@ import pytest
 
 from mi_refgs.cli import COMMANDS, command_class, main
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.images import Pixels
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -93,6 +95,12 @@ def read_loaded(*arguments: Any, **options: Any) -> Dataset:
     """`read_dataset` with all views loaded."""
     data = read_dataset(*arguments, **options)
     return replace(data, views=tuple(view.load() for view in data.views))
+
+
+def with_pixels(view: View, **changed: Any) -> View:
+    """The view, loaded, with another `image` or `alpha`."""
+    view = view.load()
+    return replace(view, pixels=Pixels(view.image, view.alpha)._replace(**changed))
 
 
 def run_process(

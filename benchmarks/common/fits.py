@@ -8,6 +8,7 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
+from mi_refgs.data.images import Pixels
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.reference.camera import look_at
@@ -28,7 +29,7 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Dataset:
         colour = 0.5 + 0.4 * np.stack(waves, axis=-1)
         image = (inside[..., None] * colour + 1 - inside[..., None]).astype(np.float32)
         camera = (size, size, focal, focal, size / 2, size / 2, to_world)
-        found.append(View(f"{i}", *camera, image, inside, None, None, is_linear_radiance=False))
+        found.append(View(f"{i}", *camera, Pixels(image, inside)))
     return Dataset(Path("sphere"), "train", tuple(found), np.ones(3, np.float32), False, None)
 
 

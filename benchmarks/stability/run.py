@@ -27,6 +27,7 @@ from benchmarks.stability.measure import (
     Row,
 )
 from benchmarks.stability.measure import measure as measure_case
+from mi_refgs.data.images import Pixels
 from mi_refgs.fitting.state import FitSetup
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import LIGHT
@@ -37,7 +38,7 @@ SURFELS, SIZE, VIEWS, STEPS = 300, 32, 3, 24
 def _with_peak(view: Any) -> dict[str, Any]:
     image = view.image.copy()
     image[SIZE // 2, SIZE // 2] = 1e6
-    return {"image": image, "is_linear_radiance": True}
+    return {"pixels": Pixels(image, view.alpha), "is_linear_radiance": True}
 
 
 FITS: dict[str, dict[str, Any]] = {
@@ -46,10 +47,12 @@ FITS: dict[str, dict[str, Any]] = {
     "the whole light starts at 1e6": {"light": lambda raw: np.full_like(raw, 1e6)},
     "the light starts black (raw -80)": {"light": lambda raw: np.full_like(raw, -80.0)},
     "a pixel of 1e6 in linear images": {"view": _with_peak},
-    "over-exposed images": {"view": lambda v: {"image": np.ones_like(v.image)}},
-    "under-exposed images": {"view": lambda v: {"image": 1 - v.alpha[..., None] + 0 * v.image}},
+    "over-exposed images": {"view": lambda v: {"pixels": Pixels(np.ones_like(v.image), v.alpha)}},
+    "under-exposed images": {
+        "view": lambda v: {"pixels": Pixels(1 - v.alpha[..., None] + 0 * v.image, v.alpha)}
+    },
     "all-transparent images": {
-        "view": lambda v: {"image": np.ones_like(v.image), "alpha": np.zeros_like(v.alpha)}
+        "view": lambda v: {"pixels": Pixels(np.ones_like(v.image), np.zeros_like(v.alpha))}
     },
 }
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -147,11 +147,14 @@ def make_view(
             raise InputError(f"{where}: k1 … p2: {error}") from None
         fx, fy = fx * straight.zoom, fy * straight.zoom
         image = replace(image, undistortion=straight)
-    source: Any = ImageSource(image, options.background, options.cache, options.decode)
-    alpha = source if source.has_alpha else None
-    linear = options.images == "exr"
-    view = View(name, width, height, fx, fy, cx, cy, to_world, source, alpha, None, None, linear)
-    return view.changed(exposure=log_exposure(image.path), file=file), straight
+    source = ImageSource.of(image, options.background, options.cache, options.decode)
+    view = View(
+        *(name, width, height, fx, fy, cx, cy, to_world, source),
+        is_linear_radiance=options.images == "exr",
+        exposure=log_exposure(image.path),
+        file=file,
+    )
+    return view, straight
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +242,8 @@ def read_dataset(
 
     # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored.
     if _opaque(views) and (split == "train" or _opaque(training())):
-        views = tuple(view.changed(alpha=None) if _own_alpha(view) else view for view in views)
+        ignored = (replace(v, pixels=v.pixels.without_alpha()) if _own_alpha(v) else v for v in views)
+        views = tuple(ignored)
         notes = (*notes, "images have alpha, but no pixel is transparent: alpha is ignored")
 
     # Positions are shifted near the origin, and clip planes derived.
@@ -250,7 +254,7 @@ def read_dataset(
     if region is None and not all(view.has_alpha for view in views):
         with contextlib.suppress(InputError):  # views that share no point have none
             region = region_of([_moved(view, offset) for view in training()])
-    views = tuple(_moved(view, offset).changed(near=near) for view in views)
+    views = tuple(replace(_moved(view, offset), near=near) for view in views)
     x, y, z = map(float, offset)
     if offset.any():
         points = None if points is None else replace(points, position=points.position - offset)
@@ -321,4 +325,4 @@ def _moved(view: View, offset: np.ndarray) -> View:
         return view
     to_world = view.to_world.copy()
     to_world[:3, 3] -= offset
-    return view.changed(to_world=to_world)
+    return replace(view, to_world=to_world)

@@ -9,6 +9,7 @@ by number is a test view, as in the splits made for 3DGS-DR and Ref-Gaussian. [N
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,7 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
         return view
     grey = read_grey(depths)[0][..., None]
     depth = grey.astype(np.float32) * np.float32(MAX_DEPTH / MAX_CODE)
-    return view.changed(depth=block_mean(depth, grey < BACKGROUND, options.downscale)[0][..., 0])
+    return replace(view, depth=block_mean(depth, grey < BACKGROUND, options.downscale)[0][..., 0])
 
 
 def _camera(path: Path) -> tuple[np.ndarray, np.ndarray]:

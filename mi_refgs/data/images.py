@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -145,21 +146,32 @@ class ImageFile:
         return np.concatenate(bands)
 
 
-def compose(decoded: np.ndarray, background: float) -> tuple[np.ndarray, np.ndarray | None]:
-    """Composite what `ImageFile.decode` returned: colour (H, W, 3), and alpha (H, W) or None, float32.
+class Pixels(NamedTuple):
+    """The decoded image of a view: sRGB-encoded, or linear radiance of an EXR file."""
 
-    The colour is sRGB-encoded, or linear radiance of an EXR file.
-    """
+    image: np.ndarray  # (H, W, 3) float32, composited onto the background
+    alpha: np.ndarray | None = None  # (H, W) float32
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.alpha is not None
+
+    def without_alpha(self) -> Pixels:
+        return Pixels(self.image)
+
+
+def compose(decoded: np.ndarray, background: float) -> Pixels:
+    """Composite what `ImageFile.decode` returned onto a background, a number from 0 to 1."""
     if decoded.dtype == np.uint8:
         decoded = decoded.astype(np.float32) / np.float32(255)
         if decoded.shape[-1] == 4:
             decoded[..., :3] *= decoded[..., 3:]
     colour = np.array(decoded[..., :3])
     if decoded.shape[-1] == 3:
-        return colour, None
+        return Pixels(colour)
     alpha = np.array(decoded[..., 3])
     colour += (1 - alpha[..., None]) * np.float32(background)
-    return colour, alpha
+    return Pixels(colour, alpha)
 
 
 class ImageCache:
@@ -194,21 +206,32 @@ class ImageCache:
         return self.bytes + file.decoded_bytes <= self.budget
 
 
+@dataclass(frozen=True)
 class ImageSource:
     """The image of a view that is not loaded."""
 
-    def __init__(self, file: ImageFile, background: float, cache: ImageCache, decode: bool = True) -> None:
+    file: ImageFile
+    background: float
+    cache: ImageCache
+    has_alpha: bool  # if False, alpha of the file is ignored
+
+    @classmethod
+    def of(cls, file: ImageFile, background: float, cache: ImageCache, decode: bool = True) -> ImageSource:
         """`decode`: decode the file now if the cache has room, so that a broken file is refused early.
 
         Raises InputError as `ImageFile.decode` does.
         """
-        self.file, self.background, self.cache = file, background, cache
         decoded = cache.pixels(file) if decode and cache.has_room_for(file) else None
-        self.has_alpha = file.has_alpha() if decoded is None else decoded.shape[-1] == 4
+        has_alpha = file.has_alpha() if decoded is None else decoded.shape[-1] == 4
+        return cls(file, background, cache, has_alpha)
 
-    def read(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """Image and alpha as in `View`; raises InputError as `ImageFile.decode` does."""
-        return compose(self.cache.pixels(self.file), self.background)
+    def without_alpha(self) -> ImageSource:
+        return replace(self, has_alpha=False)
+
+    def read(self) -> Pixels:
+        """Decode the image, unless it is in the cache; raises InputError as `ImageFile.decode` does."""
+        pixels = compose(self.cache.pixels(self.file), self.background)
+        return pixels if self.has_alpha else pixels.without_alpha()
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ list the images of a split.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -197,7 +197,7 @@ class _FrameReader:
         else:
             normal = None if normal is None else unit(normal)
             depth = None if depth is None else depth[..., 0]
-        return view.changed(normal=normal, depth=depth, materials=maps)
+        return replace(view, normal=normal, depth=depth, materials=maps)
 
     def image(self, index: int, frame: Any) -> Path:
         """The image file of a frame."""

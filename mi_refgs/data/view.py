@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mi_refgs.data.images import ImageSource, Mask
+from mi_refgs.data.images import ImageSource, Mask, Pixels
 from mi_refgs.data.lens import Lens
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, srgb_from_linear
@@ -48,11 +48,10 @@ class View:
     cx: float  # principal point, pixels from the left edge; the centre is width / 2
     cy: float
     to_world: np.ndarray  # (4, 4) float64, rigid, from Mitsuba's camera frame: +z forward, +x left, +y up
-    image: np.ndarray = field(repr=False)  # (H, W, 3) float32 target, composited onto the background
-    alpha: np.ndarray | None = field(repr=False)  # (H, W) float32
-    normal: np.ndarray | None  # (H, W, 3) float32, world space, 0 off the object
-    depth: np.ndarray | None  # (H, W) float32 along the viewing axis, 0 off the object
-    is_linear_radiance: bool  # of `image`: EXR; else it is sRGB-encoded
+    pixels: Pixels | ImageSource = field(repr=False)
+    normal: np.ndarray | None = None  # (H, W, 3) float32, world space, 0 off the object
+    depth: np.ndarray | None = None  # (H, W) float32 along the viewing axis, 0 off the object
+    is_linear_radiance: bool = False  # of `image`: EXR; else it is sRGB-encoded
     materials: dict[str, np.ndarray] = field(default_factory=dict)
     """Those known of albedo, roughness, metallic: (H, W, C + 1) float32, the last the fraction of the pixel
     that the others describe; all 0 where it is 0."""
@@ -65,21 +64,27 @@ class View:
 
         Raises InputError for a file that cannot be read.
         """
-        source, own = self.__dict__["image"], self.__dict__["alpha"]  # own: that of the file, or another one
-        if not isinstance(source, ImageSource):
-            return self
-        image, alpha = source.read()
-        return self.changed(image=image, alpha=alpha if own is source else own)
-
-    def changed(self, **fields: Any) -> View:
-        """The view with other values of some fields; unlike `dataclasses.replace`, also if not loaded."""
-        return replace(self, **{name: self.__dict__[name] for name in ("image", "alpha")} | fields)
+        return replace(self, pixels=self.pixels.read()) if isinstance(self.pixels, ImageSource) else self
 
     @property
     def has_alpha(self) -> bool:
         """Whether the image has alpha; the view need not be loaded."""
-        alpha = self.__dict__["alpha"]
-        return alpha.has_alpha if isinstance(alpha, ImageSource) else alpha is not None
+        return self.pixels.has_alpha
+
+    @property
+    def image(self) -> np.ndarray:
+        """The target (H, W, 3) float32, composited onto the background."""
+        return self._loaded("image").image
+
+    @property
+    def alpha(self) -> np.ndarray | None:
+        """Alpha (H, W) float32; None without any, for which the view need not be loaded."""
+        return self._loaded("alpha").alpha if self.has_alpha else None
+
+    def _loaded(self, name: str) -> Pixels:
+        if isinstance(self.pixels, ImageSource):
+            raise RuntimeError(f"view '{self.name}' is not loaded; use view.load().{name}")
+        return self.pixels
 
     @property
     def displayed(self) -> np.ndarray:
@@ -120,9 +125,9 @@ class View:
         loaded = self.load()
         alpha = None if loaded.alpha is None else box_downscale(loaded.alpha[..., None], block)[..., 0]
         pinhole = {name: getattr(self, name) / block for name in ("fx", "fy", "cx", "cy")}
-        averaged = replace(loaded, width=self.width // block, height=self.height // block, **pinhole)
-        image = box_downscale(loaded.image, block)
-        return replace(averaged, image=image, alpha=alpha, normal=None, depth=None, materials={})
+        pixels = Pixels(box_downscale(loaded.image, block), alpha)
+        averaged = replace(self, width=self.width // block, height=self.height // block, **pinhole)
+        return replace(averaged, pixels=pixels, normal=None, depth=None, materials={})
 
     def colour(self, background: np.ndarray) -> np.ndarray:
         """Linear colour (H, W, 3) of the object, not premultiplied; `background` (3,) as in `image`."""
@@ -138,29 +143,6 @@ class View:
         row = -self.fy * local[:, 1] / depth + self.cy - 0.5
         in_view = (local[:, 2] > 0) & (abs(column - (self.width - 1) / 2) <= self.width / 2)
         return row, column, in_view & (abs(row - (self.height - 1) / 2) <= self.height / 2)
-
-
-class _LoadedField:
-    """`View.image` or `View.alpha`, which raises RuntimeError for a view that is not loaded."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get__(self, view: View | None, owner: type) -> Any:
-        if view is None:
-            return self
-        value = view.__dict__[self.name]
-        if isinstance(value, ImageSource):
-            raise RuntimeError(f"view '{view.name}' is not loaded; use view.load().{self.name}")
-        return value
-
-    def __set__(self, view: View, value: np.ndarray | ImageSource | None) -> None:
-        view.__dict__[self.name] = value
-
-
-# Set after the class is made: @dataclass would take a descriptor in its body as the field's default.
-for _name in ("image", "alpha"):
-    setattr(View, _name, _LoadedField(_name))
 
 
 def evenly_spread(length: int, most: int) -> list[int]:

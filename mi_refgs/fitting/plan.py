@@ -24,6 +24,7 @@ import numpy as np
 
 from mi_refgs import __version__
 from mi_refgs.data.dataset import Dataset, fitting_downscale
+from mi_refgs.data.images import Pixels
 from mi_refgs.data.poses import poses_around
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import View
@@ -131,9 +132,7 @@ def synthetic_data(has_alpha: bool, size: int) -> Dataset:
             image = alpha[..., None] * image + 1 - alpha[..., None]
         focal, middle = 1.6 * size, size / 2
         place = (size, size, focal, focal, middle, middle, to_world)
-        views.append(
-            View(f"{i}", *place, image, alpha if has_alpha else None, None, None, is_linear_radiance=False)
-        )
+        views.append(View(f"{i}", *place, Pixels(image, alpha if has_alpha else None)))
     region = None if has_alpha else Region((0.0, 0.0, 0.0), 1.0)
     white = np.ones(3, np.float32)
     return Dataset(Path("synthetic"), "train", tuple(views), white, False, None, None, region)

@@ -14,6 +14,7 @@ from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
 from mi_refgs.fitting.runner import begin
 from mi_refgs.methods import load
 from mi_refgs.runs.run import Run
+from tests.helpers import with_pixels
 from tests.scenes import photographed as scene
 
 COUNT = 10
@@ -109,7 +110,7 @@ def test_triangulation_is_skipped_where_useless(
 ) -> None:
     monkeypatch.setattr(triangulate, "triangulated", None)
     said: list[str] = []
-    masked = [replace(view, alpha=np.ones((view.height, view.width), np.float32)) for view in data.views]
+    masked = [with_pixels(view, alpha=np.ones_like(view.image[..., 0])) for view in data.views]
     assert triangulate.with_points(replace(data, views=tuple(masked)), tmp_path, said.append) is None
     assert triangulate.with_points(replace(data, points=points), tmp_path, said.append) is points
     small = replace(data, views=tuple(view.averaged(4) for view in data.views))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,9 +9,10 @@ import pytest
 from scipy.stats import kstest
 
 from mi_refgs.data import hull
+from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.reference.camera import look_at
-from tests.helpers import refused
+from tests.helpers import refused, with_pixels
 
 BLACK = np.zeros(3)
 
@@ -33,7 +33,7 @@ def sphere_views(
         alpha = (4 * np.sqrt(1 - cosine**2) < radius).astype(np.float32)
         image = np.float32(number / count) * np.repeat(alpha[..., None], 3, axis=2)
         pinhole = (size, size, focal, focal, size / 2, size / 2)
-        views.append(View("", *pinhole, to_world, image, alpha, None, None, is_linear_radiance=True))
+        views.append(View("", *pinhole, to_world, Pixels(image, alpha), is_linear_radiance=True))
     return views
 
 
@@ -106,7 +106,7 @@ def test_hull_of_tiny_volume_returns_fewer_points(rng: np.random.Generator) -> N
 
 def test_empty_hull_and_parallel_cameras_are_refused(rng: np.random.Generator) -> None:
     views = sphere_views(4, 16, np.zeros(3), 0.8, rng)
-    nothing = [replace(view, alpha=np.zeros((16, 16), np.float32)) for view in views]
+    nothing = [with_pixels(view, alpha=np.zeros((16, 16), np.float32)) for view in views]
     refused(lambda: hull.visual_hull(nothing, hull.camera_bounds(views), resolution=8), "inside every mask")
     for few in ([], views[:1]):
         refused(partial(hull.camera_bounds, few), "do not look at one point")

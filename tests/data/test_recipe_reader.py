@@ -23,6 +23,7 @@ from mi_refgs.data.dataset import (
     read_dataset,
     register_reader,
 )
+from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.io.images import box_downscale, image_size, read_png, write_png
 from mi_refgs.surfels.ply import read_ply
@@ -58,7 +59,7 @@ class TableReader:
         to_world = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
         pixels = focal / downscale
         centre = (width / 2, height / 2)
-        return View(line[0], width, height, pixels, pixels, *centre, to_world, image, None, None, None, False)
+        return View(line[0], width, height, pixels, pixels, *centre, to_world, Pixels(image))
 
 
 @pytest.fixture

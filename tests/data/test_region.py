@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mi_refgs.data.images import Pixels
 from mi_refgs.data.region import REGION_FILE, Region, read_region, region_of, region_pixels
 from mi_refgs.data.view import View
 from tests.helpers import refused
@@ -23,7 +24,7 @@ def view_from(origin: np.ndarray, focal: float = 100.0) -> View:
     to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
     to_world[:3, 3] = origin
     image = np.zeros((100, 100, 3), np.float32)
-    return View("v", 100, 100, focal, focal, 50, 50, to_world, image, None, None, None, False)
+    return View("v", 100, 100, focal, focal, 50, 50, to_world, Pixels(image))
 
 
 def test_region_pixels_are_those_whose_rays_hit_it() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from mi_refgs.cli.evaluate import table
 from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.evaluation.decomposition import Decomposition
 from mi_refgs.evaluation.evaluate import DECOMPOSITION, evaluate
@@ -45,8 +46,8 @@ def random_view(seed: int) -> tuple[RenderedView, View, np.ndarray]:
         name: np.concatenate([rng.uniform(0.2, 0.8, (H, W, c)) * known, known], -1).astype(np.float32)
         for name, c in (("albedo", 3), ("roughness", 1), ("metallic", 1))
     }
-    size, given = (W, H, 9, 9, 4, 4, np.eye(4)), (colour, alpha, normal, alpha)
-    view = View("a", *size, *given, is_linear_radiance=False, materials=materials)
+    size, given = (W, H, 9, 9, 4, 4, np.eye(4)), (Pixels(colour, alpha), normal, alpha)
+    view = View("a", *size, *given, materials=materials)
     return RenderedView(colour, alpha, normal, {}), view, rng.random((H, W)) > 0.5
 
 

@@ -12,6 +12,7 @@ import pytest
 import trimesh
 
 from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.evaluation import surface
 from mi_refgs.occlusion.mesh import Mesh
@@ -32,11 +33,11 @@ def truth_of(*shapes: Any) -> surface.TrueSurface:
 
 def around(count: int = 8) -> list[View]:
     """Cameras on a circle and above that look at the origin."""
-    views, images = [], (np.zeros((16, 16, 3), np.float32), None, None, None)
+    views, pixels = [], Pixels(np.zeros((16, 16, 3), np.float32))
     for angle in 2 * np.pi * np.arange(count) / count:
         origin = 6 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)])
         pose = look_at(origin, np.zeros(3))
-        views.append(View("", 16, 16, 16, 16, 8, 8, pose, *images, is_linear_radiance=False))
+        views.append(View("", 16, 16, 16, 16, 8, 8, pose, pixels))
     return views
 
 

@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.data.dataset import View
+from mi_refgs.data.images import Pixels
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as reference
 
@@ -35,7 +36,8 @@ def shown(radiance: np.ndarray, alpha: np.ndarray, linear: bool, gain: Any = 1.0
 def view_of(image: np.ndarray, alpha: np.ndarray | None, linear: bool) -> View:
     image = image.astype(np.float32)
     alpha = None if alpha is None else alpha.astype(np.float32)
-    return View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), image, alpha, None, None, linear)
+    pixels = Pixels(image, alpha)
+    return View("a", WIDTH, HEIGHT, 20.0, 20.0, 8.0, 7.0, np.eye(4), pixels, is_linear_radiance=linear)
 
 
 def stack(planes_: list[Any]) -> np.ndarray:

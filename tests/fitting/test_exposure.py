@@ -28,6 +28,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
 from tests.fitting.image_checks import BACKGROUND, HEIGHT, STEP, WIDTH, planes, shown, view_of
+from tests.helpers import with_pixels
 from tests.scenes.highlight import SIZE, ball, run_folder, small_method
 
 GAINS = np.array([1.4, 0.7, 0.9])
@@ -128,7 +129,7 @@ def exposed(data: Dataset, log: np.ndarray) -> Dataset:
         alpha = view.alpha[..., None]
         colour = np.clip(srgb_from_linear(view.colour(data.background) * gain), 0, 1)
         image = (alpha * colour + (1 - alpha) * data.background).astype(np.float32)
-        views.append(dataclasses.replace(view, image=image))
+        views.append(with_pixels(view, image=image))
     return dataclasses.replace(data, views=tuple(views))
 
 

@@ -14,6 +14,7 @@ from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
+from tests.helpers import with_pixels
 from tests.scenes.highlight import ball, small_method
 
 STEPS = 14
@@ -22,8 +23,9 @@ STEPS = 14
 
 def changed(change: Callable[[View], dict[str, Any]], linear: bool = False, views: int = 6) -> Dataset:
     data = ball(views=views)
-    found = tuple(dataclasses.replace(view, **change(view), is_linear_radiance=linear) for view in data.views)
-    return dataclasses.replace(data, views=found, is_linear_radiance=linear)
+    found = (with_pixels(view, **change(view)) for view in data.views)
+    found = (dataclasses.replace(view, is_linear_radiance=linear) for view in found)
+    return dataclasses.replace(data, views=tuple(found), is_linear_radiance=linear)
 
 
 def radiance(view: View, peak: float) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from mi_refgs import methods
 from mi_refgs.data import dataset, hull
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.initial import initial_surfels
+from tests.helpers import with_pixels
 from tests.scenes.tiny import RADIUS, write_data
 
 COUNT = 2_000
@@ -85,7 +86,7 @@ def test_same_seed_gives_same_start(ball: dataset.Dataset) -> None:
 
 
 def test_without_alpha_surfels_fill_box(ball: dataset.Dataset) -> None:
-    bare = dataclasses.replace(ball, views=tuple(view.changed(alpha=None) for view in ball.views))
+    bare = dataclasses.replace(ball, views=tuple(with_pixels(view, alpha=None) for view in ball.views))
     table = start(bare, 0.5)
     assert len(table["position"]) == COUNT and np.linalg.norm(table["position"], axis=1).max() > 1.1 * RADIUS
 

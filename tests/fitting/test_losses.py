@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.data.dataset import View
+from mi_refgs.data.images import Pixels
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.targets import Target
 from mi_refgs.io.images import srgb_from_linear
@@ -85,7 +86,7 @@ def test_only_objects_own_colour_is_highlight() -> None:
 def test_floater_brighter_than_white_background_costs(covered: float) -> None:
     """Over the background it does, over a highlight of the object it does not."""
     image, alpha = np.ones((4, 4, 3), np.float32), np.full((4, 4), covered, np.float32)
-    view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), image, alpha, None, None, is_linear_radiance=False)
+    view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), Pixels(image, alpha))
     target = Target.of(view, np.ones(3))
     radiance = [mi.Float(np.full(16, 3.0)) for _ in range(3)]
     dr.enable_grad(radiance)

@@ -27,6 +27,7 @@ from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.run import Run
 from mi_refgs.surfels.ply import read_ply
+from tests.helpers import with_pixels
 from tests.scenes.tiny import train_command, write_data
 
 METHOD = """
@@ -342,7 +343,7 @@ def test_linear_images_are_scored_as_displayed(
     trainer = Trainer(other(variant), views)
     encoded = select.validation_psnr(trainer, views)
     linear = tuple(
-        replace(v, image=linear_from_srgb(v.image), is_linear_radiance=True)
+        with_pixels(replace(v, is_linear_radiance=True), image=linear_from_srgb(v.image))
         for v in (view.load() for view in views.views)
     )
     judges = replace(views, views=linear, is_linear_radiance=False)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset, View
+from mi_refgs.data.images import Pixels
 from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import Method
 from mi_refgs.reference.camera import look_at
@@ -65,7 +66,7 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
         colour = np.stack([0.3 + 0.6 * shine, 0.4 + x, 0.5 + 0.5 * shine + y], axis=-1)
         image = (alpha[..., None] * colour + 1 - alpha[..., None]).clip(0, 1).astype(np.float32)
         intrinsics = size, size, focal, focal, size / 2, size / 2
-        images.append(View(f"{i}", *intrinsics, to_world, image, alpha, None, None, is_linear_radiance=False))
+        images.append(View(f"{i}", *intrinsics, to_world, Pixels(image, alpha)))
     return Dataset(Path("ball"), "train", tuple(images), np.ones(3, np.float32), False, None)
 
 
