@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
@@ -31,7 +32,6 @@ import mitsuba as mi  # isort: skip
 
 from benchmarks.common.fits import sphere_data
 from benchmarks.common.report import plain_parser
-from benchmarks.common.timing import process_bytes
 
 ROOT = Path(__file__).parents[1]
 SIZE, VIEWS = 32, 5
@@ -217,7 +217,7 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
         records.append(
             {
                 "step": state.iteration,
-                "rss_mb": round(process_bytes() / 2**20, 3),
+                "rss_mb": round(psutil.Process().memory_info().rss / 2**20, 3),
                 "surfels": state.surfels.count,
                 "skipped": state.health.skipped,
                 "not_finite": bad,

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
-from benchmarks.common.report import plain_parser, write_json
+from benchmarks.common.report import plain_parser
+from mi_refgs.io.files import read_json, write_json
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -38,7 +39,7 @@ NORMAL_BOUND = 0.1
 def move(folder: Path, factor: float) -> None:
     """Multiply the cameras' positions in the transforms files; depth maps, which no fit reads, stay."""
     for path in folder.glob("transforms_*.json"):
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         for frame in content["frames"]:
             for row in frame["transform_matrix"][:3]:
                 row[3] *= factor

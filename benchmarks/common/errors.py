@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.common.montecarlo import Estimate
-from benchmarks.common.report import number, table
+from benchmarks.common.report import Row, number, table
 from mi_refgs.evaluation import metrics
 from mi_refgs.io.images import srgb_from_linear
 
@@ -20,49 +19,31 @@ CLEAR = 2.0
 """A relMSE below this many times what the reference's own noise adds to it is not told from zero."""
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Errors of one image, each with the floor that the reference's noise sets.
-
-    bias: mean signed error over mean radiance; relmse: mean of (x - ref)² / (ref² + ε), ε = (0.01 mean)²;
-    mape: mean of |x - ref| / (ref + 0.01 mean).
-    """
-
-    bias: float
-    relmse: float
-    mape: float
-    bias_floor: float
-    relmse_floor: float
-
-    @property
-    def below_floor(self) -> bool:
-        """Whether relMSE cannot be told from the reference's noise."""
-        return self.relmse < CLEAR * self.relmse_floor
-
-    def record(self) -> dict[str, Any]:
-        """For CSV and JSON."""
-        return vars(self) | {"below_floor": self.below_floor}
-
-
 def weight(reference: np.ndarray, scale: float | None = None) -> np.ndarray:
     """1 / (ref² + ε), the weight of squared errors; `scale` replaces the mean of `reference` in ε."""
     mean = float(reference.mean()) if scale is None else scale
     return 1 / (reference**2 + (DARK * mean) ** 2)
 
 
-def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = None) -> Errors:
-    """Errors of (P, 3) values, over all points or those of a mask (P,)."""
+def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = None) -> Row:
+    """Errors of (P, 3) values, over all points or those of a mask (P,), each with the floor of the noise.
+
+    bias: mean signed error over mean radiance; relmse: mean of (x - ref)² / (ref² + ε), ε = (0.01 mean)²;
+    mape: mean of |x - ref| / (ref + 0.01 mean); below_floor: relMSE may be the reference's noise alone.
+    """
     scale = float(reference.mean.mean())
     chosen = np.ones(len(values), bool) if where is None else where
     x, mean, noise = values[chosen], reference.mean[chosen], reference.error[chosen]
     w = weight(mean, scale)
-    return Errors(
-        bias=float((x - mean).mean() / mean.mean()),
-        relmse=float(((x - mean) ** 2 * w).mean()),
-        mape=float((np.abs(x - mean) / (mean + DARK * scale)).mean()),
-        bias_floor=float(np.sqrt((noise**2).sum()) / noise.size / mean.mean()),
-        relmse_floor=float((noise**2 * w).mean()),
-    )
+    relmse, floor = float(((x - mean) ** 2 * w).mean()), float((noise**2 * w).mean())
+    return {
+        "bias": float((x - mean).mean() / mean.mean()),
+        "relmse": relmse,
+        "mape": float((np.abs(x - mean) / (mean + DARK * scale)).mean()),
+        "bias_floor": float(np.sqrt((noise**2).sum()) / noise.size / mean.mean()),
+        "relmse_floor": floor,
+        "below_floor": relmse < CLEAR * floor,
+    }
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
@@ -83,79 +64,50 @@ def mean_score(values: np.ndarray, reference: Estimate) -> float:
 
 TOLERANCE = 0.2
 """Share of the total by which a sum of squares may miss it and still add up."""
-Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """An image (P, 3), and the approximation that it no longer makes ("" for the first)."""
 
     replaced: str
     values: np.ndarray
 
 
-@dataclass(frozen=True)
-class Part:
-    """What one approximation adds: signed mean over mean radiance, relMSE on its own, share of the total.
+def decompose(steps: Sequence[Step]) -> Row:
+    """Budget of a chain of at least two steps, the last of which is the reference.
 
-    Shares are projections on the whole error, e_k·e / e·e: they add up to 1; a negative one cancels others.
+    parts, in the order of the chain: bias (signed mean over mean radiance), relmse alone, and share of the
+    total, the projection on the whole error e_k·e / e·e, negative where it cancels others. sum: of the
+    parts' relmse; interaction: total - sum; pair: the two parts that interact most, and their correlation.
     """
-
-    name: str
-    bias: float
-    relmse: float
-    share: float
-
-
-@dataclass(frozen=True)
-class Budget:
-    """Parts in the order of the chain; `interaction` = total - sum of the parts' relMSE."""
-
-    parts: tuple[Part, ...]
-    total: float
-    interaction: float
-    pair: tuple[str, str]  # the two parts that interact most
-    correlation: float  # of these two
-
-    @property
-    def sum(self) -> float:
-        """Sum of the parts' relMSE."""
-        return self.total - self.interaction
-
-    @property
-    def adds_up(self) -> bool:
-        """Whether the sum of squares alone explains the total."""
-        return abs(self.interaction) <= TOLERANCE * self.total
-
-    def record(self) -> Row:
-        """For JSON."""
-        parts = {"parts": [vars(part) for part in self.parts], "sum": self.sum, "adds_up": self.adds_up}
-        return vars(self) | parts | {"pair": list(self.pair)}
-
-
-def decompose(steps: Sequence[Step]) -> Budget:
-    """Budget of a chain of at least two steps, the last of which is the reference."""
     reference = steps[-1].values
     root = np.sqrt(weight(reference))
     differences = [before.values - after.values for before, after in itertools.pairwise(steps)]
     scaled = np.stack([(difference * root).ravel() for difference in differences])
     products = scaled @ scaled.T / scaled.shape[1]
-    total = float(products.sum())
+    total, squares = float(products.sum()), float(np.trace(products))
     names = [step.replaced for step in steps[1:]]
-    parts = tuple(
-        Part(
-            name,
-            float(difference.mean() / reference.mean()),
-            float(products[k, k]),
-            float(products[k].sum() / total) if total > 0 else 0.0,
-        )
-        for k, (name, difference) in enumerate(zip(names, differences, strict=True))
-    )
+    parts = [
+        {
+            "name": name,
+            "bias": float(difference.mean() / reference.mean()),
+            "relmse": float(row[k]),
+            "share": float(row.sum() / total) if total > 0 else 0.0,
+        }
+        for k, (name, difference, row) in enumerate(zip(names, differences, products, strict=True))
+    ]
     cross = np.triu(products, 1)
-    j, k = (int(x) for x in np.unravel_index(int(np.abs(cross).argmax()), cross.shape))
+    j, k = np.unravel_index(int(np.abs(cross).argmax()), cross.shape)
     size = float(np.sqrt(products[j, j] * products[k, k]))
-    correlation = float(cross[j, k]) / size if size > 0 else 0.0
-    return Budget(parts, total, total - float(np.trace(products)), (names[j], names[k]), correlation)
+    return {
+        "parts": parts,
+        "total": total,
+        "sum": squares,
+        "interaction": total - squares,
+        "adds_up": abs(total - squares) <= TOLERANCE * total,
+        "pair": [names[j], names[k]],
+        "correlation": float(cross[j, k]) / size if size > 0 else 0.0,
+    }
 
 
 def noise_floor(error: np.ndarray, reference: np.ndarray) -> float:

@@ -8,7 +8,6 @@ import io
 import json
 import math
 import os
-import platform
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,12 +16,12 @@ from typing import Any
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
-import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 from benchmarks.common.view import ROOT
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import replace_file
+from mi_refgs.io.files import write_bytes
+from mi_refgs.kernels import device
 
 Row = dict[str, Any]
 
@@ -38,34 +37,13 @@ def where(rows: Iterable[Row], **values: Any) -> list[Row]:
 
 def machine() -> dict[str, Any]:
     """What the times were taken on, and how busy it is: the load average of the last minute."""
-    return {
-        "cpu": _cpu(),
-        "threads": int(dr.thread_count()),
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "variant": mi.variant(),
-        "load": f"{os.getloadavg()[0]:.1f}",
-    }
-
-
-def _cpu() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return device.machine() | {"variant": mi.variant(), "load": f"{os.getloadavg()[0]:.1f}"}
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
+    """Write a file atomically, and make its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-
-
-def write_json(path: Path, value: Any) -> None:
-    """JSON; refuses NaN and infinity."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+    write_bytes(path, text.encode())
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -162,7 +140,7 @@ def write_reports(
     folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
     try:
         result = json.loads(options.json.read_text(encoding="utf-8")) if options.json else measure()
-        write_json(data / f"{name}.json", result)
+        write_text(data / f"{name}.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
         write_csv(data / f"{name}.csv", result["rows"])
         plot(result, folder / "images")
         values = result["machine"] | {"minutes": f"{result['seconds'] / 60:.1f}"} | page(result)

@@ -1,7 +1,11 @@
-"""Times of warm runs, taken in turns, and memory of a process."""
+"""Times of warm runs, taken in turns, memory of a process, and measurements that require a fresh one."""
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
@@ -9,6 +13,9 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
+import psutil
+
+from benchmarks.common.view import ROOT
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -52,7 +59,26 @@ def once(call: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def process_bytes(field: str = "VmRSS") -> int:
-    """VmRSS (now), VmHWM (peak) or VmSize (mapped) of this process; needs the /proc of Linux."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(field))
+def peak_bytes() -> int:
+    """Largest resident memory of this process since it began, or since `forget_peak`; requires Linux."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
+def forget_peak() -> int:
+    """Let `peak_bytes` begin anew; return the resident memory now."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return int(psutil.Process().memory_info().rss)
+
+
+def in_fresh_process(
+    module: str, *arguments: Any, seconds: float | None = None, **environment: str
+) -> dict[str, Any]:
+    """Run `python -m module arguments` and return the JSON object of its last line.
+
+    Raises subprocess.SubprocessError for one that fails or takes longer than `seconds`.
+    """
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    options: dict[str, Any] = {"cwd": ROOT, "env": os.environ | environment, "timeout": seconds}
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, **options)
+    return dict(json.loads(done.stdout.splitlines()[-1]))

@@ -17,7 +17,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.timing import process_bytes
+import psutil
+
+from benchmarks.common.timing import forget_peak, peak_bytes
 from benchmarks.fuzz import MEBIBYTES, SECONDS
 from benchmarks.fuzz.mutate import mutate
 from benchmarks.fuzz.readers import READERS, Reader
@@ -44,8 +46,7 @@ def mutated(reader: Reader, samples: list[bytes], seed: int, index: int) -> byte
 
 def outcome(reader: Reader, folder: Path, data: bytes) -> dict[str, Any]:
     """Read one file; `result` is "right", "refused" or what went wrong."""
-    began, before = time.perf_counter(), process_bytes("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins anew
+    began, before = time.perf_counter(), forget_peak()
     Watch.folder, Watch.seen = (folder if reader.inside else None), []
     before_alarm = signal.signal(signal.SIGALRM, _ring)
     signal.alarm(SECONDS)
@@ -66,7 +67,7 @@ def outcome(reader: Reader, folder: Path, data: bytes) -> dict[str, Any]:
         signal.signal(signal.SIGALRM, before_alarm)
         Watch.folder = None
     found["seconds"] = round(time.perf_counter() - began, 4)
-    found["mebibytes"] = round((process_bytes("VmHWM") - before) / 2**20, 1)
+    found["mebibytes"] = round((peak_bytes() - before) / 2**20, 1)
     if Watch.seen:
         found |= {"result": "escape", "what": Watch.seen[0]}
     elif found["mebibytes"] > MEBIBYTES:
@@ -128,8 +129,8 @@ def main() -> None:
         samples = reader.samples(folder)
         for sample in samples:  # compiles and imports what reading needs
             outcome(reader, folder, reader.finish(sample))
-        limit = (process_bytes("VmSize") >> 20) + ADDRESS_SPACE
-        resource.setrlimit(resource.RLIMIT_AS, (limit << 20, limit << 20))
+        limit = psutil.Process().memory_info().vms + (ADDRESS_SPACE << 20)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         sys.addaudithook(Watch.hook)
         for index in range(options.first, options.last):
             found = outcome(reader, folder, mutated(reader, samples, options.seed, index))

@@ -9,14 +9,15 @@ Writes memory.md, memory.csv and memory.json; without -o, the page goes to docs/
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-import json
 import subprocess
 import sys
 import time
 from typing import Any
 
 from benchmarks.common.report import machine, make_parser, table, write_reports
+from benchmarks.common.timing import in_fresh_process
 from benchmarks.memory import cell
 from mi_refgs.kernels import memory
 
@@ -47,12 +48,9 @@ def measured(kind: str, size: int, samples: int, surfels: int) -> dict[str, Any]
     row |= {"predicted": needed, "measured": None, "seconds": None}
     if needed > LIMIT:
         return row
-    command = [sys.executable, "-m", "benchmarks.memory.cell", kind, *map(str, (size, samples, surfels))]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=True)
-    except subprocess.SubprocessError:
-        return row
-    return row | json.loads(done.stdout.strip().splitlines()[-1])
+    with contextlib.suppress(subprocess.SubprocessError):
+        row |= in_fresh_process("benchmarks.memory.cell", kind, size, samples, surfels, seconds=SECONDS)
+    return row
 
 
 def page(result: dict[str, Any]) -> dict[str, Any]:

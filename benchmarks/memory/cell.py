@@ -16,7 +16,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common.timing import process_bytes
+from benchmarks.common.timing import peak_bytes
 from mi_refgs.shade.light.envmap import EnvironmentLight
 
 AOVS = "n:normal,d:depth,al:albedo,r:roughness,m:metallic,di:diffuse,sp:specular"
@@ -70,7 +70,7 @@ def main(kind: str, size: int, samples: int, surfels: int) -> None:
         mi.render(of, spp=samples).numpy()
     dr.sync_thread()
     seconds = time.perf_counter() - start
-    print(json.dumps({"measured": process_bytes("VmHWM"), "seconds": seconds}))
+    print(json.dumps({"measured": peak_bytes(), "seconds": seconds}))
 
 
 if __name__ == "__main__":

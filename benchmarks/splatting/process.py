@@ -6,12 +6,9 @@ python -m benchmarks.splatting.process memory 50000 256
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
@@ -19,8 +16,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-from benchmarks.common.timing import process_bytes
-from benchmarks.common.view import ROOT
+from benchmarks.common.timing import forget_peak, in_fresh_process, peak_bytes
 
 SPREAD = 1.5
 STEPS = 3
@@ -32,13 +28,8 @@ def measure_compile(case: tuple[int, int]) -> dict[str, Any]:
     """Milliseconds of the first forward and the first forward + backward: kernel cache empty, full, warm."""
     with tempfile.TemporaryDirectory() as folder:
         cold, cached = (measure("compile", case, DRJIT_CACHE_DIR=folder) for _ in range(2))
-    return {
-        "surfels": case[0],
-        "size": case[1],
-        "cold": cold["first"],
-        "cached": cached["first"],
-        "warm": cached["second"],
-    }
+    found = {"cold": cold["first"], "cached": cached["first"], "warm": cached["second"]}
+    return {"surfels": case[0], "size": case[1]} | found
 
 
 def measure(task: str, case: tuple[int, int], **environment: str) -> dict[str, Any]:
@@ -46,12 +37,7 @@ def measure(task: str, case: tuple[int, int], **environment: str) -> dict[str, A
 
     memory: peak of forward and backward; step: peak and time of training steps; compile: first calls.
     """
-    command = [sys.executable, "-m", "benchmarks.splatting.process", task, *map(str, case)]
-    done = subprocess.run(
-        command, cwd=ROOT, env=os.environ | environment, stdout=subprocess.PIPE, text=True, check=True
-    )
-    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return result
+    return in_fresh_process("benchmarks.splatting.process", task, *case, **environment)
 
 
 # ---------------- in the fresh process ----------------
@@ -89,7 +75,7 @@ def _step(count: int, size: int) -> dict[str, Any]:
         trainer.step()
         dr.sync_thread()
         times.append(1e3 * (time.perf_counter() - begin))
-    whole = process_bytes("VmHWM")
+    whole = peak_bytes()
     found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}
     return found | _peaks(before) | {"whole_process": whole}
 
@@ -115,14 +101,13 @@ def _start() -> int:
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
-    Path("/proc/self/clear_refs").write_text("5")
-    return process_bytes("VmRSS")
+    return forget_peak()
 
 
 def _peaks(before: int) -> dict[str, int]:
     """Bytes since `_start`: what the process grew by at most, and what Dr.Jit's allocator held at most."""
     backend = dr.JitBackend.LLVM
-    return {"peak": process_bytes("VmHWM") - before, "allocated": int(dr.detail.malloc_watermark(backend))}
+    return {"peak": peak_bytes() - before, "allocated": int(dr.detail.malloc_watermark(backend))}
 
 
 if __name__ == "__main__":

@@ -15,7 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common.errors import Row, Step, decompose, noise_floor
+from benchmarks.common.errors import Step, decompose, noise_floor
+from benchmarks.common.report import Row
 from benchmarks.common.setup import ALBEDO, covering
 from benchmarks.common.view import Points, rows
 from benchmarks.splitsum.setup import CONVEX, Exact, diffuse, reflectance, split_sum
@@ -50,7 +51,7 @@ def budgets(setup: Exact) -> list[Row]:
             reference = setup.integrals(roughness).radiance(metallic)
             row = setup.case(roughness, metallic) | {"height": height}
             row["floor"] = noise_floor(reference.error, reference.mean)
-            found.append(row | decompose(steps).record())
+            found.append(row | decompose(steps))
     return found
 
 
@@ -150,7 +151,7 @@ def surfel_budget(setup: Exact) -> dict[str, Any]:
         "surfels": settings.surfels,
         "covered": float(covered.mean()),
         "floor": noise_floor(noise, steps[-1].values[covered]),
-        **found.record(),
+        **found,
     }
 
 

@@ -131,7 +131,7 @@ class Run:
         if method.startswith("split_sum"):
             masks |= view_bins(points.n_dot_v())
         for name, mask in masks.items():
-            found = errors.compare(values, reference, mask).record()
+            found = errors.compare(values, reference, mask)
             self.rows.append(case | {"n_dot_v": name} | found | {"flip": flip if mask is None else None})
 
 

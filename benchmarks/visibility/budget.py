@@ -142,7 +142,7 @@ def budgets(
             "roughness": roughness,
             "indirect": name,
             "floor": noise_floor(np.hypot(exact.indirect.error, noise), exact.whole),
-            **decompose(steps).record(),
+            **decompose(steps),
         }
         for name, (steps, noise) in chains.items()
     ]

@@ -63,7 +63,7 @@ def _errors(setup: Setup, roughness: float, references: dict[str, np.ndarray]) -
         reference = mc.estimate(batches)
         for rule, values in images.items():
             case = {"scene": setup.name, "roughness": roughness, "method": rule.name, "depth": name}
-            rows.append(case | vars(rule) | errors.compare(values, reference).record())
+            rows.append(case | vars(rule) | errors.compare(values, reference))
     return rows
 
 

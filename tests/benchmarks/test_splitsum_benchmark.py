@@ -17,6 +17,7 @@ import pytest
 from benchmarks.common import errors
 from benchmarks.common import montecarlo as mc
 from benchmarks.common import view as common
+from benchmarks.common.errors import Step
 from benchmarks.common.report import where
 from benchmarks.splitsum import budget, measure, setup
 from mi_refgs.errors import InputError
@@ -271,44 +272,35 @@ def test_errors_report_their_noise_floor() -> None:
     truth = rng.uniform(0.5, 1.5, (4000, 3))
     reference = mc.Estimate(truth + 0.01 * rng.normal(size=truth.shape), np.full(truth.shape, 0.01))
     same = errors.compare(truth, reference)
-    assert same.below_floor and same.relmse == pytest.approx(same.relmse_floor, rel=0.1)
-    assert abs(same.bias) < 4 * same.bias_floor
+    assert same["below_floor"] and same["relmse"] == pytest.approx(same["relmse_floor"], rel=0.1)
+    assert abs(same["bias"]) < 4 * same["bias_floor"]
     off = errors.compare(1.05 * truth, reference)
-    assert not off.below_floor and off.bias == pytest.approx(0.05, abs=1e-3)
-    assert off.relmse == pytest.approx(0.05**2, rel=0.1) and off.mape == pytest.approx(0.05, rel=0.05)
+    assert not off["below_floor"] and off["bias"] == pytest.approx(0.05, abs=1e-3)
+    assert off["relmse"] == pytest.approx(0.05**2, rel=0.1) and off["mape"] == pytest.approx(0.05, rel=0.05)
 
 
 def test_budget_recovers_known_parts() -> None:
     """Two orthogonal errors and two that cancel."""
     exact = np.ones((2, 3))
     a, b = np.array([[0.1], [0.0]]), np.array([[0.0], [0.2]])
-    steps = [errors.Step("", exact + a + b), errors.Step("a", exact + b), errors.Step("b", exact)]
-    found = errors.decompose(steps)
-    assert found.record()["adds_up"] and found.interaction == pytest.approx(0, abs=1e-12)
-    assert [part.share for part in found.parts] == pytest.approx([0.2, 0.8])
-    assert [part.bias for part in found.parts] == pytest.approx([0.05, 0.1])
-    opposed = [errors.Step("", exact), errors.Step("a", exact - a), errors.Step("b", exact)]
+    found = errors.decompose([Step("", exact + a + b), Step("a", exact + b), Step("b", exact)])
+    assert found["adds_up"] and found["interaction"] == pytest.approx(0, abs=1e-12)
+    assert [part["share"] for part in found["parts"]] == pytest.approx([0.2, 0.8])
+    assert [part["bias"] for part in found["parts"]] == pytest.approx([0.05, 0.1])
     with np.errstate(all="raise"):
-        found = errors.decompose(opposed)
-    assert found.total == pytest.approx(0) and not found.record()["adds_up"]
-    assert found.correlation == pytest.approx(-1)
+        found = errors.decompose([Step("", exact), Step("a", exact - a), Step("b", exact)])
+    assert found["total"] == pytest.approx(0) and not found["adds_up"]
+    assert found["correlation"] == pytest.approx(-1)
 
 
 def test_budget_names_the_interacting_pair() -> None:
     """Three parts, of which the last two cancel at the second of two points: one part, they add up."""
     exact = np.ones((2, 3))
     a, b = np.array([[0.3], [0.0]]), np.array([[0.0], [0.2]])
-    steps = [
-        errors.Step("", exact + a),
-        errors.Step("a", exact),
-        errors.Step("b", exact - b),
-        errors.Step("c", exact),
-    ]
-    found = errors.decompose(steps)
-    record = found.record()
-    assert record["pair"] == ["b", "c"] and found.correlation == pytest.approx(-1)
-    assert not record["adds_up"]
-    row = {"floor": 0.0, **record}
+    found = errors.decompose([Step("", exact + a), Step("a", exact), Step("b", exact - b), Step("c", exact)])
+    assert found["pair"] == ["b", "c"] and found["correlation"] == pytest.approx(-1)
+    assert not found["adds_up"]
+    row = {"floor": 0.0, **found}
     text = errors.interactions([row, {**row, "total": 0.0, "floor": 1.0}])
     assert text.splitlines()[2:] == ["| b and c | 1 | 1 | -1.00 |"]
     cells = errors.budget_table("case", [("known", row), ("noise", {**row, "floor": 1.0})]).splitlines()[2:]

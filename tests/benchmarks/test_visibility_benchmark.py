@@ -118,7 +118,7 @@ def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
     setup.material(0.3)
     reference = estimate(setup.reference(12))
     found = [compare(setup.image(Rule(64, bounces)), reference) for bounces in (0, 1, 2, 4, 8)]
-    bias, relmse = [x.bias for x in found], [x.relmse for x in found]
+    bias, relmse = ([row[key] for row in found] for key in ("bias", "relmse"))
     assert bias == sorted(bias) and bias[0] < -0.3 and abs(bias[-1]) < 0.04
     assert relmse == sorted(relmse, reverse=True) and relmse[-1] < 0.15 * relmse[0]
 
