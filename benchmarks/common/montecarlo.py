@@ -1,9 +1,9 @@
-"""The integrals that a split sum stands for, by Monte Carlo in Dr.Jit, sharing no code with `mi_refgs.shade`.
+"""The integrals that a split sum stands for, by Monte Carlo in Dr.Jit, with Mitsuba's GGX distribution.
 
-A `Lobe` names a way to draw directions and the weights whose integrals against the light are wanted.
-`integrate` combines each lobe with samples of the light (balance heuristic) over randomly shifted Fibonacci
-lattices: the shifts are independent, so the batches tell their own standard error. [Veach 1997, §9; Cranley
-and Patterson 1976]
+Nothing of `mi_refgs.shade` is used. A `Lobe` names a way to draw directions and the weights whose integrals
+against the light are wanted. `integrate` combines each lobe with samples of the light (balance heuristic)
+over randomly shifted Fibonacci lattices; the shifts are independent, so batches give their own standard
+error. [Veach 1997, §9; Cranley and Patterson 1976]
 """
 
 from __future__ import annotations
@@ -80,81 +80,46 @@ def exact_table(n_dot_v: np.ndarray, roughness: float) -> tuple[np.ndarray, np.n
     return a[:, None], b[:, None]
 
 
-def smith_lambda(cosine: Any, α2: Any) -> Any:
-    """Λ of a direction. [Heitz 2014, eq. 72]"""
-    c2 = dr.square(cosine)
-    return 0.5 * (dr.sqrt(1 + α2 * dr.maximum(1 - c2, 0) / c2) - 1)
-
-
-def ggx(half: Any, α2: Any) -> Any:
-    """D of unit half vectors in the normal's frame; sin² is x² + y², as 1 - cos² would lose narrow lobes."""
-    return α2 * dr.inv_pi / dr.square(α2 * dr.square(half.z) + dr.square(half.x) + dr.square(half.y))
-
-
-def sample_visible(view: Any, α: Any, u: Any) -> Any:
-    """Half vector drawn from the normals that `view` sees. [Dupuy and Benyoub 2023, spherical caps]"""
-    stretched = dr.normalize(mi.Vector3f(α * view.x, α * view.y, view.z))
-    sin_φ, cos_φ = dr.sincos(dr.two_pi * u.x)
-    z = dr.fma(1 - u.y, 1 + stretched.z, -stretched.z)
-    sine = dr.sqrt(dr.clip(1 - z * z, 0, 1))
-    cap = mi.Vector3f(sine * cos_φ, sine * sin_φ, z) + stretched
-    return dr.normalize(mi.Vector3f(α * cap.x, α * cap.y, cap.z))
-
-
-def _reflect(view: Any, half: Any) -> Any:
-    return 2 * dr.dot(view, half) * half - view
-
-
-def specular_times_cosine(view: Any, light: Any, α2: Any) -> tuple[Any, Any, Any]:
-    """(D G₂ / (4 n·v) without Fresnel, density of `sample_visible` for it, Schlick's (1 - v·h)⁵)."""
-    half = dr.normalize(view + light)
-    lit = light.z > 0
-    λ_view, λ_light = smith_lambda(view.z, α2), smith_lambda(dr.select(lit, light.z, 1), α2)
-    d = ggx(half, α2) / (4 * view.z)
-    schlick = dr.clip(1 - dr.dot(view, half), 0, 1)
-    value = dr.select(lit, d / (1 + λ_view + λ_light), 0)
-    return value, d / (1 + λ_view), dr.square(dr.square(schlick)) * schlick
-
-
 def brdf_lobe(points: Points, α: Any) -> Lobe:
-    """GGX reflectance in two parts, (1 - Fc) f cosθ and Fc f cosθ, for F = F0 (1 - Fc) + Fc."""
+    """GGX reflectance in two parts, (1 - Fc) f cosθ and Fc f cosθ, for F = F0 (1 - Fc) + Fc.
+
+    f cosθ without Fresnel = D G₂ / (4 n·v), with Smith's height-correlated 1/G₂ = 1/G₁(v) + 1/G₁(l) - 1.
+    """
     frame = mi.Frame3f(points.normal)
-    view, α2 = frame.to_local(points.view), dr.square(α)
+    view, ggx = frame.to_local(points.view), mi.MicrofacetDistribution(mi.MicrofacetType.GGX, α)
 
     def weights(light: Any) -> list[Any]:
-        value, _, schlick = specular_times_cosine(view, light, α2)
+        half, lit = dr.normalize(view + light), light.z > 0
+        below = dr.rcp(ggx.smith_g1(view, half)) + dr.rcp(ggx.smith_g1(light, half)) - 1
+        value = dr.select(lit, ggx.eval(half) / (4 * view.z * below), 0)
+        schlick = dr.power(dr.clip(1 - dr.dot(view, half), 0, 1), 5)
         return [value * (1 - schlick), value * schlick]
 
-    return Lobe(
-        frame,
-        lambda u: _reflect(view, sample_visible(view, α, u)),
-        lambda light: specular_times_cosine(view, light, α2)[1],
-        weights,
-    )
+    def pdf(light: Any) -> Any:
+        half = dr.normalize(view + light)
+        return ggx.pdf(view, half) / (4 * dr.dot(view, half))
+
+    return Lobe(frame, lambda u: mi.reflect(view, ggx.sample(view, u)[0]), pdf, weights)
 
 
 def prefilter_lobe(points: Points, roughness: float, α: Any) -> Lobe:
     """The lobe of a prefiltered map: N = V = R, weight max(L·R, 0) D(H), normalised. [Karis 2013]"""
-    axis = 2 * dr.dot(points.normal, points.view) * points.normal - points.view
-    frame, α2 = mi.Frame3f(axis), dr.square(α)
+    frame = mi.Frame3f(mi.reflect(points.view, points.normal))
+    ggx = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, α, sample_visible=False)
     up = mi.Vector3f(0, 0, 1)
     # ∫ D cosθ_l dω_l = ∫ 4 cosθ_l (D cosθ_h dω_h), and D cosθ_h dω_h = d(ξ) with tan²θ_h = α² ξ / (1 - ξ).
     ξ = (np.arange(NORM_NODES) + 0.5) / NORM_NODES
     light_cosine = 2 / (1 + roughness**4 * ξ / (1 - ξ)) - 1
-    norm = 4 * float(np.maximum(light_cosine, 0).mean())
+    norm = dr.opaque(mi.Float, 4 * float(np.maximum(light_cosine, 0).mean()))
 
-    def sample(u: Any) -> Any:
-        s = dr.sqrt(u.y)
-        tan = α * s / dr.sqrt(dr.maximum(1 - u.y, 1e-7))
-        sin_φ, cos_φ = dr.sincos(dr.two_pi * u.x)
-        return _reflect(up, dr.normalize(mi.Vector3f(tan * cos_φ, tan * sin_φ, 1)))
+    def density(light: Any) -> Any:
+        return ggx.eval(dr.normalize(up + light))
 
-    def pdf(light: Any) -> Any:
-        return 0.25 * ggx(dr.normalize(up + light), α2)
-
-    scale = dr.opaque(mi.Float, 1 / norm)
     return Lobe(
-        frame, sample, pdf, lambda light: [dr.maximum(light.z, 0) * scale * ggx(dr.normalize(up + light), α2)]
+        frame,
+        lambda u: mi.reflect(up, ggx.sample(up, u)[0]),
+        lambda light: 0.25 * density(light),
+        lambda light: [dr.maximum(light.z, 0) * density(light) / norm],
     )
 
 

@@ -72,13 +72,13 @@ def forget_peak() -> int:
 
 
 def in_fresh_process(
-    module: str, *arguments: Any, seconds: float | None = None, **environment: str
+    module: str, *arguments: Any, seconds: float | None = None, environment: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Run `python -m module arguments` and return the JSON object of its last line.
 
     Raises subprocess.SubprocessError for one that fails or takes longer than `seconds`.
     """
     command = [sys.executable, "-m", module, *map(str, arguments)]
-    options: dict[str, Any] = {"cwd": ROOT, "env": os.environ | environment, "timeout": seconds}
+    options: dict[str, Any] = {"cwd": ROOT, "env": {**os.environ, **(environment or {})}, "timeout": seconds}
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, **options)
     return dict(json.loads(done.stdout.splitlines()[-1]))

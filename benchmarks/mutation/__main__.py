@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from benchmarks.common.report import plain_parser
-from benchmarks.mutation.planting import Mutant, catalogue, copy_repository, planted
+from benchmarks.mutation import Mutant, applied, copy_repository, read_mutants
 
 WORKERS = 2
 TIME_LIMIT = 300
@@ -32,10 +32,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the mutants; print one line per mutant, and the counts."""
     parser = plain_parser("mutation", __doc__)
     parser.add_argument("--only", default="", metavar="WORD", help="mutants whose name contains the word")
-    parser.add_argument("--list", action="store_true", help="print the catalogue and stop")
+    parser.add_argument("--list", action="store_true", help="print the mutants and stop")
     parser.add_argument("--workers", type=int, default=WORKERS, metavar="N", help="copies tested at once")
     options = parser.parse_args(arguments)
-    chosen = [mutant for mutant in catalogue() if options.only in mutant.name]
+    chosen = [mutant for mutant in read_mutants() if options.only in mutant.name]
     if options.list or not chosen:
         for mutant in chosen:
             print(f"{mutant.name:52} {mutant.file:36} {mutant.test}")
@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
             copy = copies.get()
             begin = time.perf_counter()
             try:
-                with planted(mutant, copy):
+                with applied(mutant, copy):
                     return outcome([mutant.test], copy), time.perf_counter() - begin
             finally:
                 copies.put(copy)

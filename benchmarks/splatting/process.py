@@ -37,7 +37,7 @@ def measure(task: str, case: tuple[int, int], **environment: str) -> dict[str, A
 
     memory: peak of forward and backward; step: peak and time of training steps; compile: first calls.
     """
-    return in_fresh_process("benchmarks.splatting.process", task, *case, **environment)
+    return in_fresh_process("benchmarks.splatting.process", task, *case, environment=environment)
 
 
 # ---------------- in the fresh process ----------------

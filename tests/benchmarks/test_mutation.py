@@ -5,10 +5,10 @@ from __future__ import annotations
 import ast
 from functools import cache
 
-from benchmarks.mutation.planting import catalogue, mutated
+from benchmarks.mutation import mutated, read_mutants
 from tests.helpers import ROOT
 
-MUTANTS = catalogue()
+MUTANTS = read_mutants()
 WITHOUT_MUTANTS = {"reference"}
 """The float64 reference that the others are tested against."""
 
@@ -36,7 +36,7 @@ def test_mutant_names_are_unique() -> None:
     assert sorted(set(names)) == sorted(names)
 
 
-def test_every_room_has_mutants() -> None:
-    """A new room gets mutants, or is listed as one that computes nothing of its own."""
+def test_every_folder_of_the_package_has_mutants() -> None:
+    """A new folder gets mutants, or is listed as one that computes nothing of its own."""
     packages = {path.parent.name for path in (ROOT / "mi_refgs").glob("*/__init__.py")}
     assert packages - {mutant.file.split("/")[1] for mutant in MUTANTS} <= WITHOUT_MUTANTS
