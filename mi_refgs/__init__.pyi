@@ -53,6 +53,7 @@ from mi_refgs.surfels.ply import write_ply as write_ply
 from mi_refgs.surfels.primitives import Primitive as Primitive
 from mi_refgs.surfels.table import Surfels as Surfels
 from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
+from mi_refgs.synthesis.settings import DatasetOptions as DatasetOptions
 
 FormatOption = mi_refgs.formats.format.Option
 load_method = mi_refgs.methods.read.load

@@ -16,6 +16,7 @@ from typing import Any, get_type_hints
 import mitsuba as mi
 import numpy as np
 import pytest
+from tyro.conf import Suppress
 
 from mi_refgs.cli import COMMANDS, command_class, main
 from mi_refgs.data.dataset import Dataset, read_dataset
@@ -70,6 +71,8 @@ def command_options(command: str | type) -> list[str]:
             found += command_options(type(field.default))  # a group of options
         else:
             marks = hints[field.name].__metadata__ if hasattr(hints[field.name], "__metadata__") else ()
+            if Suppress in marks:
+                continue
             [name] = [mark.name for mark in marks if getattr(mark, "name", None)] or [field.name]
             found.append(name if "Positional" in str(marks) else f"--{name.replace('_', '-')}")
     return found

@@ -41,7 +41,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.synthesis.settings import Settings, prepare_folder
+from mi_refgs.synthesis.settings import prepare_folder
 
 VIEWS = 3
 SIZE = (8, 6)
@@ -431,7 +431,8 @@ def _settings(folder: Path) -> list[bytes]:
 def _read_settings(path: Path) -> None:
     """dataset.json of a data set, before it is written anew."""
     (path.parent / "transforms_train.json").write_text("{}")
-    prepare_folder(path.parent, Settings("a.xml", "0", 3, 1, 8, 1, 0, 3, (-30.0, 80.0), 40.0, 0.9, 0), False)
+    settings = {"scene": "a.xml", "scene_sha256": "0", "views": 3, "elevation": [-30.0, 80.0], "fov": 40.0}
+    prepare_folder(path.parent, settings, False)
 
 
 def _logs(folder: Path) -> list[bytes]:

@@ -8,10 +8,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import Flag, Output, Rendering, Result, Words, separated
+from mi_refgs.cli.command import Flag, Output, Rendering, Result, separated
 from mi_refgs.errors import InputError
-
-Range = tuple[float, float]
+from mi_refgs.synthesis.settings import DatasetOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,34 +25,15 @@ class Dataset:
     """Mitsuba scene with an environment emitter, or lamps"""
     output: Output
     """folder of the data set; an interrupted run is continued"""
-    views: Annotated[int, arg(metavar="N")] = 80
-    """training views"""
-    test_views: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """test views (default: a quarter of --views)"""
     size: Annotated[str, arg(metavar="S|WxH")] = "160"
     """pixels per side, or width and height"""
-    samples: Annotated[int, arg(metavar="N")] = 128
-    """samples per pixel; path tracing is noisy, so that the default is larger than that of other commands"""
-    shapes: Words = ()
-    """shapes of interest of an open scene: opaque images, ground truth of these shapes only"""
-    distance: Annotated[Range | None, arg(metavar="NEAR FAR", help_behavior_hint="")] = None
-    """distance of cameras from the object's centre, scene units (default: the object fills the image)"""
-    elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)
-    """elevation of cameras, degrees"""
-    fov: Annotated[float, arg(metavar="DEG")] = 40.0
-    """field of view of the shorter side"""
-    seed: Annotated[int, arg(metavar="N")] = 0
-    """seed of cameras and paths"""
-    max_depth: Annotated[int, arg(metavar="N")] = 6
-    """largest path depth"""
-    light: Annotated[Path | None, arg(metavar="ENV", help_behavior_hint="")] = None
-    """lat-long map (EXR, HDR) instead of the scene's environment map"""
     relight: Annotated[tuple[Path, ...], arg(metavar="ENV …", help_behavior_hint="")] = ()
     """trace the test views under these maps, too, into relight/NAME; may be added later"""
     colmap: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """also write the data set as COLMAP text files with points"""
     overwrite: Flag = False
     """replace a data set that was made with other settings"""
+    image: DatasetOptions = DatasetOptions()
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -63,23 +43,15 @@ class Dataset:
         size = [int(part) if part.isdecimal() else 0 for part in self.size.lower().split("x")]
         if len(size) > 2 or not all(size):
             raise InputError(f"--size: {self.size!r}: give pixels per side, or WIDTHxHEIGHT; such as 160")
+        resolution = (size[0], size[1]) if len(size) == 2 else size[0]
+        image = vars(self.image) | {"size": resolution, "objects": separated(self.image.objects)}
         folder = make_dataset(
             self.scene,
             self.output,
-            views=self.views,
-            size=(size[0], size[1]) if len(size) == 2 else size[0],
-            spp=self.samples,
-            seed=self.seed,
-            test_views=self.test_views,
-            max_depth=self.max_depth,
-            elevation=self.elevation,
-            fov=self.fov,
-            light=self.light,
             relight=self.relight,
-            objects=separated(self.shapes),
-            distance=self.distance,
             colmap=self.colmap,
             overwrite=self.overwrite,
+            **image,
         )
         counts = {split: len(list((folder / split).glob("r_*.png"))) for split in ("train", "test")}
         lights = sorted(path.parent.name for path in folder.glob("relight/*/transforms_test.json"))
@@ -87,7 +59,7 @@ class Dataset:
             "dataset": str(folder),
             "train_views": counts["train"],
             "test_views": counts["test"],
-            "size": size if len(size) == 2 else size[0],
+            "size": resolution,
             "relight": lights,
         }
         text = (

@@ -20,8 +20,7 @@ unknown: A = 0.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -36,19 +35,28 @@ SPHERE_SUBDIVISIONS = 5
 ROUND_SIDES = 256  # sides of a circle: the centre of a side is 8e-5 radii inside it
 
 
-@dataclass(frozen=True)
-class Materials:
+class Materials(NamedTuple):
     """Materials at points: each a value, 0 where undefined, and whether it is defined."""
 
     albedo: tuple[Color3f, Bool]
     roughness: tuple[Float, Bool]
     metallic: tuple[Float, Bool]
 
+    @staticmethod
+    def of(albedo: Any = None, roughness: Any = None, metallic: Any = None, known: Bool = True) -> Materials:
+        """Materials of these values, where `known`; None is undefined."""
+        import mitsuba as mi
+
+        def pair(kind: Any, value: Any) -> tuple[Any, Bool]:
+            return (kind(0), mi.Bool(False)) if value is None else (kind(value), mi.Bool(known))
+
+        return Materials(pair(mi.Color3f, albedo), pair(mi.Float, roughness), pair(mi.Float, metallic))
+
     def where(self, mask: Bool, other: Materials) -> Materials:
         """These materials under the mask, the others elsewhere."""
         import drjit as dr
 
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        pairs = zip(self, other, strict=True)
         return Materials(*((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs))
 
     def cleaned(self) -> Materials:
@@ -62,15 +70,7 @@ class Materials:
                 finite = finite & (dr.abs(x) < MAX_NUMBER)
             return type(value)(dr.select(finite, dr.clip(value, 0, 1), 0)), mi.Bool(finite)
 
-        return Materials(*(clean(*getattr(self, f.name)) for f in fields(self)))
-
-
-def unknown() -> Materials:
-    """Materials that are undefined everywhere."""
-    import mitsuba as mi
-
-    nothing = (mi.Float(0), mi.Bool(False))
-    return Materials((mi.Color3f(0), mi.Bool(False)), nothing, nothing)
+        return Materials(*(clean(*pair) for pair in self))
 
 
 def materials_at(scene: Any, si: Any) -> Materials:
@@ -80,7 +80,7 @@ def materials_at(scene: Any, si: Any) -> Materials:
     """
     import mitsuba as mi
 
-    found, here = unknown(), si.bsdf()
+    found, here = Materials.of(), si.bsdf()
     bsdfs = {id(bsdf): bsdf for shape in scene.shapes() if (bsdf := shape.bsdf()) is not None}
     for bsdf in bsdfs.values():
         mask = si.is_valid() & (here == mi.BSDFPtr(bsdf))
@@ -139,41 +139,33 @@ def _of(bsdf: Any, si: Any, active: Bool) -> Materials:
     for needed, rule in RULES:
         if all(name in parameters for name in needed):
             return rule(parameters)
-    return unknown()
+    return Materials.of()
 
 
 def _principled(p: _Parameters) -> Materials:
-    known, colour = p.number("spec_trans") < OPAQUE, p.colour("albedo" if "albedo" in p else "base_color")
-    return Materials((colour, known), (p.number("roughness"), known), (p.number("metallic"), known))
-
-
-def _diffuse(p: _Parameters) -> Materials:
-    import mitsuba as mi
-
-    yes = mi.Bool(True)
-    return Materials((p.colour("reflectance"), yes), (mi.Float(0), mi.Bool(False)), (mi.Float(0), yes))
+    colour, opaque = p.colour("albedo" if "albedo" in p else "base_color"), p.number("spec_trans") < OPAQUE
+    return Materials.of(colour, p.number("roughness"), p.number("metallic"), opaque)
 
 
 def _conductor(p: _Parameters) -> Materials:
     import drjit as dr
-    import mitsuba as mi
 
-    eta, k, yes = p.colour("eta"), p.colour("k"), mi.Bool(True)
+    eta, k = p.colour("eta"), p.colour("k")
     # Reflectance at normal incidence; η = 0 (`material = none`) gives 1.
     f0 = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
     α = dr.sqrt(p.number("alpha_u") * p.number("alpha_v")) if "alpha_u" in p else p.number("alpha")
-    return Materials((f0 * p.colour("specular_reflectance"), yes), (dr.sqrt(α), yes), (mi.Float(1), yes))
+    return Materials.of(f0 * p.colour("specular_reflectance"), dr.sqrt(α), 1)
 
 
 def _plastic(p: _Parameters) -> Materials:
     import drjit as dr
     import mitsuba as mi
 
-    albedo, yes = p.colour("diffuse_reflectance"), mi.Bool(True)
+    albedo = p.colour("diffuse_reflectance")
     if "nonlinear = 1" in str(p.bsdf):  # no parameter says so
         inside = mi.fresnel_diffuse_reflectance(1 / p.number("eta", 1.5))
         albedo = albedo * (1 - inside) / (1 - albedo * inside)
-    return Materials((albedo, yes), (dr.sqrt(p.number("alpha")), yes), (mi.Float(0), yes))
+    return Materials.of(albedo, dr.sqrt(p.number("alpha")), 0)
 
 
 def _two_sided(p: _Parameters) -> Materials:
@@ -187,7 +179,7 @@ def _two_sided(p: _Parameters) -> Materials:
 
 def _blend(p: _Parameters) -> Materials:
     weight = p.number("weight")
-    second = p.nested("bsdf_1").where(1 - weight < OPAQUE, unknown())
+    second = p.nested("bsdf_1").where(1 - weight < OPAQUE, Materials.of())
     return p.nested("bsdf_0").where(weight < OPAQUE, second)
 
 
@@ -196,12 +188,12 @@ RULES: tuple[tuple[tuple[str, ...], Callable[[_Parameters], Materials]], ...] = 
     (("bsdf_0", "bsdf_1", "weight"), _blend),
     (("nested_bsdf",), lambda p: p.nested("nested_bsdf")),
     (("albedo", "roughness", "metallic"), _principled),
-    (("diff_trans",), lambda p: unknown()),
+    (("diff_trans",), lambda p: Materials.of()),
     (("base_color", "roughness"), _principled),
     (("diffuse_reflectance",), _plastic),
     (("eta", "k"), _conductor),
-    (("transmittance",), lambda p: unknown()),
-    (("reflectance",), _diffuse),
+    (("transmittance",), lambda p: Materials.of()),
+    (("reflectance",), lambda p: Materials.of(p.colour("reflectance"), None, 0)),
 )
 """Parameters of a BSDF → its materials; the first entry that fits."""
 

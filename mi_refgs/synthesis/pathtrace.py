@@ -14,7 +14,7 @@ from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis.ground_truth import materials_at
-from mi_refgs.synthesis.settings import Settings
+from mi_refgs.synthesis.settings import DatasetOptions
 from mi_refgs.types import Point2f
 
 SAMPLES_PER_LAUNCH = 1 << 24
@@ -104,44 +104,63 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
     return image.astype(np.float32)
 
 
+@dataclass(frozen=True)
+class Cameras:
+    """The cameras of a data set around the bounding sphere of its object."""
+
+    options: DatasetOptions
+    centre: np.ndarray  # (3,)
+    radius: float
+    reach: float  # radius around the centre that contains all shapes
+    objects: Sequence[Any] = ()  # the object's shapes in an open scene
+
+    @property
+    def distance(self) -> tuple[float, float]:
+        """Distance from the centre to the nearest and the farthest camera."""
+        filling = self.radius / (self.options.fill * math.sin(math.radians(self.options.fov) / 2))
+        return self.options.distance or (filling, filling)
+
+    def of(self, split: str) -> list[tuple[np.ndarray, int]]:
+        """Pose and seed of each view of a split.
+
+        Random streams are independent: one per split for the cameras, one per view for its paths.
+        """
+        options, index = self.options, ("train", "test").index(split)
+        rng, count = np.random.default_rng([options.seed, index]), options.count(split)
+        poses = camera_poses(count, self.centre, self.distance, options.elevation, rng)
+        streams = (np.random.SeedSequence([options.seed, index, i]) for i in range(count))
+        return [(p, int(stream.generate_state(1)[0])) for p, stream in zip(poses, streams, strict=True)]
+
+
 class Tracer:
     """One sensor that moves from view to view, so that each kernel is compiled once.
 
-    `size` is width and height, `fov` that of the shorter side in degrees. Images have alpha, and emitters are
-    hidden, unless `objects` are shapes of an open scene: then images show everything, and maps are of those
-    shapes only.
+    Images have alpha, and emitters are hidden, unless `cameras` have the objects of an open scene: then
+    images show everything, and maps are of those shapes only.
     """
 
-    def __init__(
-        self,
-        scene: Any,
-        *,
-        size: tuple[int, int],
-        fov: float,
-        spp: int,
-        max_depth: int,
-        near: float,
-        far: float,
-        objects: Sequence[Any] = (),
-    ) -> None:
+    def __init__(self, scene: Any, cameras: Cameras) -> None:
         import mitsuba as mi
 
-        self.scene, self.objects = scene, objects
-        self.width, self.height = size
-        pixels = self.width * self.height
+        options, (low, high) = cameras.options, cameras.distance
+        self.scene, self.cameras, self.objects = scene, cameras, cameras.objects
+        self.width, self.height = options.resolution
+        pixels, spp = self.width * self.height, options.spp
         paths = min(pixels * spp, SAMPLES_PER_LAUNCH)
         what = f"image: {self.width} × {self.height} pixels"
         require(BASE + PER_PATH * paths + 8 * PER_STACKED_VALUE * pixels, what, "make smaller ones")
-        self.passes = -(-self.width * self.height * spp // SAMPLES_PER_LAUNCH)
+        self.passes = -(-pixels * spp // SAMPLES_PER_LAUNCH)
         # The sampler's own grid of strata: it would round up by itself, but warn each time.
         strata = math.isqrt(-(-spp // self.passes))
         self.spp = strata * -(-spp // (self.passes * strata))
-        self.integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": not objects})
+        opaque = bool(self.objects)
+        path = {"type": "path", "max_depth": options.max_depth, "hide_emitters": not opaque}
+        self.integrator = mi.load_dict(path)
         film: dict[str, Any] = {"type": "hdrfilm", "component_format": "float32", "rfilter": {"type": "box"}}
-        film |= {"width": self.width, "height": self.height, "pixel_format": "rgb" if objects else "rgba"}
-        lens = {"fov": fov, "fov_axis": "smaller", "near_clip": near, "far_clip": far}
-        sampler = {"type": "multijitter"}
-        self.sensor = mi.load_dict({"type": "perspective", **lens, "sampler": sampler, "film": film})
+        film |= {"width": self.width, "height": self.height, "pixel_format": "rgb" if opaque else "rgba"}
+        lens: dict[str, Any] = {"type": "perspective", "fov": options.fov, "fov_axis": "smaller"}
+        lens |= {"near_clip": 0.1 * (low - cameras.radius), "far_clip": 10 * (high + cameras.reach)}
+        self.sensor = mi.load_dict(lens | {"sampler": {"type": "multijitter"}, "film": film})
         self.params = mi.traverse(self.sensor)
 
     def image(self, pose: np.ndarray, seed: int) -> np.ndarray:
@@ -184,7 +203,7 @@ class Tracer:
             hit = plane(wanted).astype(bool) & covered
             depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(height, width)
             found = {"normal": np.array(normal).T.reshape(height, width, 3), "depth": depth[..., None]}
-            for name, (value, known) in vars(materials_at(self.scene, si)).items():
+            for name, (value, known) in materials_at(self.scene, si)._asdict().items():
                 planes = [plane(x) for x in (value if dr.depth_v(value) > 1 else [value])]
                 found[name] = np.stack([*planes, plane(known)], axis=-1)
         return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
@@ -214,40 +233,3 @@ class Tracer:
 
         self.params["to_world"] = mi.ScalarTransform4f(pose)
         self.params.update()
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """The cameras of a data set around the bounding sphere of its object."""
-
-    settings: Settings
-    centre: np.ndarray
-    radius: float
-    reach: float  # radius around the centre that contains all shapes
-    objects: Sequence[Any] = ()  # the object's shapes in an open scene
-
-    @property
-    def distance(self) -> tuple[float, float]:
-        """Distance from the centre to the nearest and the farthest camera."""
-        filling = self.radius / (self.settings.fill * math.sin(math.radians(self.settings.fov) / 2))
-        near, far = self.settings.distance
-        return near or filling, far or filling
-
-    def tracer(self, scene: Any) -> Tracer:
-        """The path tracer of the scene's views."""
-        s, (low, high) = self.settings, self.distance
-        options = {name: getattr(s, name) for name in ("fov", "spp", "max_depth")}
-        options |= {"near": 0.1 * (low - self.radius), "far": 10 * (high + self.reach)}
-        return Tracer(scene, size=s.resolution, objects=self.objects, **options)
-
-    def of(self, split: str) -> list[tuple[np.ndarray, int]]:
-        """Pose and seed of each view of a split.
-
-        Random streams are independent: one per split for the cameras, one per view for its paths.
-        """
-        s, index = self.settings, ("train", "test").index(split)
-        rng = np.random.default_rng([s.seed, index])
-        count = s.test_views if index else s.views
-        poses = camera_poses(count, self.centre, self.distance, s.elevation, rng)
-        streams = (np.random.SeedSequence([s.seed, index, i]) for i in range(count))
-        return [(p, int(stream.generate_state(1)[0])) for p, stream in zip(poses, streams, strict=True)]

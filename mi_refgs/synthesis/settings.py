@@ -1,4 +1,4 @@
-"""Settings of a path-traced data set, the folder that records them, and its scene files."""
+"""Options of a path-traced data set, the folder that records them, and its scene files."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from tyro.conf import Suppress, arg
 
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
@@ -34,6 +35,8 @@ VIEW_FILES = (*OWN_FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in OWN
 """Files of a data set except its settings; overwriting removes them."""
 Z_UP = (1, 0, 0), 90.0
 """Axis and angle in degrees that rotate y of a lat-long map to z, in scenes without an `envmap`."""
+LATER = {"light": "", "light_sha256": "", "height": 0, "objects": [], "distance": [0, 0]}
+"""Values of settings that records of older versions lack."""
 
 
 @dataclass(frozen=True)
@@ -110,83 +113,114 @@ def under_light(scene: Any, light: Path) -> Any:
     return mi.load_dict({"type": "scene", **parts, "environment": environment})
 
 
-@dataclass(frozen=True)
-class Settings:
-    """All settings that determine the pixels of a data set."""
+Count = Annotated[int, arg(metavar="N")]
+Range = tuple[float, float]
 
-    scene: str  # file name without folder
-    scene_sha256: str  # of the XML and the files in it
-    views: int
-    test_views: int
-    size: int  # pixels: the width
-    spp: int
-    seed: int
-    max_depth: int
-    elevation: tuple[float, float]  # degrees above the horizon, z up
-    fov: float  # degrees, of the shorter side
-    fill: float  # radius of the bounding sphere / (distance · sin(fov / 2)); at 1 it touches the edge
-    environment_height: int  # rows; 0 writes no environment
-    light: str = ""  # file name of the map in place of the scene's environment
-    light_sha256: str = ""
-    height: int = 0  # pixels; 0: as many as `size`
-    objects: tuple[str, ...] = ()  # ids of the object's shapes in an open scene; empty: all, with alpha
-    distance: tuple[float, float] = (0.0, 0.0)  # nearest and farthest camera, scene units; 0: from `fill`
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetOptions:
+    """What determines the pixels of a data set, beside its scene."""
+
+    views: Count = 80
+    """training views"""
+    test_views: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """test views (default: a quarter of --views)"""
+    size: Annotated[int | tuple[int, int], Suppress] = 160
+    """pixels per side, or width and height"""
+    spp: Annotated[int, arg(metavar="N", name="samples")] = 128
+    """samples per pixel; path tracing is noisy, so that the default is larger than that of other commands"""
+    objects: Annotated[tuple[str, ...], arg(metavar="NAME …", name="shapes", help_behavior_hint="")] = ()
+    """shapes of interest of an open scene: opaque images, ground truth of these shapes only"""
+    distance: Annotated[Range | None, arg(metavar="NEAR FAR", help_behavior_hint="")] = None
+    """distance of cameras from the object's centre, scene units (default: the object fills the image)"""
+    elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)
+    """elevation of cameras, degrees"""
+    fov: Annotated[float, arg(metavar="DEG")] = 40.0
+    """field of view of the shorter side"""
+    fill: Annotated[float, Suppress] = 0.95
+    """fraction of the shorter side that the object's bounding sphere fills, where `distance` is not given"""
+    seed: Count = 0
+    """seed of cameras and paths"""
+    max_depth: Count = 6
+    """largest path depth"""
+    environment_height: Annotated[int, Suppress] = 256
+    """rows of environment.exr; 0 writes none"""
+    light: Annotated[str | Path | None, arg(metavar="ENV", help_behavior_hint="")] = None
+    """lat-long map (EXR, HDR) instead of the scene's environment map, rotated as that is"""
 
     @property
     def resolution(self) -> tuple[int, int]:
         """Width and height, pixels."""
-        return self.size, self.height or self.size
+        return (self.size, self.size) if isinstance(self.size, int) else self.size
 
     @property
     def focal(self) -> float:
         """Focal length, pixels."""
         return 0.5 * min(self.resolution) / math.tan(math.radians(self.fov) / 2)
 
-    def require_valid(self) -> None:
-        """Raise InputError for a setting that is out of range."""
+    def count(self, split: str) -> int:
+        """Number of views of a split."""
+        if split == "train":
+            return self.views
+        return max(1, self.views // 4) if self.test_views is None else self.test_views
 
-        def need(good: bool, field: str, remedy: str) -> None:
+    def record(self, scene: Path) -> dict[str, Any]:
+        """The content of dataset.json. Raises InputError for a scene or light that cannot be read, and for an
+        option that is out of range.
+        """
+        light = None if self.light is None else LightFile.of(Path(self.light))
+        width, height = self.resolution
+        values = vars(self) | {
+            "scene": scene.name,
+            "scene_sha256": scene_hash(scene),  # of the XML and the files in it
+            "test_views": self.count("test"),
+            "size": width,
+            "height": 0 if height == width else height,
+            "light": "" if light is None else light.path.name,
+            "light_sha256": "" if light is None else light.sha256,
+            "distance": self.distance or (0, 0),
+        }
+
+        def need(good: Any, field: str, remedy: str) -> None:
             if not good:
-                value = getattr(self, field)
-                raise InputError(f"{self.scene}: {field}: {value} is out of range; {remedy}")
+                raise InputError(f"{scene}: {field}: {values[field]} is out of range; {remedy}")
 
         for field in ("views", "test_views", "size", "spp", "max_depth"):
-            need(getattr(self, field) >= 1, field, "give a number of at least 1")
+            need(values[field] >= 1, field, "give a number of at least 1")
         low, high = self.elevation
         need(-90 < low < high < 90, "elevation", "give two angles in degrees, -90 < low < high < 90")
         need(0 < self.fov < 170, "fov", "give degrees between 0 and 170")
         need(0 < self.fill <= 1, "fill", "give a fraction between 0 and 1")
         need(self.seed >= 0, "seed", "give a number of at least 0")
-        need(self.height >= 0, "height", "give a number of at least 0")
-        near, far = self.distance
-        need(0 < near <= far < np.inf or near == far == 0, "distance", "give two lengths, 0 < NEAR <= FAR")
+        need(height >= 1, "height", "give a number of at least 1")
+        near, far = self.distance or (1, 1)
+        need(0 < near <= far < np.inf, "distance", "give two lengths, 0 < NEAR <= FAR")
+        content: dict[str, Any] = json.loads(json.dumps(values, default=lambda array: array.tolist()))
+        return content
 
 
 def prepare_folder(
-    out: Path, settings: Settings, overwrite: bool, relight: Sequence[LightFile] = ()
+    out: Path, wanted: dict[str, Any], overwrite: bool, relight: Sequence[LightFile] = ()
 ) -> OutputFolder:
-    """Make the folders and record the settings.
+    """Make the folders and record the settings `wanted`.
 
     Raises InputError for a folder with a data set of other settings or with foreign files; `overwrite`
     removes the former.
     """
-    # Recorded settings; those that an older version lacked have their defaults.
+    # Recorded settings.
     record = out / RECORD
-    known = _as_json({f.name: f.default for f in fields(Settings) if f.default is not MISSING})
-    wanted = _as_json(asdict(settings))
-    found: Any = None
-    if record.is_file():
-        with contextlib.suppress(InputError):
-            content = read_json(record)
-            found = known | content if "scene_sha256" in content else None  # runs also have a dataset.json
+    found: dict[str, Any] | None = None
+    with contextlib.suppress(InputError):
+        content = read_json(record)
+        found = LATER | content if "scene_sha256" in content else None  # runs also have a dataset.json
     output = OutputFolder(out, "dataset", (RECORD, *VIEW_FILES), RECORD if found else "", overwrite=overwrite)
 
     # Files that do not match the settings or a light, and the options that say so.
-    lights = _lights(found)
-    same = found is not None and {name: found.get(name) for name in wanted} == wanted
-    stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]
-    differing = [k for k in wanted if k not in found or found[k] != wanted[k]] if found else []
+    differing = [name for name, value in wanted.items() if found and found.get(name) != value]
     changed = [*dict.fromkeys(_option(name) for name in differing)]
+    same = found is not None and not changed
+    stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]
+    lights = recorded_lights(record) if same else {}
     if len({light.name for light in relight}) < len(relight):
         names = ", ".join(str(light.path) for light in relight)
         raise InputError(f"{names}: --relight: two have one name; rename one of the files")
@@ -201,7 +235,7 @@ def prepare_folder(
         )
 
     # Remove them, make the folders, and record the settings.
-    lights = (lights if same else {}) | {light.name: light.sha256 for light in relight}
+    lights |= {light.name: light.sha256 for light in relight}
     if not same:
         output.require_free()
     output.remove(file.relative_to(out).as_posix() for file in stale)
@@ -218,21 +252,10 @@ def _option(field: str) -> str:
     return names.get(field) or f"--{field.replace('_', '-')}"
 
 
-def _as_json(values: dict[str, Any]) -> dict[str, Any]:
-    """The values as JSON returns them: tuples become lists."""
-    content: dict[str, Any] = json.loads(json.dumps(values))
-    return content
-
-
-def _lights(record: Any) -> dict[str, str]:
-    """Name and SHA-256 of the other environment maps in a dataset.json."""
-    lights = record.get(RELIGHT) if isinstance(record, dict) else None
-    return {k: v for k, v in lights.items() if isinstance(v, str)} if isinstance(lights, dict) else {}
-
-
 def recorded_lights(record: Path) -> dict[str, str]:
     """Name and SHA-256 of the other environment maps in a dataset.json; empty without that file."""
     try:
-        return _lights(read_json(record))
+        lights = read_json(record).get(RELIGHT)
     except InputError:
         return {}
+    return {k: v for k, v in lights.items() if isinstance(v, str)} if isinstance(lights, dict) else {}

@@ -38,18 +38,18 @@ def colmap_output(folder: Path, data: Path, cameras: Cameras) -> OutputFolder:
     return output
 
 
-def write_colmap(output: OutputFolder, data: Path, cameras: Cameras, tracer: Tracer) -> None:
+def write_colmap(output: OutputFolder, data: Path, tracer: Tracer) -> None:
     """Write the finished data set in `data` as COLMAP; raises InputError if a file cannot be written."""
     folder = output.path
-    names, poses, tests = _order(cameras)
+    names, poses, tests = _order(tracer.cameras)
     sparse, images = folder / "sparse" / "0", folder / "images"
     files = _files(names)
     for name, file in zip(names, files, strict=True):
         _copy(data / f"{name}.png", images / file)
-    settings = cameras.settings
-    (width, height), focal = settings.resolution, settings.focal
+    options = tracer.cameras.options
+    (width, height), focal = options.resolution, options.focal
     shown = np.stack([read_png(images / file)[..., :3] for file in files])
-    points, colours, tracks, places = _points(shown, poses, tracer, focal, settings.seed)
+    points, colours, tracks, places = _points(shown, poses, tracer, focal, options.seed)
 
     write_cameras(sparse, [((width, height, focal, focal, width / 2, height / 2), None)])
     seen: list[list[str]] = [[] for _ in files]

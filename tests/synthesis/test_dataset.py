@@ -23,7 +23,7 @@ from mi_refgs.io.ownership import RECORD
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
-from mi_refgs.synthesis.settings import load_scene, under_light
+from mi_refgs.synthesis.settings import DatasetOptions, load_scene, under_light
 from tests.helpers import read_loaded, refused
 from tests.scenes.integrator import sky
 from tests.scenes.sphere import CENTRE, RADIUS, SCENE
@@ -228,10 +228,11 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
 def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
     pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), np.random.default_rng(0))[0]
-    options: dict[str, Any] = {"size": (8, 8), "fov": 30, "spp": 64, "max_depth": 3, "near": 0.1, "far": 50}
-    whole = pathtrace.Tracer(scene, **options).image(pose, 5)
+    options = DatasetOptions(size=8, fov=30, spp=64, max_depth=3)
+    cameras = pathtrace.Cameras(options, CENTRE, RADIUS, RADIUS)
+    whole = pathtrace.Tracer(scene, cameras).image(pose, 5)
     monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
-    split = pathtrace.Tracer(scene, **options)
+    split = pathtrace.Tracer(scene, cameras)
     assert (split.passes, split.spp) == (4, 16)
     np.testing.assert_allclose(split.image(pose, 5).mean(), whole.mean(), rtol=0.02)
 

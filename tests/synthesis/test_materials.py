@@ -57,7 +57,7 @@ def seen_from(direction: tuple[float, float, float], *shapes: dict[str, Any]) ->
     scene = mi.load_dict({"type": "scene", **parts})
     ray = mi.Ray3f(-5 * mi.Point3f(direction), mi.Vector3f(direction))
     found = materials_at(scene, scene.ray_intersect(ray))
-    dr.eval(vars(found))  # while there is a scene to trace
+    dr.eval(*found)  # while there is a scene to trace
     return found
 
 

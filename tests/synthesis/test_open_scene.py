@@ -179,6 +179,7 @@ def test_every_eighth_image_is_a_test_view(made: Path, tmp_path: Path) -> None:
         ({"distance": (6.0, 6.0)}, ("--distance: something is between",)),
         ({"distance": (3.0, 2.0)}, ("distance: ", "out of range")),
         ({"relight": [__file__]}, ("--relight",)),
+        ({"vews": 3}, ("make_dataset: vews: unknown option; use some of views",)),
     ],
 )
 def test_refusals(made: Path, tmp_path: Path, options: dict, words: tuple[str, ...]) -> None:
