@@ -17,8 +17,7 @@ from statistics import fmean
 from typing import Any
 
 from benchmarks.common.report import plain_parser
-from mi_refgs.compare.results import table as table_of
-from mi_refgs.compare.table import NOTHING, Row, Scene, Table, aligned
+from mi_refgs.compare.table import NOTHING, Row, Scene, Table, aligned, table_of
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json
 

@@ -60,7 +60,8 @@ class Compare:
 
     def run(self) -> Result:
         """Run the missing jobs, then tabulate all runs in the folder."""
-        from mi_refgs.compare import execute, jobs, results
+        from mi_refgs.compare import execute, jobs, page
+        from mi_refgs.compare.table import markdown
 
         if self.data:
             workers = 1 if self.workers is None else self.workers
@@ -83,13 +84,14 @@ class Compare:
                     raise InputError(
                         f"--{name}: DATA: none given; name the data sets to which to fit the methods"
                     )
-        table = results.write(self.output)
-        text = results.text(self.output, table)
+        table = page.write(self.output)
+        files = ", ".join(str(self.output / name) for name in (jobs.PAGE, jobs.TABLE_TEXT, jobs.TABLE))
+        text = f"{markdown(table)}\n{files}"
         return Result(dataclasses.asdict(table), text, 0 if table.complete else EXIT_INCOMPLETE)
 
     def _plan(self, workers: int, threads: int | None) -> list[Job]:
         """Return the checked jobs, after writing them into their run folders."""
-        from mi_refgs.compare import jobs, results
+        from mi_refgs.compare import jobs
 
         methods = separated(self.methods)
         if not methods:
@@ -102,7 +104,7 @@ class Compare:
             self.preset or DEFAULT_PRESET, (*joined(self.set),), self.common.mitsuba_variant, threads
         )
         planned = jobs.plan(self.output, self.data, methods, seeds, shared)
-        results.begin(self.output, planned, workers, sys.argv[1:])
+        jobs.begin(self.output, planned, workers, sys.argv[1:])
         return planned
 
 

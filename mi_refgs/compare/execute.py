@@ -48,7 +48,7 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
         if code == DONE or (stop is not None and stop.is_set()):
             return None
         if code == FAILURE:
-            return str(read_json(Path(job.folder) / FAILED).get("reason"))
+            return str(read_json(job.run.path / FAILED).get("reason"))
     saved = job.run.checkpoints()
     ended = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
     reason = (
@@ -85,7 +85,7 @@ def _process(job: Job, stop: threading.Event | None) -> int:
     try:
         log = job.run.output.own(LOG).open("ab")
     except OSError as error:
-        raise cannot_write(Path(job.folder) / LOG, error) from error
+        raise cannot_write(job.run.path / LOG, error) from error
     with log:
         process = subprocess.Popen(
             [sys.executable, "-m", "mi_refgs.compare.worker", job.folder],

@@ -1,19 +1,25 @@
-"""The jobs of a comparison: one per data set, method and seed, each with its own run folder."""
+"""The jobs of a comparison: one per data set, method and seed, each with its own run folder.
+
+Files of a comparison beside its runs: compare.json (settings); table.json, table.md and a page with images.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import os
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mi_refgs import __version__
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.plan import sized
-from mi_refgs.io.files import read_json
+from mi_refgs.io.files import read_json, write_json
+from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import differences, load
 from mi_refgs.runs.run import Run
@@ -21,8 +27,10 @@ from mi_refgs.runs.views import read_views
 
 RUNS = "runs"
 """Folder of the runs: runs/<data>/<method>/seed<k>."""
-SETTINGS, JOB, FAILED = "compare.json", "job.json", "failed.json"
-"""Files: settings of the comparison; in a run folder, its job, and why it failed."""
+SETTINGS, TABLE, TABLE_TEXT, PAGE = "compare.json", "table.json", "table.md", "index.html"
+PICTURES = "pictures"  # folder of the page's images
+JOB, FAILED = "job.json", "failed.json"
+"""Files of a run folder: its job, and why it failed."""
 MAX_SEED = 2**31 - 1
 
 
@@ -47,9 +55,14 @@ class Job:
         return Run(self.folder)
 
     @property
+    def name(self) -> str:
+        """Name of the method."""
+        return Path(self.variant).stem
+
+    @property
     def title(self) -> str:
         """Data set, method and seed as text."""
-        return f"{Path(self.data).name} × {Path(self.variant).stem} × seed {self.seed}"
+        return f"{Path(self.data).name} × {self.name} × seed {self.seed}"
 
     def method(self, components: Sequence[str] = ()) -> Method:
         """Load the method with these optional components; raises InputError as `load` and `sized` do."""
@@ -114,6 +127,33 @@ def plan(
     for job in jobs:
         require_same(job)
     return jobs
+
+
+def output_folder(folder: Path) -> OutputFolder:
+    """Return the folder of a comparison with its files beside the runs."""
+    files = (SETTINGS, TABLE, TABLE_TEXT, PAGE, f"{PICTURES}/*_psnr.png", f"{PICTURES}/*_crops.png")
+    return OutputFolder(folder, "compare", files, marker=SETTINGS)
+
+
+def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequence[str]) -> None:
+    """Write the settings of the comparison and the jobs, which are rows of the table from now on.
+
+    Raises InputError where that is impossible.
+    """
+    output_folder(folder).require_free()
+    for job in planned:
+        job.write()
+    before = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    about = {
+        "data": list(dict.fromkeys([*before.get("data", []), *(job.data for job in planned)])),
+        "variants": list(dict.fromkeys([*before.get("variants", []), *(job.name for job in planned)])),
+        "preset": planned[0].preset,
+        "set": list(planned[0].settings),
+        "workers": workers,
+        "command": shlex.join(["refgs", *arguments]),
+        "version": __version__,
+    }
+    write_json(output_folder(folder).own(SETTINGS), about, indent=2)
 
 
 def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:

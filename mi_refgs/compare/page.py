@@ -1,11 +1,11 @@
-"""The page of a comparison: a static index.html that can be opened from disk, with plots and crops."""
+"""The files of a comparison: table.json, table.md, and a static page with plots and crops."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.compare.table import Row, Scene, Table, cell, columns_of, header, heading, remarks
+from mi_refgs.compare.jobs import PAGE, PICTURES, TABLE, TABLE_TEXT, output_folder
+from mi_refgs.compare.table import (
+    Row,
+    Scene,
+    Table,
+    cell,
+    columns_of,
+    header,
+    heading,
+    markdown,
+    remarks,
+    table_of,
+)
 from mi_refgs.compare.worker import CURVE
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
@@ -25,7 +37,6 @@ from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.views import read_views
 
-PAGE, PICTURES = "index.html", "pictures"
 STYLE = """
 :root { color-scheme: light dark; --line: #8886; --soft: #8882; }
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; padding: 0 1rem; }
@@ -51,6 +62,22 @@ CROP_SHARE, CROP_MIN = 3, 24
 """The side of a crop is this fraction of the image's shorter side, at least so many pixels."""
 ROW = 6
 """Crops per row."""
+
+
+def write(folder: Path) -> Table:
+    """Write the table of all jobs in a folder as table.json, table.md and a page.
+
+    Raises InputError if there are none, or a file cannot be written.
+    """
+    table, output = table_of(folder), output_folder(folder)
+    if not table.scenes:
+        raise InputError("DATA: none given, and the folder has no comparison; name data sets to fit")
+    output.require_free()
+    content = json.dumps(asdict(table), indent=1, ensure_ascii=False)
+    write_bytes(output.own(TABLE), f"{content}\n".encode())
+    write_bytes(output.own(TABLE_TEXT), markdown(table).encode())
+    write_page(output, table)
+    return table
 
 
 def write_page(output: OutputFolder, table: Table) -> None:

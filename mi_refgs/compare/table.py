@@ -3,47 +3,19 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.compare.jobs import FAILED, Job, finished, require_one_size
+from mi_refgs.compare.jobs import FAILED, SETTINGS, Job, finished, jobs_in, require_one_size
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
+from mi_refgs.evaluation.scores import SCORES, Score
 from mi_refgs.io.files import read_json
 
-
-@dataclass(frozen=True)
-class Column:
-    """A number of metrics.json and its format."""
-
-    key: str
-    title: str
-    unit: str
-    form: str  # of mean and standard deviation
-    higher: bool | None  # whether higher is better; None: neither
-    reason: str = ""  # key of metrics.json with the reason for a missing number
-
-    def text(self, value: float) -> str:
-        """Format a value."""
-        return format(value, self.form)
-
-
 NOTHING = "–"
-
-COLUMNS = (
-    Column("psnr", "PSNR", "dB", ".2f", True),
-    Column("ssim", "SSIM", "", ".4f", True),
-    Column("flip", "FLIP", "", ".4f", False, "flip_reason"),
-    Column("lpips", "LPIPS", "", ".4f", False, "lpips_reason"),
-    Column("normal_mae_deg", "normal error", "°", ".2f", False, "normal_reason"),
-    Column("normal_mae_deg_full", "normal error, whole image", "°", ".2f", False, "normal_reason"),
-    Column("env_correlation", "environment correlation", "", ".3f", True, "env_reason"),
-    Column("train_seconds", "training", "s", ".0f", False),
-    Column("surfels", "surfels", "", ".0f", None),
-    Column("ms_per_frame", "frame", "ms", ".1f", False),
-)
+COLUMNS = tuple(score for score in SCORES if score.compared)
 
 
 @dataclass(frozen=True)
@@ -105,19 +77,27 @@ class Table:
         return not any(row.failed or row.unfinished for row in rows)
 
 
-def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
-    """Tabulate the jobs of a comparison in `folder`; a run that cannot be read counts as failed.
+def table_of(folder: Path) -> Table:
+    """Tabulate all jobs in the folder of a comparison; a run that cannot be read counts as failed.
 
     Raises InputError for runs on one data set that were measured on images of different sizes.
     """
+    about = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    data, variants = about.get("data", []), about.get("variants", [])
+
+    def order(job: Job) -> tuple[int, int, int]:
+        """Data sets and methods in the order in which they were given; others last."""
+        place = data.index(job.data) if job.data in data else len(data)
+        return place, variants.index(job.name) if job.name in variants else len(variants), job.seed
+
     table = Table(about=about)
     scenes: dict[str, Scene] = {}
     rows: dict[tuple[str, str], Row] = {}
     metrics: dict[tuple[str, str], list[dict[str, Any]]] = {}
     sizes: dict[str, dict[str, list[int]]] = {}
-    for job in jobs:
+    for job in sorted(jobs_in(folder), key=order):
         # Find or add the row.
-        key = job.data, Path(job.variant).stem
+        key = job.data, job.name
         scene = scenes.setdefault(job.data, Scene(Path(job.data).name, job.data))
         if key not in rows:
             rows[key], metrics[key] = Row(key[1], key[1]), []
@@ -133,7 +113,7 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
             row.failed[job.seed] = str(error)
             continue
         if not done:
-            if (failure := Path(job.folder) / FAILED).is_file():
+            if (failure := job.run.path / FAILED).is_file():
                 row.failed[job.seed] = str(read_json(failure).get("reason"))
             else:
                 row.unfinished.append(job.seed)
@@ -144,7 +124,7 @@ def table_of(folder: Path, jobs: Iterable[Job], about: dict[str, Any]) -> Table:
         assert found is not None
         metrics[key].append(found)
         row.seeds.append(job.seed)
-        row.runs.append(str(Path(job.folder).relative_to(folder.resolve())))
+        row.runs.append(str(job.run.path.relative_to(folder.resolve())))
         scene.image_size, scene.test_views = found["image_size"], found["test_views"]
         scene.downscale = found.get("downscale")
         sizes.setdefault(job.data, {})[row.runs[-1]] = scene.image_size
@@ -175,7 +155,7 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
             row.numbers[column.key] = Statistic.of([float(value) for value in values])
             continue
         row.numbers[column.key] = None
-        reasons = [m.get(column.reason) for m in found if m[column.key] is None]
+        reasons = [m.get(f"{column.reason}_reason") for m in found if m[column.key] is None]
         if reasons and reasons[0]:
             row.missing[column.key] = str(reasons[0])
 
@@ -220,22 +200,21 @@ def remarks(scene: Scene) -> list[str]:
     return said
 
 
-def columns_of(scene: Scene) -> list[Column]:
+def columns_of(scene: Scene) -> list[Score]:
     """Return the columns in which at least one row has a number."""
     return [column for column in COLUMNS if any(row.numbers.get(column.key) for row in scene.rows)]
 
 
-def header(column: Column) -> str:
+def header(column: Score) -> str:
     """Return the title of a column with its unit."""
-    return f"{column.title} ({column.unit})" if column.unit else column.title
+    return f"{column.title} ({column.unit.strip()})" if column.unit else column.title
 
 
-def cell(column: Column, number: Statistic | None) -> str:
+def cell(column: Score, number: Statistic | None) -> str:
     """Format a mean ± standard deviation."""
     if number is None:
         return NOTHING
-    mean = column.text(number.mean)
-    return mean if number.sd is None else f"{mean} ± {column.text(number.sd)}"
+    return " ± ".join(column.form.format(x) for x in (number.mean, number.sd) if x is not None)
 
 
 def label(row: Row) -> str:

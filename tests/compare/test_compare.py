@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
-from mi_refgs.compare import execute, jobs, page, results
+from mi_refgs.compare import execute, jobs, page
 from mi_refgs.compare.jobs import Job, Shared
-from mi_refgs.compare.table import Statistic, heading
+from mi_refgs.compare.table import Statistic, heading, table_of
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import read_png
@@ -305,7 +305,7 @@ def test_different_image_sizes_are_refused(
 
 
 def test_heading_states_image_size(compared: tuple[Path, int]) -> None:
-    [scene] = results.table(compared[0]).scenes
+    [scene] = table_of(compared[0]).scenes
     assert scene.downscale == 1 and heading(scene) == "ball (2 test views of 20 × 20 pixels)"
     scene.downscale = 2
     assert heading(scene) == "ball (2 test views of 20 × 20 pixels, downscaled by 2)"
@@ -409,7 +409,7 @@ def test_crop_is_where_images_differ_most(rng: np.random.Generator) -> None:
 def test_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Path) -> None:
     folder = copied(compared[0], tmp_path / "copy")
     (folder / "runs" / "ball" / "other" / "seed0" / "config.toml").write_text("future = 1")
-    row = results.write(folder).scenes[0].rows[1]
+    row = page.write(folder).scenes[0].rows[1]
     assert row.seeds == [1] and "future" in row.failed[0]
 
 

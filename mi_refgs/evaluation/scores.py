@@ -1,0 +1,47 @@
+"""The numbers of metrics.json that `refgs eval` prints and `refgs compare` tabulates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Score:
+    """A number of metrics.json."""
+
+    key: str
+    title: str
+    form: str  # for `str.format`, without the unit
+    unit: str = ""
+    reason: str = ""  # `REASON_reason` says why the number is missing
+    compared: bool = False  # whether it is a column of comparisons
+    higher: bool | None = None  # whether higher is better; None: neither
+    concave: bool = False  # whether there is a number of concave pixels, too: `KEY_concave`
+
+
+SCORES = (
+    Score("image_size", "image size", "{0[0]} × {0[1]}", " pixels"),
+    Score("downscale", "downscaled by", "{}"),
+    Score("psnr", "PSNR", "{:.2f}", " dB", compared=True, higher=True, concave=True),
+    Score("psnr_gain", "PSNR, exposure fitted", "{:.2f}", " dB"),
+    Score("ssim", "SSIM", "{:.4f}", compared=True, higher=True),
+    Score("psnr_region", "PSNR, region of interest", "{:.2f}", " dB"),
+    Score("ssim_region", "SSIM, region of interest", "{:.4f}"),
+    Score("flip", "FLIP", "{:.4f}", "", "flip", compared=True, higher=False),
+    Score("lpips", "LPIPS", "{:.4f}", "", "lpips", compared=True, higher=False),
+    Score("normal_mae_deg", "normal error, foreground", "{:.2f}", "°", "normal", True, False, concave=True),
+    Score("normal_mae_deg_full", "normal error, whole image", "{:.2f}", "°", "normal", True, False),
+    Score("albedo_psnr", "albedo, PSNR after scale", "{:.2f}", " dB", "albedo", concave=True),
+    Score("roughness_mae", "roughness, mean error", "{:.3f}", "", "roughness", concave=True),
+    Score("metallic_mae", "metallic, mean error", "{:.3f}", "", "metallic", concave=True),
+    Score("env_psnr", "environment map, PSNR", "{:.2f}", " dB", "env"),
+    Score("env_correlation", "environment correlation", "{:.3f}", "", "env", compared=True, higher=True),
+    Score("surface_distance", "surface distance", "{:.2f}", " % of the size", "surface", concave=True),
+    Score("concave_share", "concave pixels", "{:.1%}", " of the foreground", "concave"),
+    Score("train_seconds", "training", "{:.0f}", " s", compared=True, higher=False),
+    Score("surfels", "surfels", "{:.0f}", compared=True),
+    Score("pruned", "pruned", "from {0[surfels]} surfels, training views within {0[psnr]:.1f}", " dB"),
+    Score("iterations", "iterations", "{}"),
+    Score("samples", "samples per pixel", "{}"),
+    Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True, higher=False),
+)
