@@ -10,7 +10,7 @@ import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -39,92 +39,63 @@ print(simd_width())
 """
 
 
-@dataclass(frozen=True)
-class Report:
-    """State of the installation; versions are None for missing parts."""
+def examine() -> dict[str, Any]:
+    """Examine the installation; runs one small kernel in a separate process (about 0.5 s).
 
-    mi_refgs: str
-    python: str
-    platform: str
-    mitsuba: str | None
-    drjit: str | None
-    llvm_version: str | None
-    llvm_path: str | None
-    cuda: bool
-    threads: int
-    simd_width: int | None
-    kernel_cache: str
-    speeds: list[str]
-    extras: dict[str, str | None]
-    problems: tuple[llvm.Problem, ...]
-
-    @property
-    def usable(self) -> bool:
-        """Whether fitting and rendering can run here."""
-        return not self.problems
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the report in types of JSON."""
-        return {"usable": self.usable, **asdict(self)}
-
-    def to_text(self) -> str:
-        """Return the report as text: one line per part, then the problems."""
-        found = {
-            "mi_refgs": self.mi_refgs,
-            "Python": f"{self.python} on {self.platform}",
-            "Mitsuba": self.mitsuba or "missing",
-            "Dr.Jit": self.drjit or "missing",
-            "LLVM": f"{self.llvm_version} ({self.llvm_path})" if self.llvm_version else "missing",
-            "CUDA": "available" if self.cuda else "not available (not needed)",
-            "threads": str(self.threads),
-            "SIMD width": f"{self.simd_width} floats" if self.simd_width else "unknown",
-            "kernel cache": self.kernel_cache,
-            "speeds": "; ".join(self.speeds) or "none measured yet",
-        }
-        for name, version in self.extras.items():
-            found[name] = version or f'not installed (optional: pip install "mi_refgs[{name}]")'
-        lines = [f"{name:<13}{value}" for name, value in found.items()]
-        if self.usable:
-            lines.append("Everything that is needed is here.")
-        for problem in self.problems:
-            lines.append(f"PROBLEM: {problem.what}\n  type:  {problem.remedy}")
-        return "\n".join(lines)
-
-
-def examine() -> Report:
-    """Examine the installation; runs one small kernel in a separate process (about 0.5 s)."""
+    Versions are None for missing parts. Each of `problems` says `what` it is, and a `remedy`.
+    """
     import drjit as dr
 
     from mi_refgs.fitting import cost_model
 
-    problems: list[llvm.Problem] = []
-    cuda = bool(dr.has_backend(dr.JitBackend.CUDA))
-    version = dr.detail.llvm_version()
-    width = None
-    llvm_problem = llvm.problem()
-    if llvm_problem is None:
+    cuda, version = bool(dr.has_backend(dr.JitBackend.CUDA)), dr.detail.llvm_version()
+    problem, width = llvm.problem(), None
+    if problem is None:
         width, failure = _probe()
         if failure:
             what = f"a trial kernel failed under LLVM {version[0]}: {failure}"
-            problems.append(llvm.Problem(what, llvm.REMEDY))
-    elif not cuda:
-        problems.append(llvm_problem)
-    return Report(
-        mi_refgs=__version__,
-        python=platform.python_version(),
-        platform=f"{platform.system()} {platform.machine()}",
-        mitsuba=_version("mitsuba"),
-        drjit=_version("drjit"),
-        llvm_version=".".join(str(part) for part in version) if version[0] > 0 else None,
-        llvm_path=_loaded_library(),
-        cuda=cuda,
-        threads=int(dr.thread_count()),
-        simd_width=width,
-        kernel_cache=os.environ.get("DRJIT_CACHE_DIR", str(Path.home() / ".drjit")),
-        speeds=cost_model.summary(),
-        extras={name: _version(distribution) for name, distribution in EXTRAS.items()},
-        problems=tuple(problems),
-    )
+            problem = llvm.Problem(what, llvm.REMEDY)
+    elif cuda:
+        problem = None
+    return {
+        "usable": problem is None,  # whether fitting and rendering can run here
+        "mi_refgs": __version__,
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "mitsuba": _version("mitsuba"),
+        "drjit": _version("drjit"),
+        "llvm_version": ".".join(str(part) for part in version) if version[0] > 0 else None,
+        "llvm_path": _loaded_library(),
+        "cuda": cuda,
+        "threads": int(dr.thread_count()),
+        "simd_width": width,
+        "kernel_cache": os.environ.get("DRJIT_CACHE_DIR", str(Path.home() / ".drjit")),
+        "speeds": cost_model.summary(),
+        "extras": {name: _version(distribution) for name, distribution in EXTRAS.items()},
+        "problems": [] if problem is None else [asdict(problem)],
+    }
+
+
+def text(report: dict[str, Any]) -> str:
+    """Return the report as text: one line per part, then the problems."""
+    version, width = report["llvm_version"], report["simd_width"]
+    found = {
+        "mi_refgs": report["mi_refgs"],
+        "Python": f"{report['python']} on {report['platform']}",
+        "Mitsuba": report["mitsuba"] or "missing",
+        "Dr.Jit": report["drjit"] or "missing",
+        "LLVM": f"{version} ({report['llvm_path']})" if version else "missing",
+        "CUDA": "available" if report["cuda"] else "not available (not needed)",
+        "threads": report["threads"],
+        "SIMD width": f"{width} floats" if width else "unknown",
+        "kernel cache": report["kernel_cache"],
+        "speeds": "; ".join(report["speeds"]) or "none measured yet",
+    }
+    for name, installed in report["extras"].items():
+        found[name] = installed or f'not installed (optional: pip install "mi_refgs[{name}]")'
+    lines = [f"{name:<13}{value}" for name, value in found.items()]
+    lines += [f"PROBLEM: {each['what']}\n  type:  {each['remedy']}" for each in report["problems"]]
+    return "\n".join([*lines, *(["Everything that is needed is here."] if report["usable"] else [])])
 
 
 def _version(distribution: str) -> str | None:
@@ -178,4 +149,4 @@ class Doctor:
             found = survey(self.data)
             return Result(found.to_dict(), found.to_text())
         report = examine()
-        return Result(report.to_dict(), report.to_text(), 0 if report.usable else 1)
+        return Result(report, text(report), 0 if report["usable"] else 1)
