@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import Common, Output, Result
+from mi_refgs.cli.command import Common, Output, Result, optional
 from mi_refgs.progress import say
 
 
@@ -24,13 +24,11 @@ class Capture:
     """folder with JPEG or PNG files of one scene"""
     output: Output
     """folder of the data set; an interrupted run is continued"""
-    masks: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
+    masks: Annotated[Path | None, optional("FOLDER")] = None
     """masks NAME.png, one per photograph, white where the object is"""
-    camera_model: Annotated[str | None, arg(metavar="MODEL", help_behavior_hint="")] = None
+    camera_model: Annotated[str | None, optional("MODEL")] = None
     """COLMAP camera model, such as OPENCV or OPENCV_FISHEYE (default: the simplest that fits)"""
-    region: Annotated[
-        tuple[float, float, float, float] | None, arg(metavar="X Y Z R", help_behavior_hint="")
-    ] = None
+    region: Annotated[tuple[float, float, float, float] | None, optional("X Y Z R")] = None
     """centre and radius of the region of interest, see capture.png (default: what the cameras look at)"""
     common: Common = Common()
 

@@ -22,43 +22,37 @@ from mi_refgs.io.resources import resource_dir
 
 # ---------- Options that commands share ----------
 
-Flag = Annotated[bool, arg(help_behavior_hint="")]
-Optional = arg(help_behavior_hint="")
-"""For options whose help states what happens without them."""
+
+def optional(metavar: str | None = None, hint: str = "", **more: Any) -> Any:
+    """Declare an option whose help, or `hint`, states what happens without it."""
+    return arg(metavar=metavar, help_behavior_hint=hint, **more)
+
+
+Flag = Annotated[bool, optional()]
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN", help="run folder of `refgs train`")]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="PATH")]
-OptionalOutput = Annotated[Path | None, arg(aliases=("-o",), metavar="PATH", help_behavior_hint="")]
-OtherData = Annotated[
-    Path | None, arg(metavar="DATA", help="data set (default: that of the fit)", help_behavior_hint="")
-]
-Cameras = Annotated[Path | None, arg(metavar="FILE.json", help_behavior_hint="")]
+OptionalOutput = Annotated[Path | None, optional("PATH", aliases=("-o",))]
+OtherData = Annotated[Path | None, optional("DATA", help="data set (default: that of the fit)")]
+Cameras = Annotated[Path | None, optional("FILE.json")]
 Samples = Annotated[
     int,
     arg(metavar="N", help="samples per pixel, box filter: 4 are 2 × 2; 1 is the pixel centre, as in a fit"),
 ]
 Settings = Annotated[
     UseAppendAction[tuple[tuple[str, ...], ...]],
-    arg(metavar="KEY=VALUE …", help="changes of the method, such as loss.ssim=0.1", help_behavior_hint=""),
+    optional("KEY=VALUE …", help="changes of the method, such as loss.ssim=0.1"),
 ]
 METHODS = ", ".join(sorted(path.stem for path in resource_dir("variants").glob("*.toml")))
 MethodName = Annotated[
     str | None,
-    arg(
-        metavar="NAME|FILE.toml",
-        help=f"method (default: the full method): {METHODS}, or a file",
-        help_behavior_hint="",
-    ),
+    optional("NAME|FILE.toml", help=f"method (default: the full method): {METHODS}, or a file"),
 ]
 Preset = Annotated[
     str | None,
-    arg(
-        metavar="{quick,standard,paper}",
-        help=f"length of the fit (default: {DEFAULT_PRESET})",
-        help_behavior_hint="",
-    ),
+    optional("{quick,standard,paper}", help=f"length of the fit (default: {DEFAULT_PRESET})"),
 ]
-Words = Annotated[tuple[str, ...], arg(metavar="NAME …", help_behavior_hint="")]
+Words = Annotated[tuple[str, ...], optional("NAME …")]
 """A list, separated by spaces or commas."""
 
 
@@ -89,7 +83,7 @@ class Rendering(Common):
 
     mitsuba_variant: Annotated[str, arg(metavar="NAME")] = "llvm_ad_rgb"
     """Mitsuba variant"""
-    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all cores)")] = None
+    threads: Annotated[int | None, optional("N", "(default: all cores)")] = None
     """worker threads; with 1, training is reproducible bit for bit"""
 
     def prepare(self) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from mi_refgs.cli.command import (
     METHODS,
@@ -19,6 +19,7 @@ from mi_refgs.cli.command import (
     Result,
     Settings,
     joined,
+    optional,
     separated,
 )
 from mi_refgs.constants import DEFAULT_PRESET
@@ -40,21 +41,21 @@ class Compare:
       refgs compare data/glossy --methods ref_gaussian base_2dgs --seeds 0 1 -o runs/compare
     """
 
-    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA …", help_behavior_hint="")] = ()
+    data: Annotated[Positional[tuple[Path, ...]], optional("DATA …")] = ()
     """data sets"""
     output: Output
     """folder of the comparison"""
     methods: Annotated[
         tuple[str, ...],
-        arg(metavar="NAME|FILE.toml …", help=f"methods: {METHODS}, or files", help_behavior_hint=""),
+        optional("NAME|FILE.toml …", help=f"methods: {METHODS}, or files"),
     ] = ()
-    seeds: Annotated[tuple[str, ...], arg(metavar="K …", help_behavior_hint="")] = ()
+    seeds: Annotated[tuple[str, ...], optional("K …")] = ()
     """seeds of the fits (default: 0)"""
     preset: Preset = None
     set: Settings = ()
-    workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1)")] = None
+    workers: Annotated[int | None, optional("N", "(default: 1)")] = None
     """simultaneous jobs, which share the cores"""
-    cluster: Annotated[str | None, arg(metavar="local|ADDRESS", help_behavior_hint="")] = None
+    cluster: Annotated[str | None, optional("local|ADDRESS")] = None
     """run the jobs by dask.distributed, here or on a scheduler whose workers must see the same folders"""
     common: Rendering = Rendering()
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import Flag, Output, Rendering, Result, separated
+from mi_refgs.cli.command import Flag, Output, Rendering, Result, optional, separated
 from mi_refgs.errors import InputError
 from mi_refgs.synthesis.settings import DatasetOptions
 
@@ -27,9 +27,9 @@ class Dataset:
     """folder of the data set; an interrupted run is continued"""
     size: Annotated[str, arg(metavar="S|WxH")] = "160"
     """pixels per side, or width and height"""
-    relight: Annotated[tuple[Path, ...], arg(metavar="ENV …", help_behavior_hint="")] = ()
+    relight: Annotated[tuple[Path, ...], optional("ENV …")] = ()
     """trace the test views under these maps, too, into relight/NAME; may be added later"""
-    colmap: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    colmap: Annotated[Path | None, optional("DIR")] = None
     """also write the data set as COLMAP text files with points"""
     overwrite: Flag = False
     """replace a data set that was made with other settings"""

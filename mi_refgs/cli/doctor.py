@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from mi_refgs import __version__, llvm
-from mi_refgs.cli.command import Common, Result
+from mi_refgs.cli.command import Common, Result, optional
 
 PROBE_TIMEOUT = 60.0
 """Time limit of the trial kernel in seconds; it usually takes half a second."""
@@ -137,7 +137,7 @@ class Doctor:
       refgs doctor data/glossy
     """
 
-    data: Annotated[Positional[Path | None], arg(metavar="DATA", help_behavior_hint="")] = None
+    data: Annotated[Positional[Path | None], optional("DATA")] = None
     """data set to examine instead of the installation"""
     common: Common = Common()
 

@@ -10,30 +10,37 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from mi_refgs.cli.command import Flag, OtherData, Output, Rendering, Result, RunFolder, Settings, joined
+from mi_refgs.cli.command import (
+    Flag,
+    OtherData,
+    Output,
+    Rendering,
+    Result,
+    RunFolder,
+    Settings,
+    joined,
+    optional,
+)
 from mi_refgs.errors import InputError
 from mi_refgs.progress import say
 
 PREVIEW = "preview.png"
-Vector = Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")]
+Vector = Annotated[tuple[float, float, float] | None, optional("X Y Z")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
     """Surfels that meet all of these (default: all surfels)."""
 
-    where: Annotated[str | None, arg(metavar="EXPRESSION", help_behavior_hint="")] = None
+    where: Annotated[str | None, optional("EXPRESSION")] = None
     """such as "metallic > 0.5 and z < 0"; an unknown name lists the known ones"""
-    box: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
-    ] = None
+    box: Annotated[tuple[float, float, float, float, float, float] | None, optional("X0 Y0 Z0 X1 Y1 Z1")] = (
+        None
+    )
     """inside an axis-aligned box"""
-    nearest: Annotated[
-        tuple[float, float, float, float] | None, arg(metavar="X Y Z R", help_behavior_hint="")
-    ] = None
+    nearest: Annotated[tuple[float, float, float, float] | None, optional("X Y Z R")] = None
     """within R of the surfel that is nearest to the point"""
-    mask: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="")] = None
+    mask: Annotated[Path | None, optional("PNG")] = None
     """visible where an image of a view is white"""
     view: Annotated[str, arg(metavar="I|CAMERA.json")] = "0"
     """view of --mask: its number, or a camera that the page of `refgs view` saved"""
@@ -51,16 +58,15 @@ class Change:
     """first replace colours that were fitted to the environment map by materials"""
     set: Annotated[
         Settings,
-        arg(
-            metavar="NAME=VALUE …",
+        optional(
+            "NAME=VALUE …",
             help='such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5 "metallic=max(metallic, 0.5)"; '
             "colour=R,G,B for methods with fitted colours",
-            help_behavior_hint="",
         ),
     ] = ()
     scale: Annotated[float, arg(metavar="F")] = 1.0
     """scale about the middle of the selection"""
-    rotate: Annotated[tuple[str, str] | None, arg(metavar="AXIS DEG", help_behavior_hint="")] = None
+    rotate: Annotated[tuple[str, str] | None, optional("AXIS DEG")] = None
     """rotate about the middle of the selection and the axis x, y, z or X,Y,Z, counter-clockwise"""
     move: Vector = None
     """translate, scene units"""
@@ -83,7 +89,7 @@ class Edit:
     run_folder: RunFolder
     output: Output
     """new run folder"""
-    join: Annotated[Path | None, arg(metavar="OTHER", help_behavior_hint="")] = None
+    join: Annotated[Path | None, optional("OTHER")] = None
     """add run OTHER, lit by the environment map of RUN; selection and change then apply to OTHER"""
     data: OtherData = None
     preview: Flag = False

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import arg
-
 from mi_refgs.cli.command import (
     Flag,
     OptionalOutput,
@@ -16,6 +14,7 @@ from mi_refgs.cli.command import (
     Result,
     RunFolder,
     Words,
+    optional,
     separated,
 )
 from mi_refgs.constants import PRUNE_LIMIT
@@ -40,7 +39,7 @@ class Export:
     """replace files in the output folder that are not this export of RUN, but never those of a run"""
     prune: Flag = False
     """leave out surfels that the training views do not need; export again without it to restore them"""
-    limit: Annotated[float | None, arg(metavar="DB", help_behavior_hint=f"(default: {PRUNE_LIMIT:g})")] = None
+    limit: Annotated[float | None, optional("DB", f"(default: {PRUNE_LIMIT:g})")] = None
     """with --prune: least PSNR of each image of the pruned compared with the whole scene"""
     format: Any = None
     common: Rendering = Rendering()
@@ -115,19 +114,17 @@ def command() -> type[Export]:
     for option in options_of(FORMATS).values():
         users = ", ".join(name for name, made in FORMATS.items() if option in made.options)
         if option.default is False:
-            kind: Any = Annotated[bool, arg(help=f"{option.help} ({users})", help_behavior_hint="")]
+            kind: Any = Annotated[bool, optional(help=f"{option.help} ({users})")]
             fields.append((option.name, kind, False))
         else:
             kind = type(option.default) | None
             text = f"{option.help} ({users}; default: {option.default})"
             metavar = option.name[0].upper()
-            fields.append(
-                (option.name, Annotated[kind, arg(help=text, metavar=metavar, help_behavior_hint="")], None)
-            )
+            fields.append((option.name, Annotated[kind, optional(metavar, help=text)], None))
     options = make_dataclass("FormatOptions", fields, frozen=True, kw_only=True)
     formats = Annotated[
         tuple[str, ...],
-        arg(metavar="NAME …", help=f"formats of other programs: {', '.join(FORMATS)}", help_behavior_hint=""),
+        optional("NAME …", help=f"formats of other programs: {', '.join(FORMATS)}"),
     ]
     lines = [f"  {made.name:<14}{made.summary}" for made in FORMATS.values()]
     export = make_dataclass(

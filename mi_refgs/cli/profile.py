@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import MethodName, OtherData, Preset, Rendering, Result, Settings, joined
+from mi_refgs.cli.command import MethodName, OtherData, Preset, Rendering, Result, Settings, joined, optional
 from mi_refgs.errors import InputError
 from mi_refgs.progress import say
 
@@ -36,7 +36,7 @@ class ProfileCommand:
     """run folder or data set"""
     steps: Annotated[int, arg(metavar="N")] = 15
     """steps to measure"""
-    size: Annotated[tuple[int, ...], arg(metavar="N …", help_behavior_hint="")] = ()
+    size: Annotated[tuple[int, ...], optional("N …")] = ()
     """with RUN: pixels along the longer side of its frames (default: 200 400 800)"""
     data: OtherData = None
     method: MethodName = None

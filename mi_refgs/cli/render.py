@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, separated
+from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, optional, separated
 from mi_refgs.errors import InputError, counted
 
 AOVS = "albedo, metallic, roughness, normal, depth, alpha, visibility, diffuse, specular, indirect"
@@ -32,11 +32,11 @@ class Render:
     """cameras in the form of transforms.json, such as the page of `refgs view` saves"""
     object: Flag = False
     """render the object without its background, on transparency"""
-    samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    samples: Annotated[int | None, optional("N")] = None
     """samples per pixel (default: those of the scene's sampler)"""
     aov: Annotated[
         tuple[str, ...],
-        arg(metavar="NAME …", help=f"more channels of the EXR: {AOVS}", help_behavior_hint=""),
+        optional("NAME …", help=f"more channels of the EXR: {AOVS}"),
     ] = ()
     common: Rendering = Rendering()
 

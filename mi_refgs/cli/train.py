@@ -9,7 +9,17 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import Flag, MethodName, Output, Preset, Rendering, Result, Settings, joined
+from mi_refgs.cli.command import (
+    Flag,
+    MethodName,
+    Output,
+    Preset,
+    Rendering,
+    Result,
+    Settings,
+    joined,
+    optional,
+)
 from mi_refgs.cli.view import HOST, PORT, Port
 from mi_refgs.errors import InputError
 
@@ -27,12 +37,10 @@ class Train:
     output: Output
     """run folder"""
     method: MethodName = None
-    purpose: Annotated[
-        str | None, arg(name="for", metavar="{photographs,relighting}", help_behavior_hint="")
-    ] = None
+    purpose: Annotated[str | None, optional("{photographs,relighting}", name="for")] = None
     """choose the method by a purpose"""
     preset: Preset = None
-    minutes: Annotated[float | None, arg(metavar="M", help_behavior_hint="")] = None
+    minutes: Annotated[float | None, optional("M")] = None
     """time that the fit may take, by smaller or larger images"""
     set: Settings = ()
     resume: Flag = False
