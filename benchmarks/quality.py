@@ -19,9 +19,9 @@ import numpy as np
 from benchmarks.common import figures
 from benchmarks.common.report import plain_parser, table
 from mi_refgs.compare.jobs import RUNS
-from mi_refgs.compare.page import read_curve
+from mi_refgs.compare.worker import CURVE, CURVE_KEYS
 from mi_refgs.evaluation.evaluate import read_metrics
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import Run, read_log
 
 LEVELS = (28.0, 33.0)
 """PSNR to reach, dB, where none is given."""
@@ -52,7 +52,7 @@ def fits(folder: Path) -> list[Fit]:
     """The fits of a comparison that have a curve, by data set, method and seed."""
     found = []
     for run in sorted((folder / RUNS).glob("*/*/*")):
-        curve = read_curve(run)
+        curve = read_log(run / CURVE, CURVE_KEYS)
         if curve:
             seconds, psnr = (np.array([point[key] for point in curve]) for key in ("seconds", "psnr"))
             final = float((read_metrics(Run(run)) or {}).get("psnr", np.nan))

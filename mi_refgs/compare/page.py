@@ -26,7 +26,7 @@ from mi_refgs.compare.table import (
     remarks,
     table_of,
 )
-from mi_refgs.compare.worker import CURVE
+from mi_refgs.compare.worker import CURVE, CURVE_KEYS
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import render_names
@@ -34,7 +34,7 @@ from mi_refgs.evaluation.images import contact_sheet
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import read_png, write_png
 from mi_refgs.io.ownership import OutputFolder
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import Run, read_log
 from mi_refgs.runs.views import read_views
 
 STYLE = """
@@ -185,7 +185,7 @@ def write_curves(folder: Path, scene: Scene, path: Path) -> bool:
 
     Returns False if no run has a curve; raises InputError if the file cannot be written.
     """
-    lines = [(row, read_curve(folder / run)) for row in scene.rows for run in row.runs]
+    lines = [(row, read_log(folder / run / CURVE, CURVE_KEYS)) for row in scene.rows for run in row.runs]
     lines = [(row, curve) for row, curve in lines if curve]
     if not lines:
         return False
@@ -211,22 +211,6 @@ def write_curves(folder: Path, scene: Scene, path: Path) -> bool:
     figure.savefig(buffer, format="png", metadata={"Software": None})
     write_bytes(path, buffer.getvalue())
     return True
-
-
-def read_curve(run: Path) -> list[dict[str, Any]]:
-    """Return the points of a run's curve, without an incomplete line of a killed process."""
-    try:
-        lines = (run / CURVE).read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return []
-    points = []
-    for line in lines:
-        try:
-            point = json.loads(line)
-            points.append({key: float(point[key]) for key in ("iteration", "seconds", "psnr")})
-        except (ValueError, KeyError, TypeError):
-            continue
-    return points
 
 
 # ---------- Crops ----------

@@ -23,7 +23,7 @@ from mi_refgs.runs.run import Run
 
 DONE, FAILURE, STOPPED = 0, 2, 143
 """Exit codes."""
-CURVE = "curve.jsonl"
+CURVE, CURVE_KEYS = "curve.jsonl", ("iteration", "seconds", "psnr")
 CURVE_POINTS, CURVE_VIEWS = 20, 8
 """Measurements during a fit, evenly spaced, and test views per measurement, evenly spaced."""
 PATIENCE = 60.0

@@ -7,11 +7,13 @@ metrics.json  contact_sheet.png  eval/                                 by `evalu
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
@@ -202,6 +204,16 @@ class Run:
                     pass
         except OSError as error:
             raise cannot_write(self.path, error) from error
+
+
+def read_log(path: Path, names: Sequence[str]) -> list[dict[str, float]]:
+    """Return these numbers of the lines of a log that are complete and have all of them; [] without a log."""
+    lines = []
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # being written, or of a killed process
+            line = json.loads(text)
+            lines.append({name: float(line[name]) for name in names})
+    return lines
 
 
 def _logged(line: str) -> float:

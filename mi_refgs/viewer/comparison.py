@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from mi_refgs.render.display import displayed
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, displayed_planes, to_bytes
+from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, displayed_planes, to_bytes
 from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 ARRIVED, LEFT = 1e-3, 1e-2
@@ -102,11 +103,12 @@ def compared(
 ) -> tuple[list[np.ndarray], float | None]:
     """Return ground truth and rendered image (H, W, 3) uint8 of a view, and the PSNR; None for an AOV."""
     truth, size = np.clip(view.load().displayed, 0, 1), (view.width, view.height)
+    sample = SampleRequest(Pose.of_view(view), *size, look, settled=True, exact=view.camera())
     if look.what == IMAGE and isinstance(scene, ReconstructionView):
-        shown = displayed(scene.frame(view.camera()), data.background, data.is_linear_radiance)
+        sample = replace(sample, look=DisplayOptions(backdrop=BACKGROUND))
+        shown = displayed(scene.frame(sample), data.background, data.is_linear_radiance)
         ours = image_array(shown, view.height, view.width)
         return [to_8_bits(truth), to_8_bits(ours)], metrics.psnr(ours, truth)
-    sample = SampleRequest(Pose.of_view(view), *size, look, settled=True, exact=view.camera())
     drawn = to_bytes(displayed_planes(scene.draw(sample).planes, look), *size)
     return [to_8_bits(truth), drawn], None
 

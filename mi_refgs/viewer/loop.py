@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.types import Float
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.pose import Pose
@@ -26,7 +27,7 @@ from mi_refgs.viewer.tonemap import DisplayOptions, displayed_planes, to_bytes
 from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 FAR = 160.0
-"""Largest depth that pages can represent, scene units: viser packs it into 24 bits of 1e-5."""
+"""Depth where nothing is seen, scene units, and the largest: viser packs depth into 24 bits of 1e-5."""
 
 Comparison = Callable[[ViewerScene, DisplayOptions, tuple[int, int]], np.ndarray]
 """Renders what a page displays instead, (H, W, 3) uint8, for a window's width and height."""
@@ -210,10 +211,10 @@ class RenderLoop:
             if progress <= LARGE or progress in SHOWN_AT:
                 share = dr.opaque(type(sums[0]), 1 / (index + 1))
                 mean = [plane * share for plane in sums] if index else sums
-                size = request.width, request.height
-                image = to_bytes(displayed_planes(mean, client.look), *size)
+                image = to_bytes(displayed_planes(mean, client.look), request.width, request.height)
                 if client.depth and drawn.depth is not None:
-                    depth = depth_image(drawn.depth, *size)
+                    far = dr.select(drawn.depth > 0, drawn.depth, FAR)
+                    depth = np.array(image_array(far, request.height, request.width))
             dr.sync_thread()
         taken = self.clock() - begin
         with self._wake:
@@ -234,9 +235,3 @@ def added(sums: list[Float], planes: list[Float]) -> list[Float]:
     total = [a + b for a, b in zip(sums, planes, strict=True)] if sums else list(planes)
     dr.eval(total)
     return total
-
-
-def depth_image(depth: Float, width: int, height: int) -> np.ndarray:
-    """Return depth (H, W) float32 of depth (H*W,) or (1,): FAR where nothing is seen."""
-    values = dr.select(depth > 0, depth, FAR) + dr.zeros(type(depth), width * height)
-    return np.array(values.numpy(), dtype=np.float32).reshape(height, width)

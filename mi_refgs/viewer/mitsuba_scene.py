@@ -12,15 +12,14 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.plugins.properties import BackgroundProperties
-from mi_refgs.render.pipeline import Request
-from mi_refgs.shade.points import TERMS
+from mi_refgs.render.pipeline import Frame, Request
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import box_of, sphere_around, variables_of
 from mi_refgs.viewer.resolution import SAMPLES
-from mi_refgs.viewer.tonemap import IMAGE, backdrops_of, planes_of
+from mi_refgs.viewer.tonemap import IMAGE, backdrops_of, premultiplied
 from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 
 CLIP = 1e-3, 1e4
@@ -88,21 +87,20 @@ class MitsubaScene(ViewerScene):
         near = float(params["near_clip"]) if self._is_refgs else 0.0
         return Pose(matrix, 2 * math.atan(across * height / width), width / height, near)
 
+    def frame(self, sample: SampleRequest) -> Frame:
+        """See `ViewerScene`; for the integrator `refgs`."""
+        background = OBJECT_ONLY if sample.look.object_only else self._background
+        request = Request(sample.aovs, forward_only=True)
+        frame: Frame = self.scene.integrator().frame(self.scene, request, background, sample.camera())
+        return frame
+
     def draw(self, sample: SampleRequest) -> SampleResult:
         """See `ViewerScene`."""
-        if not self._is_refgs:
-            return SampleResult(self._planes(sample, 1))
-        camera, integrator = sample.camera(), self.scene.integrator()
-        background = OBJECT_ONLY if sample.look.object_only else self._background
-        with dr.suspend_grad():
-            frame = integrator.frame(self.scene, Request(sample.aovs, forward_only=True), background, camera)
-            return SampleResult(planes_of(frame, camera, sample.look, None), frame.depth)
+        return super().draw(sample) if self._is_refgs else SampleResult(self._planes(sample, 1))
 
     def fine(self, request: SampleRequest) -> list[Float]:
         """See `ViewerScene`."""
-        if not self._is_refgs:
-            return self._planes(request, SAMPLES)
-        return super().fine(request)
+        return super().fine(request) if self._is_refgs else self._planes(request, SAMPLES)
 
     def cost(self) -> tuple[Shading, int]:
         """See `ViewerScene`."""
@@ -139,7 +137,4 @@ class MitsubaScene(ViewerScene):
         planes = {name: dr.gather(mi.Float, image.array, index + i) for i, name in enumerate(names)}
         if what == IMAGE:
             return [planes[name] for name in "RGBA"]
-        alpha = planes["A"]
-        values = [planes[f"{what}.{suffix}"] for suffix in suffixes()[what]]
-        premultiplied = what in (*TERMS, "alpha")
-        return [*(value if premultiplied else value * alpha for value in values), alpha]
+        return premultiplied(what, [planes[f"{what}.{suffix}"] for suffix in suffixes()[what]], planes["A"])

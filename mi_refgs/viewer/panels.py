@@ -141,7 +141,7 @@ class MaterialsPanel:
     def __init__(self, page: Page, scene: ReconstructionView) -> None:
         """Add the controls."""
         self.scene = scene
-        self.done: list[SceneChange] = []  # of earlier selections
+        self.done = scene.changes  # of earlier selections
         self.values: dict[str, float] = {}  # set on the present one
         self.mask = np.ones(scene.original.surfels.count, bool)
         self.quiet = False  # sliders are being set to the selection's values
@@ -180,9 +180,7 @@ class MaterialsPanel:
             said = PUNCTUATION.sub(r"\\\1", str(error).removeprefix("--where: "))
             self.count.content = f"{said} (still {self._counted()})"
             return
-        if self.values:
-            self.done.append(self._change())
-        self.mask, self.values = mask, {}
+        self.done, self.mask, self.values = self.scene.changes, mask, {}
         self._update()
 
     def reset(self) -> None:

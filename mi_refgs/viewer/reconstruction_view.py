@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
@@ -20,11 +20,10 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.tonemap import IMAGE, backdrops_of, planes_of
-from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
+from mi_refgs.viewer.tonemap import IMAGE, backdrops_of
+from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 OUTLIERS = 2.0
 """Percent of the surfels along each axis and side that do not count as the object."""
@@ -117,7 +116,7 @@ class ReconstructionView(ViewerScene):
         self._stale = True  # caches of the occluder
 
     @property
-    def light(self) -> Light | None:
+    def light(self) -> Light | None:  # type: ignore[override]
         """The rotated light. The angle is opaque, so that no kernel depends on it."""
         if self._filtered is None:
             return None
@@ -127,18 +126,16 @@ class ReconstructionView(ViewerScene):
 
     # ---------------- images ----------------
 
-    def frame(
-        self, camera: Camera, aovs: Collection[str] = (), settled: bool = True, object_only: bool = False
-    ) -> Frame:
-        """Render a view forward only; ambient shadows may be outdated unless it is `settled`."""
+    def frame(self, sample: SampleRequest) -> Frame:
+        """See `ViewerScene`; ambient shadows may be outdated unless the sample is `settled`."""
         light, scene = self.light, self.scene
         with dr.suspend_grad():
-            if self._stale and (settled or self._lacks_caches):
+            if self._stale and (sample.settled or self._lacks_caches):
                 update_occluder_caches(self._occluder, scene.surfels, light, scene.shading)
                 self._stale = False
-            background = None if object_only else scene.surroundings
+            background = None if sample.look.object_only else scene.surroundings
             rendered = SurfelScene(scene.surfels, scene.shading, light, self._occluder, background)
-            return render(rendered, camera, Request(aovs, forward_only=True))
+            return render(rendered, sample.camera(), Request(sample.aovs, forward_only=True))
 
     @property
     def _lacks_caches(self) -> bool:
@@ -147,13 +144,6 @@ class ReconstructionView(ViewerScene):
         ambient = bool(shading.ambient_rays) and occluder.ambient is None
         traced = bool(shading.traced_bounces) and occluder.vertex_surfels is None
         return not occluder.empty and (ambient or traced)
-
-    def draw(self, sample: SampleRequest) -> SampleResult:
-        """See `ViewerScene`."""
-        camera = sample.camera()
-        frame = self.frame(camera, sample.aovs, sample.settled, sample.look.object_only)
-        with dr.suspend_grad():
-            return SampleResult(planes_of(frame, camera, sample.look, self.light), frame.depth)
 
     def cost(self) -> tuple[Shading, int]:
         """See `ViewerScene`."""

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import cannot_write, make_folder
 from mi_refgs.io.images import straight_srgb, write_png
-from mi_refgs.shade.points import TERMS
 from mi_refgs.types import Float
 from mi_refgs.viewer.page import Page
-from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, composited, displayed_planes
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, composited, displayed_planes, premultiplied
 from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 NUMBERED = re.compile(r"view_\d{3,6}", re.ASCII)
@@ -59,22 +58,19 @@ def write_view(scene: ViewerScene, request: SampleRequest, folder: Path, suffix:
     written.
     """
     make_folder(folder)
-    size = request.width, request.height
-    camera = write_camera(
-        folder, lambda stem: json.dumps(request.pose.transforms(*size, stem), indent=1) + "\n"
-    )
+    camera = write_camera(folder, request)
     image = camera.with_suffix(suffix)
     if suffix != CAMERA:
         try:
-            write_image(image, scene.fine(request), size, request.look)
+            write_image(image, scene.fine(request), (request.height, request.width), request.look)
         except BaseException:
             camera.unlink(missing_ok=True)
             raise
     return image
 
 
-def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
-    """Write the file with the next number, its text depending on its name; other files stay as they are.
+def write_camera(folder: Path, request: SampleRequest) -> Path:
+    """Write the camera as a transforms file with the next number; other files stay as they are.
 
     The viewer that creates the file first gets the number, so two viewers may save into one folder. Raises
     InputError if it cannot be written.
@@ -86,9 +82,10 @@ def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
         path = folder / f"view_{number:03d}{CAMERA}"
         if path.stem in stems:
             continue
+        content = request.pose.transforms(request.width, request.height, path.stem)
         try:
             with path.open("x", encoding="utf-8") as file:
-                file.write(content(path.stem))
+                file.write(json.dumps(content, indent=1) + "\n")
         except FileExistsError:
             continue
         except OSError as error:
@@ -97,23 +94,15 @@ def write_camera(folder: Path, content: Callable[[str], str]) -> Path:
 
 
 def write_image(path: Path, planes: list[Float], size: tuple[int, int], look: DisplayOptions) -> None:
-    """Write planes of `tonemap.planes_of` as PNG, as displayed, or as EXR, linear."""
+    """Write planes of `tonemap.planes_of`, height × width, as PNG, as displayed, or as EXR, linear."""
     if path.suffix == ".exr":
-        values, alpha = composited(planes, look), planes[-1]
+        values = composited(planes, look)
         if look.what != IMAGE:
-            premultiplied = look.what in (*TERMS, "alpha")
-            values = [*(value if premultiplied else value * alpha for value in values), alpha]
-        write_exr(path, stacked(values, size), {2: "YA", 4: "RGBA"}[len(values)])
+            values = premultiplied(look.what, values, planes[-1])
+        write_exr(path, image_array(values, *size), {2: "YA", 4: "RGBA"}[len(values)])
     elif look.what == IMAGE and len(planes) == 4:  # nothing behind the object
-        rgba = stacked(planes, size)
+        rgba = image_array(planes, *size)
         rgba[..., :3] *= np.float32(2.0**look.exposure)
         write_png(path, straight_srgb(rgba))
     else:
-        write_png(path, stacked(displayed_planes(planes, look), size))
-
-
-def stacked(planes: list[Float], size: tuple[int, int]) -> np.ndarray:
-    """Return planes (H*W,) or (1,) as an array (H, W, C) float32."""
-    width, height = size
-    full = [np.broadcast_to(np.array(plane, np.float32).ravel(), width * height) for plane in planes]
-    return np.stack(full, axis=-1).reshape(height, width, len(planes))
+        write_png(path, image_array(displayed_planes(planes, look), *size))

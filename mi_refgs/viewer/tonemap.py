@@ -70,6 +70,12 @@ def composited(planes: list[Float], look: DisplayOptions) -> list[Float]:
     return [*(plane + value for plane, value in zip(radiance, behind, strict=True)), mi.Float(1)]
 
 
+def premultiplied(what: str, values: list[Float], alpha: Float) -> list[Float]:
+    """Return the channels of an AOV, times alpha unless the AOV is, and alpha."""
+    weighted = values if what in (*TERMS, "alpha") else [value * alpha for value in values]
+    return [*weighted, alpha]
+
+
 def displayed_planes(planes: list[Float], look: DisplayOptions) -> list[Float]:
     """Return display-encoded RGB planes, not clipped, of the mean of `planes_of`."""
     backdrop = BACKDROPS.get(look.backdrop, 1.0)

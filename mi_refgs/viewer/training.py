@@ -5,23 +5,21 @@ Images are rendered only while a page is open, and then take at most SHARE of th
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import drjit as dr
 import numpy as np
 
 from mi_refgs.reconstruction.fit import ProgressBar
-from mi_refgs.runs.run import LOG, Run
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.runs.run import LOG, Run, read_log
 from mi_refgs.shade.shading import Shading
 from mi_refgs.viewer.page import Page, require_free, require_viser
 from mi_refgs.viewer.panels import add_display, add_overlays
 from mi_refgs.viewer.reconstruction_view import bounds_of, variables_of
-from mi_refgs.viewer.tonemap import IMAGE, backdrops_of, planes_of
-from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
+from mi_refgs.viewer.tonemap import IMAGE, backdrops_of
+from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
@@ -46,12 +44,9 @@ class Training(ViewerScene):
         self.variables = tuple(name for name in names if name != "visibility")  # in all stages
         self.backdrops = backdrops_of(trainer.surroundings is not None, light=False)
 
-    def draw(self, sample: SampleRequest) -> SampleResult:
+    def frame(self, sample: SampleRequest) -> Frame:
         """See `ViewerScene`."""
-        camera = sample.camera()
-        frame = self.trainer.view(camera, sample.look.what != IMAGE, sample.look.object_only)
-        with dr.suspend_grad():
-            return SampleResult(planes_of(frame, camera, sample.look, None), frame.depth)
+        return self.trainer.view(sample.camera(), sample.look.what != IMAGE, sample.look.object_only)
 
     def cost(self) -> tuple[Shading, int]:
         """See `ViewerScene`."""
@@ -134,23 +129,7 @@ class TrainingPage(Page):
         return curves
 
     def _update_curves(self) -> None:
-        rows = read_log(self.log)
-        iteration, *values = (
-            np.array([row[name] for row in rows], np.float64) for name in ("iteration", *CURVES)
-        )
-        if len(rows) > 1:
-            for plot, value in zip(self.curves.values(), values, strict=True):
-                plot.data = (iteration, value)
-
-
-def read_log(path: Path) -> list[dict[str, Any]]:
-    """Return the complete lines of a log that have all plotted numbers."""
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
-        try:
-            row = json.loads(line)
-        except ValueError:  # being written
-            continue
-        if all(isinstance(row.get(name), int | float) for name in ("iteration", *CURVES)):
-            rows.append(row)
-    return rows
+        lines = read_log(self.log, ("iteration", *CURVES))
+        if len(lines) > 1:
+            for name, plot in self.curves.items():
+                plot.data = tuple(np.array([line[key] for line in lines]) for key in ("iteration", name))

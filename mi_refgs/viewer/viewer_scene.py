@@ -11,13 +11,15 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.render.passes import in_passes
+from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import box_mean
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Float
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import GRID
-from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions
+from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, planes_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +60,18 @@ class ViewerScene(ABC):
     backdrops: tuple[str, ...]  # see `tonemap.backdrops_of`
     centre: np.ndarray  # (3,) world, the point that cameras orbit
     radius: float  # of the object around it, scene units
+    light: Light | None = None  # the environment map as backdrop
     square_pixels = False  # whether its pixels must be square, whatever sizes that gives
 
     @abstractmethod
+    def frame(self, sample: SampleRequest) -> Frame:
+        """Render one sample per pixel; a scene without frames defines `draw`."""
+
     def draw(self, sample: SampleRequest) -> SampleResult:
-        """Render one sample per pixel."""
+        """Render one sample per pixel, as what is displayed."""
+        with dr.suspend_grad():
+            frame = self.frame(sample)
+            return SampleResult(planes_of(frame, sample.camera(), sample.look, self.light), frame.depth)
 
     @abstractmethod
     def cost(self) -> tuple[Shading, int]:

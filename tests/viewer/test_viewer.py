@@ -24,9 +24,10 @@ from mi_refgs.io.exr import read_exr_image
 from mi_refgs.methods.read import load
 from mi_refgs.render import passes
 from mi_refgs.render.load_scene import load_scene
+from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.export import export
 from mi_refgs.runs.relightable import relightable
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import Run, read_log
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
@@ -41,7 +42,7 @@ from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING
 from mi_refgs.viewer.saving import write_view
 from mi_refgs.viewer.tonemap import DisplayOptions, displayed_planes, to_bytes
-from mi_refgs.viewer.training import Training, TrainingPage, read_log
+from mi_refgs.viewer.training import CURVES, Training, TrainingPage
 from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 from tests.helpers import ROOT, refused
 from tests.scenes.known import known_scene, with_background
@@ -162,6 +163,9 @@ class Plain(ViewerScene):
         self.samples: list[SampleRequest] = []
         self.grey = 0.25
         self.during: Callable[[], None] = lambda: None  # called in each draw
+
+    def frame(self, sample: SampleRequest) -> Frame:
+        raise NotImplementedError
 
     def draw(self, sample: SampleRequest) -> SampleResult:
         self.samples.append(sample)
@@ -692,8 +696,9 @@ def test_a_fit_draws_only_for_open_pages_and_a_share_of_its_time(
 
 def test_the_curves_have_the_complete_lines_of_the_log(tmp_path: Path) -> None:
     log = tmp_path / "metrics.jsonl"
-    assert read_log(log) == []
+    names = ("iteration", *CURVES)
+    assert read_log(log, names) == []
     log.write_text(
         '{"iteration": 1, "loss": 0.5, "psnr": 20}\n{"iteration": 2, "loss": 0.4}\n{"iteration": 3, '
     )
-    assert [row["iteration"] for row in read_log(log)] == [1]
+    assert [row["iteration"] for row in read_log(log, names)] == [1]
