@@ -81,7 +81,8 @@ def section(path: Path, method: dict[str, Any]) -> str:
         f"{stage.shading.reflectance} at {stage.shading.at}s" for _, stage in resolved.stages()
     )
     facts = [
-        f"Splats {resolved.surfels.primitive}s with {', '.join(resolved.surfels.channels)}; shades {stages}."
+        f"Splats {resolved.surfels.primitive}s with {', '.join(resolved.surfels.attributes)}; "
+        f"shades {stages}."
     ]
     lines = [
         f"### {about(method, 'name')} {{#{path.stem}}}",

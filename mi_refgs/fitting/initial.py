@@ -232,7 +232,7 @@ def initial_surfels(
         colours[order],
         rng=rng,
         primitive=options.primitive,
-        attributes=options.channels,
-        degree={name: options.degree_of(name) for name in options.channels},
+        attributes=options.attributes,
+        degree={name: options.degree_of(name) for name in options.attributes},
         **start,
     )

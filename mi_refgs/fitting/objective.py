@@ -1,12 +1,8 @@
-"""The loss of one rendered view: image losses, and registered losses with the weights of the method.
-
-A registered loss has a name; its weight is the field of that name in `[loss]` of a method file, or the table
-`[loss.registered.NAME]` with `weight`, `start`, `rise` and `until`.
-"""
+"""The loss of one rendered view: image losses, and registered losses with the weights of the method."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import drjit as dr
@@ -16,7 +12,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.targets import Target
-from mi_refgs.methods.method import LossWeights, Method
+from mi_refgs.methods.method import LossWeight, Method
 from mi_refgs.registry import Registry
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed
@@ -66,7 +62,8 @@ class Loss:
     value: Callable[[LossInputs], Float | None]  # width 1; None: not defined for these inputs
     normals: bool = False  # reads blended normals
     maps: bool = False  # reads blended materials, which deferred stages have
-    attributes: tuple[str, ...] = ()  # of surfels, without which a method that weighs the loss is refused
+    light: bool = False  # reads the light
+    attributes: tuple[str, ...] = ()  # of surfels, that it reads
 
 
 LOSSES = Registry[Loss]("loss")  # the registered losses, in the order in which they are summed
@@ -109,44 +106,48 @@ def _alpha(inputs: LossInputs) -> Float | None:
 
 register(Loss("normal", _normal, normals=True))
 register(Loss("smooth", _smooth, normals=True))
-register(Loss("half_metal", _half_metal, maps=True))
-register(Loss("materials", _materials, maps=True))
-register(Loss("light_colour", _light_colour))
+register(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
+register(Loss("materials", _materials, maps=True, attributes=MATERIALS))
+register(Loss("light_colour", _light_colour, light=True))
 register(Loss("alpha", _alpha))
 
 
 def require_losses(method: Method) -> None:
-    """Raise InputError for a loss that is not registered, or needs an attribute that the surfels lack."""
-    for name in method.loss.registered:
-        for attribute in LOSSES.find(name, f"loss.registered.{name}").attributes:
-            if attribute not in method.surfels.names:
-                raise InputError(
-                    f"loss.registered.{name}: there is no attribute '{attribute}'; "
-                    "add it to surfels.channels, or drop the loss"
-                )
+    """Raise InputError for a loss that is not registered, or whose inputs the method lacks."""
+    attributes = method.surfels.names
+    deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())
+    for name in method.loss.keys() - {"ssim"}:
+        loss = LOSSES.find(name, f"loss.{name}")
+        absent = [f"the attribute {one}" for one in loss.attributes if one not in attributes]
+        absent += ["a stage at = pixel"] * (loss.maps and not deferred)
+        absent += ["a light"] * (loss.light and method.light is None)
+        if absent and method.loss[name].weight:
+            raise InputError(f"loss.{name}: needs {' and '.join(absent)}; add it, or drop the loss")
 
 
-def losses_in_use(weights: LossWeights) -> list[Loss]:
-    """The registered losses that a method weighs."""
-    return [x for x in LOSSES.values() if x.name in weights.registered or getattr(weights, x.name, None)]
+def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss]:
+    """The registered losses that a method weighs, in the order in which they are summed."""
+    return [loss for loss in LOSSES.values() if loss.name in weights and weights[loss.name].weight]
 
 
-def objective(inputs: LossInputs, weights: LossWeights, iteration: int) -> tuple[Float, Float]:
+def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: int) -> tuple[Float, Float]:
     """Weighted sum of the losses (width 1), and the mean squared error of the image, detached."""
     image, target = inputs.image, inputs.target
-    loss = (1 - weights.ssim) * losses.l1(image, target.image)
+    # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
+    factors = {
+        name: dr.opaque(mi.Float, weight) if window.rise else weight
+        for name, window in weights.items()
+        if (weight := window.at(iteration))
+    }
+    ssim = factors.get("ssim", 0)
+    loss = (1 - ssim) * losses.l1(image, target.image)
     if inputs.log_gain is not None:
         loss += GAIN_PRIOR * sum((dr.square(value) for value in inputs.log_gain), mi.Float(0))
-    if weights.ssim:
+    if "ssim" in factors:
         width, height = target.camera.width, target.camera.height
-        loss += weights.ssim * losses.d_ssim(image, target.image, width, height)
-
-    # Registered losses. A weight that changes from step to step is opaque: a literal would be compiled into
-    # each step's kernels.
-    for term in losses_in_use(weights):
-        window = weights.of(term.name)
-        weight = window.at(iteration)
-        if weight and (value := term.value(inputs)) is not None:
-            loss += (dr.opaque(mi.Float, weight) if window.rise else weight) * value
+        loss += ssim * losses.d_ssim(image, target.image, width, height)
+    for name, registered in LOSSES.items():
+        if name in factors and (value := registered.value(inputs)) is not None:
+            loss += factors[name] * value
     squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
     return loss, dr.mean(sum(squares, mi.Float(0))) / 3

@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -62,7 +62,7 @@ def speed_of(method: Method, has_alpha: bool) -> Speed:
     parts = {name: getattr(method, name) for name in ("surfels", "light", "surroundings", "mesh", "stage")}
     subject = machine() | {"simd_width": simd_width(), "mi_refgs": __version__, "cut_out": has_alpha}
     subject["method"] = {name: plain(part) for name, part in parts.items() if part is not None}
-    subject["loss"] = {name: bool(value) for name, value in asdict(method.loss).items()}
+    subject["loss"] = {name: bool(loss.weight) for name, loss in method.loss.items()}
     return cost_model.kept(subject, lambda: measured(method, has_alpha))
 
 

@@ -14,6 +14,7 @@ from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
+from mi_refgs.fitting.objective import require_losses
 from mi_refgs.fitting.plan import planned
 from mi_refgs.fitting.progress import Progress
 from mi_refgs.fitting.select import DECISIONS, install_trials, with_components
@@ -79,6 +80,7 @@ def fit(
         if not isinstance(method, Method):
             method = method or default_method(data, choice.preset, choice.settings, progress)
             method = load_method(method, choice.preset, choice.settings)
+        require_losses(method)
         if minutes is not None and method.data.downscale is not None:
             raise InputError(
                 f"--minutes: data.downscale={method.data.downscale} decides the size of images; drop either"

@@ -94,7 +94,7 @@ class ComponentTrial:
 class Decision:
     """Decision about one component, tried or not."""
 
-    term: str  # the component; in checkpoints and decisions.json by this name
+    component: str
     iteration: int
     stays: bool
     reason: str
@@ -138,7 +138,7 @@ def install_trials(trainer: Trainer, tell: Callable[[str], None] = lambda _: Non
 
 def _undecided(trainer: Trainer, select: Selection) -> list[str]:
     """Components that are not decided yet, in the order in which they are tried."""
-    decided = {row["term"] for row in trainer.fit.decisions}
+    decided = {row["component"] for row in trainer.fit.decisions}
     return [name for name in select.order if name not in decided]
 
 
@@ -201,14 +201,14 @@ def sentence(decision: Decision) -> str:
     """The decision as one sentence."""
     verdict = "stays" if decision.stays else "is left out"
     if decision.without is None or decision.with_it is None:
-        return f"{decision.term} {verdict}: {decision.reason}"
+        return f"{decision.component} {verdict}: {decision.reason}"
     ms, mb = (getattr(decision.with_it, unit) - getattr(decision.without, unit) for unit in ("ms", "mb"))
-    return f"{decision.term} {verdict}: {decision.reason}, {ms:+.1f} ms per step, {mb:+.1f} MB"
+    return f"{decision.component} {verdict}: {decision.reason}, {ms:+.1f} ms per step, {mb:+.1f} MB"
 
 
 def table(decisions: list[dict[str, Any]]) -> str:
     """Format the decisions of a fit as a text table."""
-    rows = [("term", "iteration", "gain", "time", "memory", "verdict")]
+    rows = [("component", "iteration", "gain", "time", "memory", "verdict")]
     units = (("psnr", 2, "dB"), ("ms", 1, "ms"), ("mb", 1, "MB"))
     for row in decisions:
         cells = ["", "", ""]
@@ -216,7 +216,7 @@ def table(decisions: list[dict[str, Any]]) -> str:
             change = {key: row["with_it"][key] - row["without"][key] for key, _, _ in units}
             cells = [f"{change[key]:+.{digits}f} {unit}" for key, digits, unit in units]
         verdict = "stays" if row["stays"] else f"left out ({row['reason']})"
-        rows.append((row["term"], str(row["iteration"]), *cells, verdict))
+        rows.append((row["component"], str(row["iteration"]), *cells, verdict))
     widths = [max(len(row[i]) for row in rows) for i in range(5)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True)).rstrip()
@@ -226,7 +226,7 @@ def table(decisions: list[dict[str, Any]]) -> str:
 
 def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
     """The method with the components that the decisions kept."""
-    names = tuple(row["term"] for row in decisions if row["stays"])
+    names = tuple(row["component"] for row in decisions if row["stays"])
     if method.select is None or names == method.components:
         return method
     return replace(methods.load(method.file, method.preset, method.assignments, names), data=method.data)

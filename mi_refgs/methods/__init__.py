@@ -1,6 +1,6 @@
 """Methods as data: the TOML files of `variants/`, read strictly and scaled to a preset."""
 
-from mi_refgs.methods.method import LightOptions, LossWeights, Method, Refine, Stage, SurfelOptions
+from mi_refgs.methods.method import LightOptions, LossWeight, Method, Refine, Stage, SurfelOptions
 from mi_refgs.methods.read import (
     PRESETS,
     assignments,
@@ -16,7 +16,7 @@ from mi_refgs.methods.window import Window
 __all__ = [
     "PRESETS",
     "LightOptions",
-    "LossWeights",
+    "LossWeight",
     "Method",
     "Refine",
     "Stage",

@@ -112,6 +112,6 @@ def scaled(value: Any, factor: float) -> Any:
         inner = getattr(value, field.name)
         if field.metadata != ITERATIONS:
             fields[field.name] = scaled(inner, factor)
-        elif inner > 0:
+        elif inner is not None and inner > 0:
             fields[field.name] = max(round(inner * factor), 1)
     return dataclasses.replace(value, **fields)

@@ -40,7 +40,7 @@ class SurfelOptions:
     """The surfels at the start, and their largest number."""
 
     primitive: str = "surfel"  # what is splatted
-    channels: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
+    attributes: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
     count: int = 20_000  # initial surfels
     max_count: int = 40_000  # densification stops here
     inside: float = 0.0  # fraction of initial surfels in the visual hull's volume; the others on its surface
@@ -56,7 +56,7 @@ class SurfelOptions:
     @property
     def names(self) -> tuple[str, ...]:
         """All attributes, those of the primitive first; raises InputError for an unknown primitive."""
-        return (*PRIMITIVES.find(self.primitive, "primitive").widths, *self.channels)
+        return (*PRIMITIVES.find(self.primitive, "primitive").widths, *self.attributes)
 
     def columns(self, name: str) -> int:
         """Raw columns of an attribute."""
@@ -169,7 +169,7 @@ class MeshOptions:
 class Rates:
     """Adam learning rates, raw units per step; those of positions in scene extents."""
 
-    channel: dict[str, float] = field(default_factory=dict)  # by attribute; else its own default
+    attribute: dict[str, float] = field(default_factory=dict)  # by name; else its own default
     rest: dict[str, float] = field(default_factory=dict)  # factors for SH degrees above 0; else their own
     light: float = 0.01  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
@@ -178,7 +178,7 @@ class Rates:
 
     def of(self, name: str) -> float:
         """Learning rate of an attribute."""
-        return self.channel.get(name, attribute(name).rate)
+        return self.attribute.get(name, attribute(name).rate)
 
     def rest_of(self, name: str) -> float:
         """Factor of that for SH degrees of 1 and above."""
@@ -187,48 +187,33 @@ class Rates:
 
 @dataclass(frozen=True)
 class LossWeight:
-    """Weight of one loss over the iterations."""
+    """Weight of the loss NAME over the iterations; a number in `[loss]`, `NAME = 0.1`, is its `weight` alone.
+    L = (1 - `ssim`) L1 + `ssim` (1 - SSIM) + `normal` L_n + `smooth` L_s + `alpha` L_α, and priors:
+    `half_metal` prefers metallic near 0 or 1, `materials` equal roughness and metallic of neighbouring pixels
+    of similar colour, `light_colour` a grey light over a grey albedo. Any other NAME is one of
+    `register_loss`.
+
+    Losses on material maps apply to deferred stages only: forward shading blends no materials.
+    """
 
     weight: float
     start: int = field(default=0, metadata=ITERATIONS)  # iterations without the loss
     rise: int = field(default=0, metadata=ITERATIONS)  # then its weight rises linearly from 0
-    until: int = field(default=2**31, metadata=ITERATIONS)  # last iteration with the loss
+    until: int | None = field(default=None, metadata=ITERATIONS)  # last iteration with the loss
 
     def at(self, iteration: int) -> float:
         """The weight in this (1-based) iteration."""
-        if not self.start < iteration <= self.until:
+        if iteration <= self.start or (self.until is not None and iteration > self.until):
             return 0.0
         return self.weight * (min((iteration - self.start) / self.rise, 1) if self.rise else 1)
 
 
-@dataclass(frozen=True)
-class LossWeights:
-    """L = (1 - ssim) L1 + ssim (1 - SSIM) + normal L_n + smooth L_s + alpha L_α, and priors.
-
-    Priors have the names of their functions in `fitting.losses`. Those on material maps apply to deferred
-    stages only: forward shading blends no materials.
-    """
-
-    ssim: float = 0.2
-    normal: float = 0.05
-    normal_start: int = field(default=0, metadata=ITERATIONS)  # iterations without L_n
-    normal_rise: int = field(default=0, metadata=ITERATIONS)  # iterations in which its weight then rises
-    smooth: float = 0.0
-    smooth_until: int = field(default=18_000, metadata=ITERATIONS)
-    alpha: float = 0.0
-    half_metal: float = 0.0  # prefers metallic near 0 or 1
-    half_metal_start: int = field(default=0, metadata=ITERATIONS)  # iterations without it
-    half_metal_rise: int = field(default=0, metadata=ITERATIONS)  # iterations in which its weight then rises
-    materials: float = 0.0  # neighbouring pixels of similar colour share roughness and metallic
-    light_colour: float = 0.0  # prefers a grey light over a grey albedo
-    registered: dict[str, LossWeight] = field(default_factory=dict)  # losses of `register_loss`, by name
-
-    def of(self, name: str) -> LossWeight:
-        """Weight and window of a loss by its name."""
-        if name in self.registered:
-            return self.registered[name]
-        ends = [end for end in ("start", "rise", "until") if hasattr(self, f"{name}_{end}")]
-        return LossWeight(getattr(self, name, 0.0), **{end: getattr(self, f"{name}_{end}") for end in ends})
+LOSS_WEIGHTS = dict.fromkeys(("alpha", "half_metal", "materials", "light_colour"), LossWeight(0.0)) | {
+    "ssim": LossWeight(0.2),
+    "normal": LossWeight(0.05),
+    "smooth": LossWeight(0.0, until=18_000),
+}
+"""Weights that a method has unless its file says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -308,7 +293,7 @@ class Method:
     surroundings: SurroundingsOptions | None = None  # absent: the object is everything
     refine: Refine = Refine()
     mesh: MeshOptions | None = None
-    loss: LossWeights = field(default_factory=LossWeights)
+    loss: dict[str, LossWeight] = field(default_factory=LOSS_WEIGHTS.copy)  # by name
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
     exposure: ExposureOptions | None = None

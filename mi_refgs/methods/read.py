@@ -9,7 +9,7 @@ import contextlib
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.build import build, plain, scaled
-from mi_refgs.methods.method import LIGHT, About, Method, MethodComponent, Selection
+from mi_refgs.methods.method import LIGHT, LOSS_WEIGHTS, About, Method, MethodComponent, Selection
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.shading import Shading
@@ -31,12 +31,20 @@ MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
 
 RENAMED = {
+    "loss.half_metal_rise": "loss.half_metal.rise",
+    "loss.half_metal_start": "loss.half_metal.start",
+    "loss.normal_rise": "loss.normal.rise",
+    "loss.normal_start": "loss.normal.start",
+    "loss.registered": "loss",
+    "loss.smooth_until": "loss.smooth.until",
+    "rates.channel": "rates.attribute",
     "select.term": "select.component",
+    "surfels.channels": "surfels.attributes",
     "surfels.from_pictures": "surfels.from_images",
     "terms": "components",
     "variant": "name",
 }
-"""Keys of version 0.1 → what they are called now; files may have either."""
+"""Earlier keys → what they are called now; files may have either."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,7 @@ def load(
     table = _extended(path, [])
     for component in components:
         table = _with_component(table, component, path)
-    method = build(Method, table, str(path))
+    method = _built(table, str(path))
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
@@ -94,7 +102,12 @@ def load(
 
 def load_resolved(path: Path) -> Method:
     """Read the resolved `config.toml` of a run, unscaled."""
-    return build(Method, _read(path), str(path))
+    return _built(_read(path), str(path))
+
+
+def _built(table: dict[str, Any], where: str) -> Method:
+    """The method of a file's table; losses that it does not name have the default weights."""
+    return build(Method, _merge({"loss": plain(LOSS_WEIGHTS)}, table), where)
 
 
 def dump(method: Method) -> str:
@@ -162,14 +175,34 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except (ValueError, RecursionError) as error:  # TOML, UTF-8, long numbers; deep nesting
         raise InputError(f"{path}: not valid TOML ({error}); correct that line") from error
+    table = _modernised(table)
+    with contextlib.suppress(AttributeError, KeyError, TypeError):  # what has another form is refused later
+        for component in table["select"]["component"].values():
+            component["change"] = _modernised(component.get("change", {}))
+    return table
+
+
+def _modernised(table: dict[str, Any]) -> dict[str, Any]:
+    """The content of a file with the keys of today; each weight of a loss becomes a table."""
+    loss = table.get("loss")
+    if isinstance(loss, dict):
+        weights = {key: x for key, x in loss.items() if f"loss.{key}" not in RENAMED and _is_number(x)}
+        table = table | {"loss": loss | {key: {"weight": weight} for key, weight in weights.items()}}
     for old, new in RENAMED.items():
         *parents, last = old.split(".")
         inner: Any = table
         for parent in parents:
             inner = inner.get(parent) if isinstance(inner, dict) else None
         if isinstance(inner, dict) and last in inner:
-            inner[new.rpartition(".")[2]] = inner.pop(last)
+            moved = inner.pop(last)
+            for key in reversed(new.split(".")):
+                moved = {key: moved}
+            table = _merge(table, moved)
     return table
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
@@ -258,6 +291,8 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
     except (ValueError, RecursionError):
         value = text
     *parents, last = _keys(key.strip())
+    if parents == ["loss"] and _is_number(value):
+        parents, last = ["loss", last], "weight"
     for parent in parents:
         inner = table.setdefault(parent, {})
         if not isinstance(inner, dict):
@@ -271,7 +306,7 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
 
 def _require_consistent(method: Method, where: str) -> None:
     """Raise InputError for unknown names, values out of range, and stages without what they need."""
-    surfels, light, loss, relocate = method.surfels, method.light, method.loss, method.refine.relocate
+    surfels, light, relocate = method.surfels, method.light, method.refine.relocate
     try:
         attributes = {*surfels.names}
     except InputError as error:
@@ -321,25 +356,12 @@ def _require_consistent(method: Method, where: str) -> None:
         except InputError as error:
             raise InputError(f"{where}: stage.{name}: {error}") from error
         for key, named, known in (
-            ("restart", stage.restart, {*surfels.channels} | parameters),
+            ("restart", stage.restart, {*surfels.attributes} | parameters),
             ("rates", stage.rates, attributes | parameters),
         ):
             if absent := [one for one in named if one not in known]:
                 raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
 
-    # Losses and operations that need attributes, a deferred stage or a light.
-    if twice := sorted(loss.registered.keys() & {key.name for key in fields(loss)}):
-        own = f"loss.{twice[0]}"
-        raise InputError(
-            f"{where}: loss.registered.{twice[0]}: this loss has a key of its own; set {own} instead"
-        )
-    deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())
-    for name, needed in (("half_metal", {"metallic"}), ("materials", {"metallic", "roughness"})):
-        if getattr(loss, name) and not (deferred and needed <= attributes):
-            what = " and ".join(sorted(needed))
-            raise InputError(f"{where}: loss.{name}: needs {what}, and a stage at = pixel; drop it")
-    if loss.light_colour and light is None:
-        raise InputError(f"{where}: loss.light_colour: there is no light; drop it")
     if method.refine.propagate is not None and "metallic" not in attributes:
         raise InputError(f"{where}: refine.propagate: there is no attribute 'metallic'; add it, or drop this")
 
@@ -350,11 +372,15 @@ def _require_known_names(method: Method, attributes: set[str], where: str) -> No
     harmonics = {name for name, attribute in ATTRIBUTES.items() if attribute.harmonics}
     bounded = {name for name in attributes & {*ATTRIBUTES} if ATTRIBUTES[name].activation == "sigmoid"}
     for key, named, known in (
-        ("surfels.channels", surfels.channels, {name for name, x in ATTRIBUTES.items() if not x.geometry}),
+        (
+            "surfels.attributes",
+            surfels.attributes,
+            {name for name, x in ATTRIBUTES.items() if not x.geometry},
+        ),
         ("surfels.initial", surfels.initial, attributes),
         ("surfels.degree", surfels.degree, harmonics),
-        ("surfels.from_images", surfels.from_images, {*surfels.channels}),
-        ("rates.channel", rates.channel, {*ATTRIBUTES}),
+        ("surfels.from_images", surfels.from_images, {*surfels.attributes}),
+        ("rates.attribute", rates.attribute, {*ATTRIBUTES}),
         ("rates.rest", rates.rest, harmonics),
         ("refine.reset_raise", method.refine.reset_raise, bounded),
     ):

@@ -52,7 +52,7 @@ def _of_work(found: Profile) -> Iterator[str]:
         yield (
             f"{low}, and the median surfel is {work.aspect:.0f} times as long as wide: it crosses many "
             f"tiles of {work.tile_pixels:.0f} pixels and fills none; a lower rate of scales "
-            "(--set rates.channel.scale) keeps surfels rounder."
+            "(--set rates.attribute.scale) keeps surfels rounder."
         )
     if work.footprint < work.tile_pixels:
         yield (
@@ -81,7 +81,7 @@ def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[s
             f"({splat:.1f} ms), for {found.work.pairs / max(found.work.surfels, 1):.0f} tiles per surfel: "
             "large, faint surfels do that (--set refine.prune_opacity, refine.prune_extent)."
         )
-    if of("ssim forward", "loss backward") > HEAVY * whole and method.loss.ssim:
+    if of("ssim forward", "loss backward") > HEAVY * whole and method.loss["ssim"].weight:
         yield (
             f"Stage {stage.name}: the losses take {of('ssim forward', 'loss backward') / whole:.0%} of a "
             "step: without SSIM (--set loss.ssim=0) they are cheaper, at some cost in quality."

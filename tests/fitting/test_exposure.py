@@ -22,7 +22,7 @@ from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, LossWeights, Method, Refine
+from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, Method, Refine
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
@@ -91,8 +91,7 @@ def test_exposure_of_step_and_its_derivative(
     leaves = [mi.Float(float(value)) for value in log]
     dr.enable_grad(leaves)
     frame = Frame(upload(alpha), upload(alpha), mi.Vector3f(0, 0, 1), mi.Color3f(*planes(radiance)))
-    weights = LossWeights(ssim=0, normal=0, alpha=0)
-    loss, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), weights, 1)
+    loss, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), {}, 1)
     assert float(loss[0]) == pytest.approx(define(log), abs=3e-6)
     expected = np.array(
         [(define(log + STEP * axis) - define(log - STEP * axis)) / (2 * STEP) for axis in np.eye(3)]
@@ -102,7 +101,7 @@ def test_exposure_of_step_and_its_derivative(
     np.testing.assert_allclose(found, expected, rtol=2e-4)
     for leaf, tangent in zip(leaves, (0.5, -1.0, 2.0), strict=True):
         dr.set_grad(leaf, mi.Float(tangent))
-    moved, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), weights, 1)
+    moved, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), {}, 1)
     dr.forward_to(moved)
     assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
 
@@ -137,7 +136,7 @@ def exposed(data: Dataset, log: np.ndarray) -> Dataset:
 def method(tmp_path: Path) -> Method:
     """Without refinement, so that a few dozen steps settle."""
     small = small_method(tmp_path)
-    rates = dataclasses.replace(small.rates, channel={"albedo": 0.1, "radiance_sh": 0.1, "opacity": 0.2})
+    rates = dataclasses.replace(small.rates, attribute={"albedo": 0.1, "radiance_sh": 0.1, "opacity": 0.2})
     options = ExposureOptions(after=DECIDED, rate=3e-3)
     return dataclasses.replace(
         small, refine=Refine(), mesh=None, data=DataOptions(), iterations=120, exposure=options, rates=rates

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -12,13 +11,14 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
-from mi_refgs.fitting.objective import LossInputs, objective
+from mi_refgs.fitting.objective import LossInputs, objective, require_losses
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import LossWeights
+from mi_refgs.methods.method import LossWeight
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -52,7 +52,7 @@ def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def test_perfect_image_costs_nothing(linear: bool, picture: tuple[np.ndarray, np.ndarray]) -> None:
     """8-bit images are composited as displayed, linear ones before they are encoded; either once."""
     data, target = made(linear, *picture)
-    weights = LossWeights(ssim=0.2, normal=0.0, alpha=0.3)
+    weights = {"ssim": LossWeight(0.2), "alpha": LossWeight(0.3)}
     loss, error = objective(LossInputs.of(frame_of(*picture), target, data), weights, 1)
     assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
 
@@ -62,7 +62,7 @@ def test_losses_are_weighed_as_method_says(
 ) -> None:
     data, target = made(True, *picture)
     radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
-    weights = LossWeights(ssim=0.3, normal=0.0, smooth=0.0, alpha=0.4)
+    weights = {"ssim": LossWeight(0.3), "alpha": LossWeight(0.4)}
     loss, error = objective(LossInputs.of(frame_of(radiance, alpha), target, data), weights, 1)
     shown, goal = (
         np.vectorize(reference.srgb)(x + (1 - a[..., None]) * BACKGROUND)
@@ -85,21 +85,22 @@ def test_priors_are_weighed_as_method_says(
     )
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
 
-    def loss(iteration: int = 1, **weights: Any) -> float:
-        chosen = LossWeights(ssim=0, normal=0, **weights)
-        return float(objective(LossInputs.of(frame, target, data, light), chosen, iteration)[0][0])
+    def loss(iteration: int = 1, **weights: LossWeight) -> float:
+        return float(objective(LossInputs.of(frame, target, data, light), weights, iteration)[0][0])
 
     rest, half = loss(), reference.half_metal(maps["metallic"], alpha)
-    assert loss(half_metal=0.3) - rest == pytest.approx(0.3 * half, rel=1e-3)
-    rise: dict[str, Any] = {"half_metal": 0.3, "half_metal_start": 10, "half_metal_rise": 100}
+    assert loss(half_metal=LossWeight(0.3)) - rest == pytest.approx(0.3 * half, rel=1e-3)
+    rising = LossWeight(0.3, start=10, rise=100)
     for iteration, share in ((10, 0), (11, 0.01), (60, 0.5), (500, 1)):
-        assert loss(iteration, **rise) - rest == pytest.approx(share * 0.3 * half, rel=1e-2, abs=1e-6)
+        assert loss(iteration, half_metal=rising) - rest == pytest.approx(
+            share * 0.3 * half, rel=1e-2, abs=1e-6
+        )
     smooth = np.stack([alpha * maps["roughness"], alpha * maps["metallic"]], axis=-1)
     guide = np.stack([np.array(plane).reshape(alpha.shape) for plane in target.image], axis=-1)
     expected = 0.2 * reference.smoothness(smooth, guide, 10.0)
-    assert loss(materials=0.2) - rest == pytest.approx(expected, rel=1e-3)
+    assert loss(materials=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3)
     expected = 0.4 * float(losses.light_colour(light)[0])
-    assert loss(light_colour=0.4) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
+    assert loss(light_colour=LossWeight(0.4)) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
 
 
 def test_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
@@ -108,12 +109,19 @@ def test_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
     target = trainer.targets[0]
     frame = trainer.view(target.camera)
 
-    def loss(iteration: int, **weights: Any) -> float:
-        inputs = LossInputs.of(frame, target, views)
-        return float(objective(inputs, LossWeights(ssim=0, **weights), iteration)[0][0])
+    def loss(iteration: int, **weights: LossWeight) -> float:
+        return float(objective(LossInputs.of(frame, target, views), weights, iteration)[0][0])
 
-    rest, full = loss(1, normal=0), loss(1, normal=0.2)
+    rest, full = loss(1), loss(1, normal=LossWeight(0.2))
     assert full - rest > 1e-3
-    rise: dict[str, Any] = {"normal": 0.2, "normal_rise": 100}
     for iteration, share in ((1, 0.01), (50, 0.5), (100, 1), (1000, 1)):
-        assert loss(iteration, **rise) - rest == pytest.approx(share * (full - rest), rel=1e-3)
+        rising = loss(iteration, normal=LossWeight(0.2, rise=100))
+        assert rising - rest == pytest.approx(share * (full - rest), rel=1e-3)
+
+
+@pytest.mark.parametrize("prior", ["half_metal", "materials", "light_colour"])
+def test_prior_needs_what_it_is_about(prior: str) -> None:
+    weight = [f"loss.{prior}=0.1"]
+    with pytest.raises(InputError, match=rf"loss\.{prior}: needs .*, or drop the loss"):
+        require_losses(methods.load("base_2dgs", "quick", weight))
+    require_losses(methods.load("ref_gaussian", "quick", weight))

@@ -46,19 +46,19 @@ def roughness_after(data: Path, method: Path, *settings: str) -> float:
 
 def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path, registered: None) -> None:
     without = roughness_after(data, method)
-    weighed = roughness_after(data, method, "loss.registered.rough={weight=1.0}")
-    late = roughness_after(data, method, "loss.registered.rough={weight=1.0, start=12}")
-    early = roughness_after(data, method, "loss.registered.rough={weight=1.0, until=6}")
+    weighed = roughness_after(data, method, "loss.rough=1.0")
+    late = roughness_after(data, method, "loss.rough={weight=1.0, start=12}")
+    early = roughness_after(data, method, "loss.rough={weight=1.0, until=6}")
     assert weighed > without + 0.02 and late == pytest.approx(without, abs=1e-4)
     assert without < early < weighed
 
 
 def test_loss_of_an_absent_attribute_is_refused(data: Path, registered: None) -> None:
-    colour = methods.load("base_2dgs", "quick", [*SETTINGS[:-1], "loss.registered.rough={weight=1.0}"])
-    with pytest.raises(mi_refgs.InputError, match=r"registered\.rough: there is no attribute 'roughness'"):
+    colour = methods.load("base_2dgs", "quick", [*SETTINGS[:-1], "loss.rough=1.0"])
+    with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: needs the attribute roughness"):
         Trainer(colour, read_dataset(data, "train", truth=False))
 
 
 def test_loss_that_is_not_registered_is_refused(data: Path, method: Path) -> None:
-    with pytest.raises(mi_refgs.InputError, match=r"registered\.rough: 'rough' is unknown; use normal or"):
-        roughness_after(data, method, "loss.registered.rough={weight=1.0}")
+    with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: 'rough' is unknown; use normal or"):
+        roughness_after(data, method, "loss.rough=1.0")

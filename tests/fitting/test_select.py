@@ -21,6 +21,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import select
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.select import branched
+from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import LIGHT, Method
@@ -56,7 +57,7 @@ after = 5
 trial = 2
 drop = ["stage"]
 [select.component.specular.change]
-surfels = { channels = ["radiance_sh", "albedo", "metallic", "roughness"] }
+surfels = { attributes = ["radiance_sh", "albedo", "metallic", "roughness"] }
 light = { height = 8 }
 stage = { deferred = { until = 2_000, light_levels = 3 } }
 
@@ -65,7 +66,7 @@ after = 8
 trial = 2
 needs = ["specular"]
 [select.component.interreflection.change]
-surfels = { channels = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"] }
+surfels = { attributes = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"] }
 mesh = { extract = { start = 8, until = 20, every = 4 }, resolution = 12 }
 """
 SETTINGS = ["iterations=12", "surfels.count=60", "surfels.max_count=60"]
@@ -115,7 +116,7 @@ def test_components_are_kept_if_gain_exceeds_cost(
     """Degree 1 gains too little; the two others are kept. Validation views are fitted at the end only."""
     seen = judged(monkeypatch, [20.01, 20.0, 25.0, 20.0, 27.0, 25.0])
     trainer = fitted(variant, views, tmp_path / "run")
-    assert [(row["term"], row["iteration"], row["stays"]) for row in trainer.decisions] == [
+    assert [(row["component"], row["iteration"], row["stays"]) for row in trainer.decisions] == [
         ("degree", 2, False),
         ("specular", 5, True),
         ("interreflection", 8, True),
@@ -227,10 +228,16 @@ def test_run_keeps_its_decisions(
     assert json.loads(printed.out)["decisions"] == json.loads((run / "decisions.json").read_text())
     rows = json.loads((run / "decisions.json").read_text())
     method = Run(run).method()
-    assert [row["term"] for row in rows] == ["degree", "specular", "interreflection"]
-    assert method.components == tuple(row["term"] for row in rows if row["stays"])
+    assert [row["component"] for row in rows] == ["degree", "specular", "interreflection"]
+    assert method.components == tuple(row["component"] for row in rows if row["stays"])
     assert {*read_ply(run / "surfels.ply").raw} == {*method.surfels.names}
     assert main(["eval", str(run)]) == 0
+
+
+def test_decisions_of_version_0_1_are_read() -> None:
+    rows = [{"term": "degree", "stays": True}, {"component": "light", "stays": False}]
+    state = {"decisions": np.frombuffer(json.dumps(rows).encode(), np.uint8)}
+    assert [row["component"] for row in decisions_of(state)] == ["degree", "light"]
 
 
 # ---------------- going on with another method ----------------

@@ -339,7 +339,7 @@ def test_another_size_compiles_once(method: Method) -> None:
 def test_shared_light_learns_sum_of_gradients(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradient that three steps leave together is the sum of those that each leaves alone."""
     assert method.light is not None
-    rates, sums = Rates(channel=dict.fromkeys(method.surfels.names, 0.0), light=0.0), {}
+    rates, sums = Rates(attribute=dict.fromkeys(method.surfels.names, 0.0), light=0.0), {}
     for every in (1, 3):
         light = dataclasses.replace(method.light, every=every)
         trainer = Trainer(dataclasses.replace(method, light=light, rates=rates), ball())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import typing
 from collections import Counter
 from collections.abc import Callable
@@ -50,13 +51,13 @@ def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
     path.write_text(
         "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
         "[refine.propagate]\nwhen = {start = 0, until = 4000, every = 100}\nhold = 200\n"
-        "[loss]\nsmooth_until = 3000\n"
+        "[loss]\nsmooth = { weight = 1, until = 3000 }\n"
         "[data]\ncoarse = [{ until = 1000, block = 2 }, { until = 400, block = 4 }]\n"
     )
     method = methods.load(str(path), "quick")
     assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
     assert method.refine.propagate is not None
-    assert (method.refine.propagate.hold, method.loss.smooth_until) == (100, 1500)
+    assert (method.refine.propagate.hold, method.loss["smooth"].until) == (100, 1500)
     assert [method.data.block_at(i) for i in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
 
 
@@ -121,7 +122,7 @@ def test_a_scaled_window_keeps_its_events(start: int, length: int, every: int, f
 MANY_EVENTS = """
 iterations = 7_000
 [surfels]
-channels = ["radiance_sh", "albedo", "metallic", "roughness"]
+attributes = ["radiance_sh", "albedo", "metallic", "roughness"]
 sh_raise = { start = 0, until = 1_000, every = 333 }
 [light]
 [stage.one]
@@ -194,7 +195,7 @@ def test_assignments_are_applied_unscaled() -> None:
     changes = ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
     method = methods.load("ref_gaussian", "quick", changes)
     assert method.mesh is not None and method.refine.densify is not None
-    assert (method.loss.ssim, method.mesh.resolution, method.refine.densify.until) == (0.3, 64, 7)
+    assert (method.loss["ssim"].weight, method.mesh.resolution, method.refine.densify.until) == (0.3, 64, 7)
 
 
 STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
@@ -203,7 +204,8 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (f"{STAGE}[loss]\nsim = 1", ["loss", "unknown key 'sim'"]),
+        (f"{STAGE}[loss.smooth]\nend = 1", ["loss.smooth", "unknown key 'end'"]),
+        (f"{STAGE}[loss]\nsmooth = true", ["loss.smooth: expected a table", "True"]),
         ("iterations = 10\n[stage.a]\nuntil = 'x'", ["until", "expected int"]),
         (f"{STAGE}at = 'voxel'", ["'voxel' is not allowed", "surfel"]),
         ("iterations = 10", ["missing key 'stage'"]),
@@ -223,7 +225,7 @@ def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> Non
     refused(lambda: methods.load(str(path)), "own.toml", *words)
 
 
-@pytest.mark.parametrize("assignment", ["loss.sim=1", "loss", "iterations.x=1"])
+@pytest.mark.parametrize("assignment", ["losses.ssim=1", "loss", "iterations.x=1"])
 def test_bad_assignments_are_named(assignment: str) -> None:
     with pytest.raises(InputError, match=r"--set|unknown key"):
         methods.load("ref_gaussian", "quick", [assignment])
@@ -240,7 +242,7 @@ def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
     child = tmp_path / "child.toml"
     child.write_text('extends = "ref_gaussian"\n[loss]\nssim = 0.5\n')
     base, changed = methods.load("ref_gaussian"), methods.load(str(child))
-    assert changed.loss == dataclasses.replace(base.loss, ssim=0.5)
+    assert changed.loss == base.loss | {"ssim": methods.LossWeight(0.5)}
     assert dataclasses.replace(changed, loss=base.loss, name=base.name, file=base.file) == base
     assert changed.name == "child"
 
@@ -253,7 +255,8 @@ def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: P
     grandchild = tmp_path / "grandchild.toml"
     grandchild.write_text('extends = "below/own.toml"\ndrop = ["refine"]\n[loss]\nnormal = 0.3\n')
     shipped, changed = methods.load(base), methods.load(str(grandchild))
-    assert changed.loss == dataclasses.replace(shipped.loss, ssim=0.5, normal=0.3)
+    normal = dataclasses.replace(shipped.loss["normal"], weight=0.3)
+    assert changed.loss == shipped.loss | {"ssim": methods.LossWeight(0.5), "normal": normal}
     assert changed.refine.densify is None and changed.refine.reset is None
     same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, name=base, file=base)
     assert same == shipped
@@ -307,7 +310,7 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
         ("stage.deferred.rates.metallic=-1.0", "metallic: -1.0 is out of range"),
         ("stage.deferred.rates.light=nan", "out of range"),
         ("surfels.from_images=['metallic']", "metallic"),
-        ("surfels.channels=['metallic', 'roughness']", "albedo"),
+        ("surfels.attributes=['metallic', 'roughness']", "albedo"),
         ("refine.relocate={when={start=0, until=9, every=3}, grow=-0.1}", r"relocate\.grow: -0\.1"),
     ],
 )
@@ -316,17 +319,21 @@ def test_bad_settings_of_relighting_are_named(assignment: str, words: str) -> No
         methods.load("relighting", "quick", [assignment])
 
 
-@pytest.mark.parametrize("prior", ["half_metal", "materials", "light_colour"])
-def test_a_prior_needs_what_it_is_about(prior: str) -> None:
-    with pytest.raises(InputError, match=rf"loss\.{prior}: .*drop it"):
-        methods.load("base_2dgs", "quick", [f"loss.{prior}=0.1"])
-    methods.load("ref_gaussian", "quick", [f"loss.{prior}=0.1"])
-
-
-@pytest.mark.parametrize("name", ["normal", "half_metal", "ssim"])
-def test_a_loss_with_a_key_of_its_own_is_not_registered_too(name: str) -> None:
-    with pytest.raises(InputError, match=rf"loss\.registered\.{name}: .*; set loss\.{name} instead"):
-        methods.load("base_2dgs", "quick", [f"loss.registered.{name}.weight=0.3"])
+OLD_LOSSES = """[loss]
+ssim = 0.2
+normal = 0.2
+normal_start = 0
+normal_rise = 2000
+smooth = 0.0
+smooth_until = 6000
+alpha = 0.2
+half_metal = 0.0
+half_metal_start = 0
+half_metal_rise = 0
+materials = 0.0
+light_colour = 0.0
+[loss.registered]
+"""
 
 
 def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
@@ -334,7 +341,10 @@ def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
     now = methods.load("auto", "quick", ["select.component.degree_1.trial=9"], ["levels_3"])
     old = methods.dump(now).replace("[select.component", "[select.term")
     old = old.replace("components =", "terms =").replace('\nname = "auto"', '\nvariant = "auto"', 1)
-    assert all(key in old for key in ("[select.term.degree_1]", "terms = [", 'variant = "auto"'))
+    old = old.replace("attributes =", "channels =").replace("[rates.attribute]", "[rates.channel]")
+    old = re.sub(r"\[loss\..*?(?=\[rates\])", OLD_LOSSES, old, flags=re.DOTALL)
+    keys = "[select.term.degree_1]", "terms = [", 'variant = "auto"', "[rates.channel]", "\nchannels ="
+    assert all(key in old for key in keys)
     (tmp_path / "config.toml").write_text(old)
     assert methods.load_resolved(tmp_path / "config.toml") == now
     changed = methods.load("auto", "quick", ["select.term.degree_1.trial=9"], ["levels_3"])
@@ -342,8 +352,14 @@ def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('extends = "auto"\ndrop = ["select.term.lobe_rays"]\n')
     select = methods.load(str(tmp_path / "own.toml")).select
     assert select is not None and "lobe_rays" not in select.component
-    (tmp_path / "own.toml").write_text('extends = "ref_gaussian"\n[surfels]\nfrom_pictures = ["albedo"]\n')
-    assert methods.load(str(tmp_path / "own.toml")).surfels.from_images == ("albedo",)
+    (tmp_path / "own.toml").write_text(
+        'extends = "ref_gaussian"\ndrop = ["rates.channel.scale"]\n[surfels]\nfrom_pictures = ["albedo"]\n'
+        "[loss]\nnormal_rise = 600\n[loss.registered.rough]\nweight = 0.5\n"
+    )
+    own = methods.load(str(tmp_path / "own.toml"), "quick", ["loss.registered.rough.until=9"])
+    assert own.surfels.from_images == ("albedo",) and "scale" not in own.rates.attribute
+    assert own.loss["normal"] == methods.LossWeight(0.2, rise=200)
+    assert own.loss["rough"] == methods.LossWeight(0.5, until=9)
 
 
 def test_a_stage_sets_every_shading_option() -> None:

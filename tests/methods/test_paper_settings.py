@@ -33,7 +33,7 @@ def test_each_loads_and_is_read_back(name: str, preset: str, tmp_path: Path) -> 
 def test_settings_are_those_of_the_scene(name: str) -> None:
     _, folder, scene = name.split("/")
     method = methods.load(name, "paper")
-    assert method.loss.smooth == SMOOTH.get(scene, 0.0)
+    assert method.loss["smooth"].weight == SMOOTH.get(scene, 0.0)
     assert method.data.downscale == DOWNSCALE.get(scene, 1)
     real = folder == "ref_real"
     assert method.data.background == ("black" if real else "white")

@@ -24,7 +24,7 @@ METHOD = f"""
 iterations = {PRESETS["quick"].iterations}
 checkpoint_every = 3
 [surfels]
-channels = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"]
+attributes = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh"]
 degree = {{ radiance_sh = 1 }}
 [light]
 height = 8

@@ -50,7 +50,7 @@ class Phong(Reflectance):
 METHOD = """
 iterations = 2000
 [surfels]
-channels = ["albedo", "shininess"]
+attributes = ["albedo", "shininess"]
 [light]
 height = 8
 [stage.only]

@@ -35,29 +35,32 @@ IMPOSSIBLE = {
         ["stage.only", "light"],
     ),
     "no roughness": (
-        f"[surfels]\nchannels = ['radiance_sh', 'albedo', 'metallic']\n{LIGHT}{STAGE}",
+        f"[surfels]\nattributes = ['radiance_sh', 'albedo', 'metallic']\n{LIGHT}{STAGE}",
         ["stage.only", "roughness", "no such attribute"],
     ),
     "no harmonics": (
-        f"[surfels]\nchannels = ['albedo', 'metallic', 'roughness']\n{LIGHT}{STAGE}",
+        f"[surfels]\nattributes = ['albedo', 'metallic', 'roughness']\n{LIGHT}{STAGE}",
         ["stage.only", "radiance_sh", "no such attribute"],
     ),
     "no SH attribute for radiance": (
-        f"[surfels]\nchannels = ['albedo']\n{STAGE}reflectance = 'radiance'",
+        f"[surfels]\nattributes = ['albedo']\n{STAGE}reflectance = 'radiance'",
         ["stage.only", "radiance_sh"],
     ),
-    "a channel misspelt": (f"[surfels]\nchannels = ['albdeo']\n{STAGE}", ["'albdeo' is unknown", "albedo"]),
+    "a misspelt attribute": (
+        f"[surfels]\nattributes = ['albdeo']\n{STAGE}",
+        ["'albdeo' is unknown", "albedo"],
+    ),
     "no samples": (
-        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nsamples = 0",
+        f"[surfels]\nattributes = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nsamples = 0",
         ["stage.only", "samples: 0"],
     ),
     "bounces of a model that traces none": (
-        f"[surfels]\nchannels = ['albedo', 'roughness']\n{LIGHT}{STAGE}reflectance = 'monte_carlo'\n"
+        f"[surfels]\nattributes = ['albedo', 'roughness']\n{LIGHT}{STAGE}reflectance = 'monte_carlo'\n"
         "at = 'surfel'\ntraced_bounces = 1\n[mesh]",
         ["stage.only", "traced_bounces: needs reflectance = split_sum"],
     ),
     "materials reset that are none": (
-        f"[surfels]\nchannels = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nrestart = ['metallic']",
+        f"[surfels]\nattributes = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nrestart = ['metallic']",
         ["stage.only", "restart", "metallic"],
     ),
 }
@@ -74,7 +77,7 @@ def test_impossible_methods_are_refused_when_they_are_read(case: str, tmp_path: 
 def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
     """`at` keeps its default, "pixel": blending is linear, so that the image is the same."""
     path = tmp_path / "own.toml"
-    surfels = "[surfels]\nchannels = ['radiance_sh']\n"
+    surfels = "[surfels]\nattributes = ['radiance_sh']\n"
     path.write_text(f"iterations = 100\n{surfels}{STAGE}reflectance = 'radiance'")
     stage = load(str(path)).stage["only"]
     assert stage.shading.at == "pixel" and Shading.resolve(stage.shading, mesh=True).shaded_at == "surfel"
@@ -133,7 +136,7 @@ def needless(shading: Shading) -> set[str]:
 def test_a_stage_says_how_many_directions(tmp_path: Path) -> None:
     """A model that sums over the hemisphere is occluded at surfels; others have no directions."""
     path = tmp_path / "own.toml"
-    text = "iterations = 100\n[surfels]\nchannels = ['albedo', 'roughness']\n" + LIGHT + STAGE
+    text = "iterations = 100\n[surfels]\nattributes = ['albedo', 'roughness']\n" + LIGHT + STAGE
     path.write_text(f"{text}at = 'surfel'\nreflectance = 'monte_carlo'\ndirections = 8")
     shading = Shading.resolve(load(str(path)).stage["only"].shading, mesh=True)
     assert shading.occlusion and shading.chosen() == ["directions"] and shading.directions == 8

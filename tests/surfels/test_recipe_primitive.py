@@ -214,7 +214,7 @@ def test_balls_are_fitted(tmp_path: Path) -> None:
         f"""
         iterations = {methods.PRESETS["quick"].iterations}
         checkpoint_every = 3
-        surfels = {{ primitive = "ball", channels = ["radiance_sh"], degree = {{ radiance_sh = 1 }} }}
+        surfels = {{ primitive = "ball", attributes = ["radiance_sh"], degree = {{ radiance_sh = 1 }} }}
         stage.all = {{ until = 6, reflectance = "radiance" }}
         refine = {{ densify = {{ start = 1, until = 6, every = 2 }}, gradient = 1e-9, prune_extent = 10.0 }}
         """
