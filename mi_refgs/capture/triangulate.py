@@ -17,7 +17,7 @@ import numpy as np
 
 from mi_refgs.capture import colmap
 from mi_refgs.data.dataset import Dataset, PointCloud, fitting_downscale, read_dataset
-from mi_refgs.data.poses import MITSUBA_FROM_OPENCV
+from mi_refgs.data.poses import world_to_camera
 from mi_refgs.data.view import View
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import linear_from_srgb, write_png
@@ -99,7 +99,8 @@ def triangulated(data: Dataset) -> PointCloud | None:
         colmap.extract(database, images, names)
         colmap.match(database, [(names[i], names[j]) for i, j in near_pairs(views)])
         try:
-            model = colmap.triangulate(database, images, output, poses(names, views))
+            poses = {name: world_to_camera(view.to_world) for name, view in zip(names, views, strict=True)}
+            model = colmap.triangulate(database, images, output, poses)
         except (RuntimeError, ValueError):  # nothing that matches
             return None
     return _cloud(model)
@@ -115,16 +116,6 @@ def near_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
     order = np.argsort(apart + angle + np.diag(np.full(len(views), np.inf)), axis=1, kind="stable")
     ranks = [rank for rank in (*range(CLOSE), *APART) if rank < len(views) - 1]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, near in enumerate(order) for j in near[ranks]})
-
-
-def poses(names: Sequence[str], views: Sequence[View]) -> dict[str, np.ndarray]:
-    """Camera from world (3, 4) with COLMAP's axes by image name."""
-    result = {}
-    for name, view in zip(names, views, strict=True):
-        to_world = view.to_world @ MITSUBA_FROM_OPENCV
-        rotation = to_world[:3, :3].T
-        result[name] = np.concatenate([rotation, -rotation @ to_world[:3, 3:]], axis=1)
-    return result
 
 
 def _cameras(names: Sequence[str], views: Sequence[View]) -> list[tuple[list[str], str, list[float]]]:

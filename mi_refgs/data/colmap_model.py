@@ -17,6 +17,7 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.lens import Lens
+from mi_refgs.data.poses import world_to_camera
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import write_bytes
 
@@ -37,8 +38,6 @@ MODELS: dict[str, tuple[int, str]] = {
 TEST_LIST = "test.txt"
 """File beside the model with the names of the test views, one per line, as 3D Gaussian Splatting reads it."""
 MAX_NAME = 4096  # bytes of an image's name; no path is longer
-OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0])
-"""OpenCV's camera has +x right and +y down, Mitsuba's +x left and +y up."""
 
 
 @dataclass(frozen=True)
@@ -289,8 +288,8 @@ def write_images(
     rows = []
     given = zip(names, poses, cameras, observations, strict=True)
     for i, (name, pose, camera, points) in enumerate(given, 1):
-        rotation = OPENCV_FROM_MITSUBA @ pose[:3, :3].T
-        numbers = (*_quaternion(rotation), *(-rotation @ pose[:3, 3]))
+        matrix = world_to_camera(pose)
+        numbers = (*_quaternion(matrix[:, :3]), *matrix[:, 3])
         rows += [f"{i} {' '.join(repr(float(x)) for x in numbers)} {camera} {name}", points]
     comment = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of X Y POINT3D_ID"
     _write(folder / "images.txt", comment, rows)

@@ -22,8 +22,6 @@ from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import FileCamera, View
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import read_exr_image
-from mi_refgs.io.images import is_opaque
 from mi_refgs.registry import Registry
 
 HOLDOUT = 8
@@ -286,15 +284,8 @@ def _opaque(views: tuple[View, ...]) -> bool:
     """Whether images with alpha have no transparent pixel; OPAQUE_CHECKED evenly spaced ones are examined."""
     own = [view for view in views if _own_alpha(view)]
     chosen = np.unique(np.linspace(0, len(own) - 1, OPAQUE_CHECKED).astype(int)) if own else ()
-    return bool(own) and all(_is_opaque(own[i]) for i in chosen)
-
-
-def _is_opaque(view: View) -> bool:
-    if view.file is None:
-        return view.alpha is not None and bool(view.alpha.min() >= 1)
-    if view.file.path.suffix.lower() == ".exr":
-        return bool(read_exr_image(view.file.path)[..., 3].min() >= 1)
-    return is_opaque(view.file.path)
+    loaded = (own[i].load().alpha for i in chosen)
+    return bool(own) and all(alpha is None or alpha.min() >= 1 for alpha in loaded)
 
 
 def _extent(views: tuple[View, ...], offset: np.ndarray | float = 0.0) -> float:

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.colmap_model import write_cameras, write_images, write_points, write_test_list
-from mi_refgs.data.lens import Lens
-from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
-from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.data.lens import COEFFICIENTS, Lens
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.data.transforms import Frame
+from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
-from mi_refgs.io.files import make_folder, read_json, write_json
+from mi_refgs.io.files import make_folder, write_json
 from mi_refgs.io.images import ENDINGS
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 
 IMAGE_FOLDER = re.compile(r"images(_\d+)?")  # folders to which COLMAP's names are relative
-LENSES = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
-"""Keys of lenses that are no pinholes, unless they are 0 or false."""
 SIZE_MAX = 2**14  # pixels along a side of an image, at most
 
 
@@ -102,45 +97,29 @@ def _below_images(names: Sequence[str]) -> list[str]:
 def read_cameras(path: Path) -> list[Camera]:
     """Read the pinhole cameras of a transforms.json; its images are not read.
 
-    Keys: fl_x or camera_angle_x, fl_y, cx, cy, w, h and near (depth of the near plane, 0 by default) of the
-    file or of a frame, and transform_matrix (camera to world, OpenGL's axes). Raises InputError for a file
-    that lacks one or has another lens.
+    Keys as in `data.transforms`, and near (depth of the near plane, 0 by default). Raises InputError for a
+    file without sizes, focal lengths or poses, and for another lens.
     """
-    content = read_json(path)
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: frames: missing or empty; add one entry for each camera")
-    return [
-        _camera(f"{path}: frames[{i}]", {**content, **(frame if isinstance(frame, dict) else {})})
-        for i, frame in enumerate(frames)
-    ]
+    frames = Frame.all_of(path)
+    if not frames:
+        raise InputError(f"{path}: frames: empty; add one entry for each camera")
+    return [_camera(frame) for frame in frames]
 
 
-def _camera(where: str, given: dict[str, Any]) -> Camera:
-    if lens := [key for key in LENSES if given.get(key)]:
-        raise InputError(f"{where}.{lens[0]}: no pinhole; undistort the images, and give those cameras")
-
-    def number(key: str, default: float | None = None) -> float:
-        value: Any = given.get(key, default)
-        if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER:
-            raise InputError(f"{where}.{key}: {abbreviated(value)} is no usable number; give one")
-        return float(value)
-
-    width, height = number("w"), number("h")
+def _camera(frame: Frame) -> Camera:
+    if lens := [key for key in (*COEFFICIENTS, "is_fisheye") if frame.given.get(key)]:
+        raise InputError(f"{frame.field(lens[0])}: no pinhole; undistort the images, and give those cameras")
+    width, height = (frame.number(key) or 0.0 for key in ("w", "h"))
     if min(width, height) < 1 or max(width, height) > SIZE_MAX:
-        raise InputError(f"{where}.w: {width:g} × {height:g} is no size of an image; correct w and h")
-    fx = number("fl_x", 0.0)
-    if "fl_x" not in given:
-        fx = width / 2 / math.tan(min(max(number("camera_angle_x"), 1e-3), 3.1) / 2)
-    fy = number("fl_y", fx)
-    if min(fx, fy) <= 0:
-        raise InputError(f"{where}.fl_x: {fx:g} is no focal length; give pixels above 0")
-    try:
-        matrix = np.asarray(given.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
-    if matrix.shape != (4, 4):
-        raise InputError(f"{where}.transform_matrix: no 4 × 4 matrix of numbers; export the file again")
-    pose = rigid(matrix, f"{where}.transform_matrix") @ MITSUBA_FROM_OPENGL
-    cx, cy, near = number("cx", width / 2), number("cy", height / 2), max(number("near", 0.0), 0.0)
-    return Camera.from_pose(round(width), round(height), -fx, -fy, cx, cy, pose, near)
+        raise InputError(
+            f"{frame.field('w')}: {width:g} × {height:g} is no size of an image; correct w and h"
+        )
+    fx, fy = frame.focal_lengths(width, height)
+    cx, cy = (frame.number(key) for key in ("cx", "cy"))
+    return Camera.from_pose(
+        *(round(width), round(height), -fx, -fy),
+        width / 2 if cx is None else cx,
+        height / 2 if cy is None else cy,
+        frame.to_world(),
+        max(frame.number("near") or 0.0, 0.0),
+    )

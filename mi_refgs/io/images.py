@@ -163,13 +163,6 @@ def has_alpha(path: str | Path) -> bool:
         return _transparent(image)
 
 
-def is_opaque(path: Path) -> bool:
-    """Whether no pixel of a PNG or JPEG file is transparent; raises InputError as `read_png` does."""
-    with open_image(path) as image:
-        whole = image if image.mode in ("RGBA", "LA") else image.convert("RGBA")
-        return bool(whole.getchannel("A").getextrema()[0] == 255)
-
-
 def _transparent(image: Any) -> bool:
     return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 

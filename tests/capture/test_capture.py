@@ -15,9 +15,10 @@ import pytest
 from PIL import Image
 
 from benchmarks import capture as capture_benchmark
+from benchmarks.capture import best_similarity, pose_errors
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
-from mi_refgs.capture.frame import Similarity, best_similarity, pose_errors, region_of_interest, up_direction
+from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
 from mi_refgs.capture.output import LAST, is_complete, prepare, replace_output
 from mi_refgs.capture.photographs import find_masks, find_photographs, mask_pixels
 from mi_refgs.capture.pipeline import require_placed

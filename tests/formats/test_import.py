@@ -268,12 +268,12 @@ def test_transforms_file_defines_the_cameras_of_an_import(theirs: Path, tmp_path
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frames": []}, "frames: missing or empty"),
-        ({"w": None}, "frames[0].w: None is no usable number"),
+        ({"frames": []}, "frames: empty"),
+        ({"w": None}, "w: 0 × 48 is no size of an image"),
         ({"w": 1e6}, "is no size of an image"),
-        ({"fl_x": -3}, "is no focal length"),
-        ({"k1": 0.1}, "frames[0].k1: no pinhole"),
-        ({"frames": [{}]}, "transform_matrix: no 4 × 4 matrix"),
+        ({"fl_x": -3}, "fl_x: -3.0 is not a positive number"),
+        ({"k1": 0.1}, "k1: no pinhole"),
+        ({"frames": [{}]}, "frames[0].transform_matrix: missing or not 4 × 4"),
         ({"frames": [{"transform_matrix": (2 * np.eye(4)).tolist()}]}, "not a rotation and a translation"),
     ],
 )
