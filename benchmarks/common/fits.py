@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,23 +15,34 @@ from mi_refgs.methods.method import Method
 from mi_refgs.reference.camera import look_at
 
 METHOD = "ref_gaussian"
+Colour = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def ball_data(size: int, focal: float, shots: Iterable[tuple[np.ndarray, Colour]]) -> Dataset:
+    """Views of size × size pixels of a unit ball, for each direction towards the camera and its colour.
+
+    `Colour` maps x and y, in pixels from the centre, to the image (H, W, 3) where the ball is seen.
+    """
+    y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
+    alpha = (np.hypot(x, y) / focal < np.tan(np.arcsin(0.25))).astype(np.float32)
+    views = []
+    for i, (outward, colour) in enumerate(shots):
+        to_world = look_at(4 * outward / np.linalg.norm(outward), np.zeros(3))
+        image = np.where(alpha[..., None] > 0, colour(x, y), 1).clip(0, 1).astype(np.float32)
+        intrinsics = (size, size, focal, focal, size / 2, size / 2)
+        views.append(View(f"{i}", *intrinsics, to_world, Pixels(image, alpha)))
+    return Dataset(Path("ball"), "train", tuple(views), np.ones(3, np.float32), False, None)
 
 
 def sphere_data(size: int, views: int, rng: np.random.Generator) -> Dataset:
-    """Views of a unit sphere with a smooth random image on it."""
+    """Views of a unit sphere from random sides, with a smooth random image on it."""
+
+    def waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        phases = [x * rng.uniform(0.02, 0.1) + y * rng.uniform(0.02, 0.1) for _ in range(3)]
+        return np.stack([0.5 + 0.4 * np.sin(phase) for phase in phases], axis=-1)
+
     focal = 0.5 * size / np.tan(np.radians(20))
-    y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
-    inside = (np.hypot(x, y) / focal < np.tan(np.arcsin(0.25))).astype(np.float32)
-    found = []
-    for i in range(views):
-        outward = rng.normal(size=3)
-        to_world = look_at(4 * outward / np.linalg.norm(outward), np.zeros(3))
-        waves = [np.sin(x * rng.uniform(0.02, 0.1) + y * rng.uniform(0.02, 0.1)) for _ in range(3)]
-        colour = 0.5 + 0.4 * np.stack(waves, axis=-1)
-        image = (inside[..., None] * colour + 1 - inside[..., None]).astype(np.float32)
-        camera = (size, size, focal, focal, size / 2, size / 2, to_world)
-        found.append(View(f"{i}", *camera, Pixels(image, inside)))
-    return Dataset(Path("sphere"), "train", tuple(found), np.ones(3, np.float32), False, None)
+    return ball_data(size, focal, ((rng.normal(size=3), waves) for _ in range(views)))
 
 
 def make_trainer(surfels: int, data: Dataset) -> tuple[Trainer, Method]:

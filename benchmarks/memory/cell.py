@@ -16,6 +16,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.common.scenes import discs
 from benchmarks.common.timing import peak_bytes
 from mi_refgs.shade.light.envmap import EnvironmentLight
 
@@ -28,18 +29,11 @@ KINDS = tuple(CHANNELS)
 def scene(kind: str, size: int, surfels: int) -> Any:
     """A Mitsuba scene of a sphere of discs, seen by a camera of size² pixels."""
     rng = np.random.default_rng(0)
-    normal = rng.normal(size=(surfels, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    raw = {
-        "position": normal,
-        "rotation": np.stack([-normal[:, 1], normal[:, 0], 0 * normal[:, 0], 1 + normal[:, 2]], 1),
+    raw = discs(surfels, degree=1) | {
         "scale": np.log(rng.uniform(0.5, 1.5, (surfels, 2)) * 2.5 / np.sqrt(surfels)),
         "opacity": rng.uniform(0, 4, (surfels, 1)),
-        "radiance_sh": 0.1 * rng.normal(size=(surfels, 12)),
-        "albedo": rng.normal(size=(surfels, 3)),
-        "metallic": rng.normal(size=(surfels, 1)),
-        "roughness": rng.normal(size=(surfels, 1)),
     }
+    del raw["indirect_sh"]
     tensors = {name: mi.TensorXf(values.astype(np.float32)) for name, values in raw.items()}
     light = EnvironmentLight.from_radiance(np.ones((64, 128, 3), np.float32)).raw
     aovs = {"aovs": AOVS} if kind == "AOVs" else {}

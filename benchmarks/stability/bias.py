@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.stability.cases import Array, Case, Raw, camera, facing, filled, plain, sky, sphere
+from benchmarks.common.scenes import discs, facing
+from benchmarks.stability.cases import Array, Case, Raw, camera, filled, plain, sky
 from benchmarks.stability.exact import light_of
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import camera_frame
@@ -29,10 +30,10 @@ def scenes() -> Iterator[Case]:
     eye = camera(width=WIDTH, height=HEIGHT)
     flat: dict[str, Any] = {"camera": eye, "at": "surfel", "reflectance": "radiance"}
     rng = np.random.default_rng(21)
-    ball = sphere(400)
+    ball = discs(400)
     ball["scale"] = np.log(rng.uniform(0.06, 0.16, (400, 2)))
     yield plain("sphere of surfels", raw=ball, **flat)
-    mirror = sphere(600)
+    mirror = discs(600)
     normal = mirror["position"]
     mirror |= {
         "position": normal * (1 + 0.004 * rng.normal(size=(600, 1))),
@@ -43,7 +44,7 @@ def scenes() -> Iterator[Case]:
     mirror |= filled(600, metallic=4, roughness=-2)
     yield plain("curved near-mirror", raw=mirror, camera=eye, light=sky(32))
     yield plain("planes through each other", raw=_planes(rng), **flat)
-    mist = sphere(300)
+    mist = discs(300)
     mist |= {
         "position": rng.uniform(-1, 1, (300, 3)),
         "rotation": rng.normal(size=(300, 4)),
@@ -55,7 +56,7 @@ def scenes() -> Iterator[Case]:
 
 def _planes(rng: np.random.Generator) -> Raw:
     """Two crossing sheets of opaque discs, each of one colour."""
-    raw = sphere(240)
+    raw = discs(240)
     normals = np.array([[0.6, 0, 0.8], [0.8, 0, -0.6]])[np.arange(240) % 2]
     flat = rng.uniform(-1, 1, (240, 3))
     raw["position"] = flat - np.sum(flat * normals, 1, keepdims=True) * normals
@@ -149,7 +150,7 @@ def _cut(opacity: float) -> dict[str, float]:
     """Relative error of d Σα / d log scale, and of d Σα / d logit, of one surfel: the cut's own derivative
     is missing. Against differences of the sum over a fine grid."""
     c = camera((0, 0, 4.0), width=200, height=200, fov=30)
-    raw = {n: x[:1].astype(np.float64) for n, x in sphere().items()} | {"position": np.zeros((1, 3))}
+    raw = {n: x[:1].astype(np.float64) for n, x in discs().items()} | {"position": np.zeros((1, 3))}
     raw |= {"rotation": np.array([[0.1, 0.05, 0, 1.0]]), "scale": np.full((1, 2), np.log(0.25))}
     raw["opacity"] = np.array([[np.log(opacity / (1 - opacity))]])
     pixels = np.arange(c.width * c.height)

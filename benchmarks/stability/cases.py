@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from benchmarks.common.scenes import asymmetric_sky, discs, facing, unit
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.splat import PinholeCamera
@@ -52,38 +53,9 @@ class Case:
         )
 
 
-def sphere(count: int = 40, seed: int = 1, degree: int = 2) -> Raw:
-    """Overlapping discs on a unit sphere, normals outward with some noise, every channel."""
-    rng = np.random.default_rng(seed)
-    normal = unit(rng.normal(size=(count, 3)))
-    coefficients = 3 * (degree + 1) ** 2
-    return {
-        "position": normal,
-        "rotation": facing(normal) + 0.1 * rng.normal(size=(count, 4)),
-        "scale": np.log(rng.uniform(0.25, 0.5, (count, 2))),
-        "opacity": rng.uniform(-1, 1.5, (count, 1)),
-        "radiance_sh": 0.12 * rng.normal(size=(count, coefficients)),
-        "albedo": rng.normal(size=(count, 3)),
-        "metallic": rng.normal(size=(count, 1)),
-        "roughness": rng.normal(size=(count, 1)),
-        "indirect_sh": 0.1 * rng.normal(size=(count, coefficients)) + 0.5 * (np.arange(coefficients) < 3),
-    }
-
-
 def filled(count: int = 40, **values: float) -> Raw:
     """Channels of the sphere with one raw value everywhere."""
-    return {name: np.full_like(sphere(count)[name], value) for name, value in values.items()}
-
-
-def unit(v: Array) -> Array:
-    """v / |v| by rows."""
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
-
-
-def facing(normal: Array) -> Array:
-    """Quaternions (N, 4) that turn +z to unit normals (N, 3)."""
-    q = np.stack([-normal[:, 1], normal[:, 0], 0 * normal[:, 0], 1 + normal[:, 2]], 1)
-    return np.where(np.abs(q).max(axis=1, keepdims=True) > 1e-6, q, np.array([1.0, 0, 0, 0]))
+    return {name: np.full_like(discs(count)[name], value) for name, value in values.items()}
 
 
 def camera(
@@ -102,10 +74,7 @@ def camera(
 
 def sky(height: int = 16, peak: float = 0.0) -> Array:
     """Raw values of a light without symmetries; one texel near the equator has the radiance `peak`."""
-    θ, φ = np.meshgrid(np.linspace(0, np.pi, height), np.arange(2 * height) * np.pi / height, indexing="ij")
-    x, y, z = np.sin(θ) * np.sin(φ), np.cos(θ), np.sin(θ) * np.cos(φ)
-    log = [0.8 * x - 0.3 * y + 0.5 * x * z, 0.6 * y + 0.4 * z - 0.5 * x * y, 0.7 * z - 0.2 * x + 0.6 * y * z]
-    radiance = np.exp(np.stack(log, -1))
+    radiance = asymmetric_sky(height)
     if peak:
         radiance[height // 2 - 1, height // 3] = peak
     return raw_light(radiance)
@@ -118,7 +87,7 @@ def raw_light(radiance: Array) -> Array:
 
 def plain(name: str, **changes: Any) -> Case:
     """The plain scene, with any field of `Case` replaced; `raw` may hold some of the channels only."""
-    raw = sphere() | changes.pop("raw", {})
+    raw = discs() | changes.pop("raw", {})
     return Case(name, raw, changes.pop("camera", camera()), changes.pop("light", sky()), **changes)
 
 
@@ -135,7 +104,7 @@ def catalogue() -> list[Case]:
 
 def where(mask: Any, values: Any, channel: str, raw: Raw | None = None) -> Raw:
     """The plain channel with new values in some rows."""
-    out = (raw or sphere())[channel].copy()
+    out = (raw or discs())[channel].copy()
     out[mask] = values
     return {channel: out}
 
@@ -169,7 +138,7 @@ def _ends() -> Iterator[Case]:
 
 def _sideways(rng: np.random.Generator) -> tuple[Array, Array]:
     """Unit vectors (40, 3) of the plain sphere's surfels to the eye, and random ones across them."""
-    view = unit(EYE - sphere()["position"])
+    view = unit(EYE - discs()["position"])
     return view, unit(np.cross(view, rng.normal(size=(40, 3))))
 
 
@@ -180,7 +149,7 @@ def _normals() -> Iterator[Case]:
         normal = np.sqrt(1 - slope**2) * side + slope * view
         yield plain(f"N·V {name}", raw={"rotation": facing(normal)} | filled(scale=LN(0.4)))
     # Two wide discs in one place, of the same weight everywhere: α₁ = α₂ (1 - α₁).
-    pair = {n: x[:2] for n, x in sphere().items()}
+    pair = {n: x[:2] for n, x in discs().items()}
     view, side = EYE / np.linalg.norm(EYE), np.cross(EYE, [0.3, 0.2, 1.0])
     side /= np.linalg.norm(side)
     tilt = 0.2  # below FACING_TOLERANCE: the second normal stays turned away
@@ -192,7 +161,7 @@ def _normals() -> Iterator[Case]:
         both["opacity"] = np.array([[LN(0.3 / 0.7)], [LN((3 / 7) / (4 / 7))]])
         yield plain(name, raw=pair | both)
     for size in ("1e-10", "1e10"):
-        raw = {"rotation": float(size) * sphere()["rotation"]}
+        raw = {"rotation": float(size) * discs()["rotation"]}
         yield plain(f"quaternions of length {size}", raw=raw)
     yield plain("quaternions 0", raw=where(every(), 0.0, "rotation"))
 
@@ -224,7 +193,7 @@ def _places() -> Iterator[Case]:
     view, side = _sideways(np.random.default_rng(4))
     for slope in (1e-5, 2e-4, 1e-3):
         yield plain(f"edge-on, cosine {slope:g}", raw={"rotation": facing(side + slope * view)})
-    behind = where(every(), sphere()["position"][every()] + 6 * eye / np.linalg.norm(eye), "position")
+    behind = where(every(), discs()["position"][every()] + 6 * eye / np.linalg.norm(eye), "position")
     yield plain("half of the surfels behind the camera", raw=behind)
     for distance in (1e-1, 1e-3, 1e-6):
         near = where(every(8), (eye + distance * forward + 0.01 * distance * side)[every(8)], "position")
@@ -240,7 +209,7 @@ def _many() -> Iterator[Case]:
     rng = np.random.default_rng(6)
 
     def stack(count: int, opacity: float, step: float, spread: float = 0.0, size: float = 3.0) -> Raw:
-        raw = {n: np.repeat(x[:1], count, 0) for n, x in sphere(degree=0).items()}
+        raw = {n: np.repeat(x[:1], count, 0) for n, x in discs(degree=0).items()}
         z = step * np.arange(count)[:, None] * np.array([0, 0, -1.0])
         raw["position"] = z + spread * rng.normal(size=(count, 3))
         raw["rotation"] = np.tile([0.05, 0.02, 0, 1.0], (count, 1))
@@ -297,7 +266,7 @@ def _worlds() -> Iterator[Case]:
 
 
 def _lights() -> Iterator[Case]:
-    shiny = {"roughness": sphere()["roughness"] - 2} | filled(metallic=2)
+    shiny = {"roughness": discs()["roughness"] - 2} | filled(metallic=2)
     yield plain("a light with a peak of 1e6", raw=shiny, light=sky(peak=1e6))
     yield plain("a light of 1e6 everywhere", light=np.full((16, 32, 3), 1e6))
     yield plain("a black light (1e-4, the floor)", light=raw_light(np.full((16, 32, 3), 1e-4)))
@@ -337,9 +306,9 @@ def _images() -> Iterator[Case]:
     flat: dict[str, Any] = {"at": "surfel", "reflectance": "radiance"}
     large = camera(width=4096, height=4096)
     yield plain("an image of 4096²", camera=large, pixels=600, quick=False, **flat)
-    one = {n: x[:1] for n, x in sphere().items()} | {"position": np.zeros((1, 3))}
+    one = {n: x[:1] for n, x in discs().items()} | {"position": np.zeros((1, 3))}
     yield plain("one surfel", raw=one)
-    none = {n: x[:0] for n, x in sphere().items()}
+    none = {n: x[:0] for n, x in discs().items()}
     yield plain("no surfel", raw=none)
     raw, eye, corner = _part_of_film(4096, 2)
     name = "surfels of 2 pixels in a film of 4096²"
@@ -426,7 +395,7 @@ def _meshes() -> Iterator[Case]:
     yield replace(_plates(), name="the same mesh, made elsewhere", mesh=foreign, further=0.04)
     ball = trimesh.creation.icosphere(subdivisions=2)
     ball = [(np.asarray(ball.vertices), np.asarray(ball.faces))]
-    raw, eye = {"rotation": facing(sphere()["position"])}, camera((3.0, 0.3, 2.0), (0.0, 1.0, 0.0), 20)
+    raw, eye = {"rotation": facing(discs()["position"])}, camera((3.0, 0.3, 2.0), (0.0, 1.0, 0.0), 20)
     yield _with_mesh("a grazing self-hit", ball, 5e-3, raw=raw | filled(opacity=2), camera=eye)
 
 

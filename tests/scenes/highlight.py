@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, View
-from mi_refgs.data.images import Pixels
+from benchmarks.common.fits import ball_data
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import Method
-from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.run import Run
 
 SIZE = 24
@@ -54,20 +53,15 @@ alpha = 0.1
 
 def ball(size: int = SIZE, views: int = 6) -> Dataset:
     """A ball with a sharp highlight that moves with the camera, from a ring of views."""
-    focal, images = 1.6 * size, []
-    y, x = (np.mgrid[0:size, 0:size] + 0.5 - size / 2) / focal
-    for i in range(views):
-        angle = 2 * np.pi * i / views
-        outward = np.array([np.cos(angle) * 0.9, np.sin(angle) * 0.9, np.sqrt(0.19)])
-        to_world = look_at(4 * outward, np.zeros(3))
-        radius = np.hypot(x, y)
-        alpha = (radius < np.tan(np.arcsin(0.25))).astype(np.float32)
+    focal, angle = 1.6 * size, 2 * np.pi * np.arange(views) / views
+
+    def colour(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = x / focal, y / focal
         shine = np.exp(-((x - 0.05) ** 2 + (y + 0.05) ** 2) / 0.002)
-        colour = np.stack([0.3 + 0.6 * shine, 0.4 + x, 0.5 + 0.5 * shine + y], axis=-1)
-        image = (alpha[..., None] * colour + 1 - alpha[..., None]).clip(0, 1).astype(np.float32)
-        intrinsics = size, size, focal, focal, size / 2, size / 2
-        images.append(View(f"{i}", *intrinsics, to_world, Pixels(image, alpha)))
-    return Dataset(Path("ball"), "train", tuple(images), np.ones(3, np.float32), False, None)
+        return np.stack([0.3 + 0.6 * shine, 0.4 + x, 0.5 + 0.5 * shine + y], axis=-1)
+
+    outward = np.stack([0.9 * np.cos(angle), 0.9 * np.sin(angle), np.sqrt(0.19) + 0 * angle], axis=-1)
+    return ball_data(size, focal, ((direction, colour) for direction in outward))
 
 
 def small_method(folder: Path) -> Method:

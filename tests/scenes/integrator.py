@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from benchmarks.common.scenes import asymmetric_sky, discs, unit
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.reference.camera import look_at
@@ -22,32 +23,14 @@ COUNT = 24
 
 
 def raw_channels(count: int = COUNT, seed: int = 1) -> dict[str, np.ndarray]:
-    """Overlapping discs on a unit sphere, with every channel."""
-    rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(count, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    # The shortest rotation from +z to the normal, (n × …, 1 + n_z), with some noise.
-    rotation = np.stack([-normal[:, 1], normal[:, 0], 0 * normal[:, 0], 1 + normal[:, 2]], 1)
-    raw = {
-        "position": normal,
-        "rotation": rotation + 0.1 * rng.normal(size=(count, 4)),
-        "scale": np.log(rng.uniform(0.25, 0.5, (count, 2))),
-        "opacity": rng.uniform(-1, 1, (count, 1)),
-        "radiance_sh": 0.15 * rng.normal(size=(count, 12)),
-        "albedo": rng.normal(size=(count, 3)),
-        "metallic": rng.normal(size=(count, 1)),
-        "roughness": rng.normal(size=(count, 1)),
-        "indirect_sh": 0.15 * rng.normal(size=(count, 12)) + 0.5 * (np.arange(12) < 3),
-    }
+    """Overlapping discs on a unit sphere, with every attribute."""
+    raw = discs(count, seed, degree=1, opacity=1, sh=0.15, glow=0.15)
     return {name: values.astype(np.float32) for name, values in raw.items()}
 
 
 def sky(height: int = 32) -> np.ndarray:
-    """Radiance without symmetries, so smooth that lookups have no strong kinks between its texels."""
-    θ, φ = np.meshgrid(np.linspace(0, np.pi, height), np.arange(2 * height) * np.pi / height, indexing="ij")
-    x, y, z = np.sin(θ) * np.sin(φ), np.cos(θ), np.sin(θ) * np.cos(φ)
-    log = [0.8 * x - 0.3 * y + 0.5 * x * z, 0.6 * y + 0.4 * z - 0.5 * x * y, 0.7 * z - 0.2 * x + 0.6 * y * z]
-    return np.exp(np.stack(log, -1)).astype(np.float32)
+    """Radiance without symmetries."""
+    return asymmetric_sky(height).astype(np.float32)
 
 
 def sensor(**changes: Any) -> dict:
@@ -224,8 +207,7 @@ OTHER_OPTIONS: dict[str, Any] = {
 def scattered_discs(seed: int = 4, count: int = 30) -> dict[str, np.ndarray]:
     """Discs behind, beside and before the object of the plain case."""
     rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = unit(rng.normal(size=(count, 3)))
     raw = {
         "position": direction * rng.uniform(0.4, 2.0, (count, 1)),
         "rotation": rng.normal(size=(count, 4)),
