@@ -8,7 +8,7 @@ import io
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -107,16 +107,25 @@ def with_pixels(view: View, **changed: Any) -> View:
 
 
 def run_process(
-    *arguments: object, folder: Path = ROOT, package: Path = ROOT, environment: dict[str, str] | None = None
+    *arguments: object,
+    program: object = sys.executable,
+    folder: Path = ROOT,
+    package: Path = ROOT,
+    environment: Mapping[str, str | None] | None = None,
+    seconds: float = 300,
 ) -> subprocess.CompletedProcess[str]:
-    """Run Python with these arguments in a fresh process, which finds mi_refgs below `package`."""
+    """Run a program, by default Python, in a fresh process, where Python finds mi_refgs below `package`.
+
+    environment: variables that it has, or with None has not, unlike this process.
+    """
+    variables = {**os.environ, "PYTHONPATH": str(package), **(environment or {})}
     return subprocess.run(
-        [sys.executable, *map(str, arguments)],
+        [str(program), *map(str, arguments)],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(package)} | (environment or {}),
+        env={name: value for name, value in variables.items() if value is not None},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=seconds,
         check=False,
     )
 

@@ -8,14 +8,16 @@ from typing import Any
 
 import pytest
 
-from tests.benchmarks.benchmark_runs import run_benchmark
+from tests.helpers import run_process
 
 
 @pytest.fixture(scope="module")
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with its output."""
     output = tmp_path_factory.mktemp(request.module.BENCHMARK)
-    done = run_benchmark(request.module.BENCHMARK, "--small", "--quiet", "-o", output)
+    done = run_process(
+        "-W", "error", "-m", f"benchmarks.{request.module.BENCHMARK}", "--small", "--quiet", "-o", output
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     return output
 

@@ -12,7 +12,7 @@ from benchmarks.paper_tables import Figures, Place, place_of
 from mi_refgs.compare.table import Row, Scene, Statistic, Table
 from mi_refgs.errors import InputError
 from mi_refgs.methods import load, names
-from tests.benchmarks.benchmark_runs import run_benchmark
+from tests.helpers import run_process
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_paper_table_contains_our_figures() -> None:
 
 
 def test_command_prints_table_without_runs() -> None:
-    done = run_benchmark("paper_tables", "5")
+    done = run_process("-W", "error", "-m", "benchmarks.paper_tables", "5")
     assert (
         "NeRO (published)" in done.stdout
         and "29.73" in done.stdout

@@ -23,7 +23,7 @@ from benchmarks.splitsum import budget, measure, setup
 from mi_refgs.errors import InputError
 from mi_refgs.reference.shade import lobe_average, split_sum
 from mi_refgs.shade.light import lobe_matrices
-from tests.benchmarks.benchmark_runs import run_benchmark
+from tests.helpers import run_process
 
 BENCHMARK = "splitsum"
 Row = dict[str, Any]
@@ -333,6 +333,8 @@ def test_other_level_sets_are_filtered() -> None:
 
 
 def test_missing_light_is_refused(tmp_path: Path) -> None:
-    done = run_benchmark("splitsum", "--small", "--envmap", "nowhere.exr", "-o", tmp_path)
+    done = run_process(
+        "-W", "error", "-m", "benchmarks.splitsum", "--small", "--envmap", "nowhere.exr", "-o", tmp_path
+    )
     assert done.returncode == 2
     assert "nowhere.exr: light" in done.stderr

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 
-from tests.benchmarks.benchmark_runs import run_benchmark
+from tests.helpers import run_process
 
 
 def test_killed_fit_resumes() -> None:
     """Two SIGKILLs, one of them while a checkpoint is written, and a SIGTERM, at the moments of seed 1."""
-    done = run_benchmark("survival", "kill", "--times", 2, "--seed", 1)
+    done = run_process("-W", "error", "-m", "benchmarks.survival", "kill", "--times", 2, "--seed", 1)
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
     result = json.loads(done.stdout)
     assert result["resumed"] == 2 and result["most_iterations_lost"] <= result["checkpoint_every"]

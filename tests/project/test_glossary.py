@@ -9,7 +9,6 @@ from __future__ import annotations
 import ast
 import io
 import re
-import sys
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
@@ -79,30 +78,18 @@ PROPER_USES: dict[str, str] = {
 }
 """Uses that are meant → why."""
 
-NOT_CLEAN_YET: set[str] = set()
-"""Folders and pages that may still have such words: none."""
-
-
-def folder_of(path: Path) -> str:
-    """Name of what is cleaned at once: a folder of the package, a folder of tests, a page, a file."""
-    parts = path.relative_to(ROOT).parts
-    if parts[0] in ("mi_refgs", "tests", "benchmarks") and len(parts) > 2:
-        return "/".join(parts[:2])
-    return "/".join(parts)
-
 
 def files() -> list[Path]:
+    """Python files, methods and pages, but for this file and those that quote or list others' words."""
     found = [
         path
-        for folder in ("mi_refgs", "benchmarks", "docs", "scenes", "tests")
-        for path in (ROOT / folder).rglob("*.py")
+        for folder in ("mi_refgs", "benchmarks", "docs", "scenes", "tests", "variants")
+        for ending in ("py", "toml", "md")
+        for path in (ROOT / folder).rglob(f"*.{ending}")
+        if not (ending == "toml" and folder != "variants")
     ]
-    found += [*(ROOT / "variants").glob("*.toml"), *ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-    found += (ROOT / "benchmarks").rglob("*.md")
     own = Path(__file__).resolve()
-    return sorted(
-        path for path in found if path.resolve() != own and path.name not in ("CHANGELOG.md", "LICENSE.md")
-    )
+    return sorted(path for path in [*found, *ROOT.glob("*.md")] if path not in (own, ROOT / "CHANGELOG.md"))
 
 
 def prose(path: Path) -> Iterator[tuple[int, str]]:
@@ -154,10 +141,8 @@ def findings(path: Path) -> list[str]:
 # ---------- The words ----------
 
 
-def test_folders_do_not_use_other_words() -> None:
-    """`python -m tests.project.test_glossary FOLDER …` lists the words of folders that are not clean yet."""
-    paths = [path for path in files() if folder_of(path) not in NOT_CLEAN_YET]
-    found = [finding for path in paths for finding in findings(path)]
+def test_files_do_not_use_other_words() -> None:
+    found = [finding for path in files() for finding in findings(path)]
     assert not found, "\n".join(found)
 
 
@@ -194,8 +179,3 @@ def test_code_of_pages_is_not_prose(tmp_path: Path) -> None:
     assert findings(path) == []
     path.write_text("# Pictures\n")
     assert [line.partition(": ")[0].rpartition(":")[2] for line in findings(path)] == ["1"]
-
-
-if __name__ == "__main__":
-    asked = sys.argv[1:] or sorted(NOT_CLEAN_YET)
-    print("\n".join(line for path in files() if folder_of(path) in asked for line in findings(path)))

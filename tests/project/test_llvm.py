@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from mi_refgs import llvm
+from tests.helpers import run_process
 
 SYSTEM = Path("/usr/lib/x86_64-linux-gnu")
 OLD = [SYSTEM / "libLLVM-14.so.1", SYSTEM / "libLLVM-15.so.1", SYSTEM / "libLLVM-16.so.1"]
@@ -25,18 +24,9 @@ print("rendered with", dr.detail.llvm_version()[0])
 """
 
 
-def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run `code` in a fresh Python in which nobody chose a libLLVM but through `environment`."""
-    inherited = {key: value for key, value in os.environ.items() if key != llvm.ENVIRONMENT_VARIABLE}
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env=inherited | environment,
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+def run(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a fresh Python in which nobody chose a libLLVM but through `environment`."""
+    return run_process(*arguments, environment={llvm.ENVIRONMENT_VARIABLE: None, **environment})
 
 
 def last_line(text: str) -> str:
@@ -137,7 +127,7 @@ def test_search_folders_are_of_this_architecture() -> None:
 
 
 def test_import_chooses_a_usable_library(usable: Path) -> None:
-    done = run("import mi_refgs" + RENDER)
+    done = run("-c", "import mi_refgs" + RENDER)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout.split()[-1]) >= llvm.MINIMUM_MAJOR
 
@@ -146,7 +136,7 @@ def test_usable_choice_of_user_is_kept(usable: Path, tmp_path: Path) -> None:
     mine = tmp_path / "libmine.so"  # a name without a version: only the library can tell
     mine.symlink_to(usable)
     code = "import os, mi_refgs\nprint(os.environ['DRJIT_LIBLLVM_PATH'])"
-    done = run(code, DRJIT_LIBLLVM_PATH=str(mine))
+    done = run("-c", code, DRJIT_LIBLLVM_PATH=str(mine))
     assert done.stdout.strip() == str(mine), done.stderr
 
 
@@ -154,7 +144,7 @@ def test_usable_choice_of_user_is_kept(usable: Path, tmp_path: Path) -> None:
 def test_old_choice_of_user_is_refused(old: Path) -> None:
     if not old.exists():
         pytest.skip(f"{old.name} is not installed")
-    done = run("import mi_refgs" + RENDER, DRJIT_LIBLLVM_PATH=str(old))
+    done = run("-c", "import mi_refgs" + RENDER, DRJIT_LIBLLVM_PATH=str(old))
     assert done.returncode == 1
     assert last_line(done.stderr).startswith("ImportError")
     version = llvm.named_version(old)
@@ -164,7 +154,7 @@ def test_old_choice_of_user_is_refused(old: Path) -> None:
 
 
 def test_missing_choice_of_user_is_refused() -> None:
-    done = run("import mi_refgs" + RENDER, DRJIT_LIBLLVM_PATH="/none/libLLVM.so")
+    done = run("-c", "import mi_refgs" + RENDER, DRJIT_LIBLLVM_PATH="/none/libLLVM.so")
     assert done.returncode == 1
     assert "RuntimeWarning: DRJIT_LIBLLVM_PATH" in done.stderr
     assert "/none/libLLVM.so does not exist" in done.stderr
@@ -176,7 +166,7 @@ def test_loaded_old_library_is_refused(old: Path) -> None:
     if not old.exists():
         pytest.skip(f"{old.name} is not installed")
     first = f"import os\nos.environ['DRJIT_LIBLLVM_PATH'] = '{old}'\nimport mitsuba\n"
-    done = run(first + "del os.environ['DRJIT_LIBLLVM_PATH']\nimport mi_refgs" + RENDER)
+    done = run("-c", first + "del os.environ['DRJIT_LIBLLVM_PATH']\nimport mi_refgs" + RENDER)
     assert done.returncode == 1
     assert "import mi_refgs before mitsuba" in done.stderr
 
@@ -207,7 +197,7 @@ except ImportError:
     print("llvm is refused")
 """
     )
-    done = run(code)
+    done = run("-c", code)
     assert done.stdout.splitlines()[-1] == "llvm is refused", done.stderr
     assert "RuntimeWarning: Dr.Jit found no usable libLLVM" in done.stderr and llvm.REMEDY in done.stderr
 
@@ -221,7 +211,7 @@ dr.has_backend = lambda backend: backend == dr.JitBackend.CUDA or real(backend)
 import mi_refgs
 """
     )
-    done = run(code)
+    done = run("-c", code)
     assert done.returncode == 0 and "Warning" not in done.stderr
 
 
@@ -234,7 +224,7 @@ def test_old_library_with_cuda_is_refused_with_the_variant() -> None:
         "import drjit as dr\nreal = dr.has_backend\ndr.has_backend = lambda backend: True\nimport mi_refgs"
         + RENDER
     )
-    done = run(code, DRJIT_LIBLLVM_PATH=str(old))
+    done = run("-c", code, DRJIT_LIBLLVM_PATH=str(old))
     assert done.returncode == 1
     assert "is LLVM 15" in last_line(done.stderr)
 
@@ -242,23 +232,12 @@ def test_old_library_with_cuda_is_refused_with_the_variant() -> None:
 # ---------- As a script, before anything is installed ----------
 
 
-def run_script(**environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-I", "-S", llvm.__file__],
-        env={"PATH": os.environ["PATH"]} | environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-
-
 def test_script_prints_the_library(usable: Path) -> None:
-    done = run_script()
+    done = run("-I", "-S", llvm.__file__)
     assert (done.returncode, done.stdout.strip()) == (0, str(usable))
 
 
 def test_script_prints_the_problem() -> None:
-    done = run_script(DRJIT_LIBLLVM_PATH="/none/libLLVM.so")
+    done = run("-I", "-S", llvm.__file__, DRJIT_LIBLLVM_PATH="/none/libLLVM.so")
     assert done.returncode == 1
     assert "does not exist" in done.stdout

@@ -5,16 +5,16 @@ from __future__ import annotations
 import configparser
 import importlib.metadata
 import json
-import os
 import re
 import shutil
-import subprocess
 import sys
 import sysconfig
 import tarfile
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +22,7 @@ import mi_refgs
 from mi_refgs.cli.doctor import EXTRAS
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
-from tests.helpers import ROOT, imported_packages
+from tests.helpers import ROOT, imported_packages, run_process
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
@@ -46,8 +46,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         elif path.is_file() and path.name not in LEFT_OUT:
             shutil.copy(path, source)
     target = tmp_path_factory.mktemp("dist")
-    command = [sys.executable, "-m", "build", "--no-isolation", "-o", str(target), "."]
-    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=300, check=False)
+    done = run_process("-m", "build", "--no-isolation", "-o", target, ".", folder=source, package=source)
     assert done.returncode == 0, done.stdout + done.stderr
     return target
 
@@ -71,21 +70,13 @@ def environment(
     """A clean environment with the wheel or the sdist installed by pip; what they depend on is this one's."""
     [package] = built.glob(request.param)
     folder = tmp_path_factory.mktemp("environment")
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True, timeout=120)
+    venv.create(folder, symlinks=True)
     here = Path(sysconfig.get_path("purelib"))
     backend = tmp_path_factory.mktemp("backend")  # setuptools alone: pip must see no other mi_refgs
     for path in [here / "setuptools", here / "_distutils_hack", *here.glob("setuptools-*.dist-info")]:
         (backend / path.name).symlink_to(path)
     options = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "-qq"]
-    command = [sys.executable, "-m", "pip", "--python", str(folder), "install", *options, str(package)]
-    done = subprocess.run(
-        command,
-        env=os.environ | {"PYTHONPATH": str(backend)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    done = run_process("-m", "pip", "--python", folder, "install", *options, package, package=backend)
     assert done.returncode == 0, done.stdout + done.stderr
     [site] = folder.glob("lib/python*/site-packages")
     others = {str(here), sysconfig.get_path("platlib")}
@@ -95,16 +86,9 @@ def environment(
 
 def run_in(environment: Path, *command: str) -> str:
     """Standard output of a command of an environment, started away from the checkout."""
-    clean = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    done = subprocess.run(
-        [str(environment / "bin" / command[0]), *command[1:]],
-        cwd=environment,
-        env=clean,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    program, *arguments = command
+    options: dict[str, Any] = {"folder": environment, "environment": {"PYTHONPATH": None}}
+    done = run_process(*arguments, program=environment / "bin" / program, **options)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pytest
 import yaml
 
 import mi_refgs
-from tests.helpers import ROOT
+from tests.helpers import ROOT, run_process
 
 TEMPLATES = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
 
@@ -65,8 +64,7 @@ def test_templates_ask_for_the_installation(path: Path) -> None:
 
 def test_hooks_are_valid_and_their_tools_here() -> None:
     config = ROOT / ".pre-commit-config.yaml"
-    command = [sys.executable, "-m", "pre_commit", "validate-config", str(config)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = run_process("-m", "pre_commit", "validate-config", config)
     assert done.returncode == 0, done.stdout
     tools = f"{Path(sys.executable).parent}:/usr/bin:/bin"
     for repository in read(config)["repos"]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.helpers import ROOT
+from tests.helpers import ROOT, run_process
 
 FOLDER = ROOT / "docs" / "tutorials"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -41,13 +39,7 @@ def test_there_are_four_tutorials() -> None:
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_tutorial_runs(path: Path) -> None:
     """In its own process and folder; every one asserts what it shows."""
-    done = subprocess.run(
-        [sys.executable, FOLDER / "run.py", "--check", path],
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
+    done = run_process(FOLDER / "run.py", "--check", path, seconds=900)
     assert done.returncode == 0, done.stderr[-3000:]
     seconds = re.search(r": (\d+) s of CPU", done.stderr)
     assert seconds and int(seconds[1]) < 2 * MOST_SECONDS
