@@ -17,7 +17,7 @@ from mi_refgs.errors import InputError as InputError
 from mi_refgs.evaluation.evaluate import evaluate as evaluate
 from mi_refgs.fitting.objective import Loss as Loss
 from mi_refgs.fitting.objective import LossInputs as LossInputs
-from mi_refgs.fitting.progress import Progress as Progress
+from mi_refgs.fitting.runner import Progress as Progress
 from mi_refgs.fitting.train import Trainer as Trainer
 from mi_refgs.formats.format import Format as Format
 from mi_refgs.methods.method import Method as Method

@@ -69,7 +69,7 @@ def _step(count: int, size: int) -> dict[str, Any]:
     trainer.extract_mesh()
     before = _start()
     times = []
-    trainer.iteration = method.stages()[-1][1].until - STEPS - 1
+    trainer.fit.iteration = method.stages()[-1][1].until - STEPS - 1
     for _ in range(STEPS + 1):
         begin = time.perf_counter()
         trainer.step()

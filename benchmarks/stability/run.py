@@ -69,8 +69,8 @@ def fit(name: str) -> dict[str, Any]:
         data = replace(trainer.data, views=views, is_linear_radiance=views[0].is_linear_radiance)
         trainer.adopt(FitSetup(method, data), trainer.state())
     if "light" in case:
-        raw = trainer.params[LIGHT].numpy()
-        trainer.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))
+        raw = trainer.fit.params[LIGHT].numpy()
+        trainer.fit.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))
         trainer.fit.optimiser.reset(LIGHT)
     losses = []
     for _, stage in method.stages():
@@ -79,8 +79,8 @@ def fit(name: str) -> dict[str, Any]:
         for _ in range(STEPS):
             trainer.step()
             losses.append(float(trainer.loss[0]))
-        trainer.iteration = stage.until  # the next stage
-    values = [*(x.numpy() for x in trainer.params.values()), np.array(losses)]
+        trainer.fit.iteration = stage.until  # the next stage
+    values = [*(x.numpy() for x in trainer.fit.params.values()), np.array(losses)]
     return {
         "name": name,
         "steps": len(losses),

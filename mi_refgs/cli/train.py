@@ -86,7 +86,7 @@ class Train:
             "variant": trainer.method.name,  # name of this key in version 0.1
             "preset": trainer.method.preset,
             "iterations": trainer.iteration,
-            "seconds": round(trainer.seconds, 3),
+            "seconds": round(trainer.fit.seconds, 3),
             "total_seconds": round(taken, 3),
             "estimated_seconds": None if expected is None else round(expected.seconds, 3),
             "surfels": trainer.surfels.count,
@@ -96,11 +96,11 @@ class Train:
             "" if expected is None else f" ({minutes(taken)} in all, estimate {minutes(expected.seconds)})"
         )
         text = (
-            f"{self.output}: {trainer.iteration} iterations in {trainer.seconds:.0f} s{total}, "
+            f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s{total}, "
             f"{trainer.surfels.count} surfels; next: refgs eval {self.output}"
         )
-        if trainer.decisions:
+        if trainer.fit.decisions:
             data["terms"] = list(trainer.method.components)  # name of this key in version 0.1
-            data["decisions"] = trainer.decisions
-            text = f"{table(trainer.decisions)}\n{text}"
+            data["decisions"] = trainer.fit.decisions
+            text = f"{table(trainer.fit.decisions)}\n{text}"
         return Result(data, text)

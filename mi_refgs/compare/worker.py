@@ -109,7 +109,7 @@ class Curve:
             psnr(RenderedView.of(trainer.view(view.camera()), self.data, view).image, view.load().displayed)
             for view in self.views
         ]
-        line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3)}
+        line = {"iteration": trainer.iteration, "seconds": round(trainer.fit.seconds, 3)}
         self.run.log(line | {"psnr": round(sum(values) / len(values), 4)}, CURVE)
 
 

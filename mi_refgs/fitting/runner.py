@@ -15,8 +15,7 @@ from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.objective import require_losses
-from mi_refgs.fitting.plan import planned
-from mi_refgs.fitting.progress import Progress
+from mi_refgs.fitting.plan import Estimate, planned
 from mi_refgs.fitting.select import DECISIONS, install_trials, with_components
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
@@ -45,13 +44,36 @@ class Choice:
     their background too. A `Method` is fitted as it is."""
     preset: str | None = None  # "standard" by default
     settings: Settings = ()
-    minutes: float | None = None  # time that a new fit may take
+    minutes: float | None = None  # time that the fit may take; a resumed run has to have its size of images
 
     def __post_init__(self) -> None:
         if isinstance(self.method, Method) and (self.preset or self.settings):
             raise InputError("method: preset, settings: a Method has its own; change it, or name one")
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise InputError(f"--minutes: {self.minutes} is no time; give more than 0")
+
+
+class Progress:
+    """A listener to a fit that displays nothing; subclasses override methods."""
+
+    trainer: Trainer | None = None  # of the fit, also after its end
+    expected: Estimate | None = None  # of a new fit
+
+    def say(self, message: str) -> None:
+        """Is called with messages about the fit and its decisions."""
+
+    def warn(self, message: str) -> None:
+        """Is called with warnings about the data or the fit."""
+
+    def begin(self, trainer: Trainer) -> None:
+        """Is called before the first step, also of a finished run. Overrides call this one."""
+        self.trainer = trainer
+
+    def step(self, trainer: Trainer) -> None:
+        """Is called after each step. `trainer.statistics()` waits for the device, `.view(camera)` renders."""
+
+    def end(self) -> None:
+        """Is called after the last step, and when the fit is interrupted or fails."""
 
 
 def fit(
@@ -65,43 +87,50 @@ def fit(
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
     TerminatedError with a message that says how to continue.
     """
-    run, method, minutes = Run(output), choice.method, choice.minutes
+    run = Run(output)
     resumed = resume and run.exists()
-
-    # The method, with the size of images decided.
-    if resumed:
-        chosen = run.method()
-        _require_same(run, chosen, choice)
-        if minutes is not None:
-            free = replace(chosen, data=replace(chosen.data, downscale=None))
-            _require(run, "--minutes", chosen, planned(free, data, 60 * minutes)[0])
-    else:
+    if not resumed:
         run.require_none()
-        if not isinstance(method, Method):
-            method = method or default_method(data, choice.preset, choice.settings, progress)
-            method = load_method(method, choice.preset, choice.settings)
-        require_losses(method)
-        if minutes is not None and method.data.downscale is not None:
-            raise InputError(
-                f"--minutes: data.downscale={method.data.downscale} decides the size of images; drop either"
-            )
-        chosen, progress.expected = planned(method, data, minutes and 60 * minutes, progress.say)
-        if progress.expected is not None:
-            progress.say(progress.expected.sentence(chosen.iterations))
-
-    # The data.
-    views = read_views(chosen, data, "train", truth=False)
+    method = _resumed_method(run, data, choice) if resumed else _new_method(data, choice, progress)
+    views = read_views(method, data, "train", truth=False)
     if note := few_views(len(views.views)):
         progress.warn(f"{views.path}: {note}")
-    if not views.has_alpha and (chosen.surroundings is None or views.region is None):
+    if not views.has_alpha and (method.surroundings is None or views.region is None):
         progress.warn(
             f"{views.path}: images without alpha: surfels start at random, and model the background too"
         )
-
     with run.alone():
         if not resumed:  # asked again: another process may have begun a run while the data was read
             run.require_none()
-        return _fit(chosen, views, run, progress, find_points)
+        return _fit(method, views, run, progress, find_points)
+
+
+def _new_method(data: Path, choice: Choice, progress: Progress) -> Method:
+    """The method of a new fit, with the size of images decided."""
+    if isinstance(choice.method, Method):
+        wanted = choice.method
+    else:
+        name = choice.method or default_method(data, choice.preset, choice.settings, progress.say)
+        wanted = load_method(name, choice.preset, choice.settings)
+    require_losses(wanted)
+    if choice.minutes is not None and wanted.data.downscale is not None:
+        raise InputError(
+            f"--minutes: data.downscale={wanted.data.downscale} decides the size of images; drop either"
+        )
+    method, progress.expected = planned(wanted, data, choice.minutes and 60 * choice.minutes, progress.say)
+    if progress.expected is not None:
+        progress.say(progress.expected.sentence(method.iterations))
+    return method
+
+
+def _resumed_method(run: Run, data: Path, choice: Choice) -> Method:
+    """The method of a run; raises InputError if the choice would have made another one."""
+    method = run.method()
+    _require_same(run, method, choice)
+    if choice.minutes is not None:
+        free = replace(method, data=replace(method.data, downscale=None))
+        _require(run, "--minutes", method, planned(free, data, 60 * choice.minutes)[0])
+    return method
 
 
 def _fit(
@@ -193,9 +222,9 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     """
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
         run.save_checkpoint(trainer.iteration, trainer.state())
-    if trainer.decisions:
+    if trainer.fit.decisions:
         run.write_method(trainer.method)
-        run.write_json(DECISIONS, trainer.decisions)
+        run.write_json(DECISIONS, trainer.fit.decisions)
     if (gains := exposure.record(trainer.setup, trainer.fit)) is not None:
         run.write_json(exposure.EXPOSURE_FILE, gains)
     warning, first = None, trainer.data.views[0]
@@ -214,7 +243,7 @@ def load_method(method: str | None, preset: str | None, settings: Settings = ())
 
 
 def default_method(
-    data: Path, preset: str | None = None, settings: Settings = (), progress: Progress | None = None
+    data: Path, preset: str | None = None, settings: Settings = (), say: Tell = lambda _: None
 ) -> str | None:
     """The method for images without alpha, if the data set has such; None for the full one."""
     # Settings of anything else may be those of the other method.
@@ -223,8 +252,7 @@ def default_method(
     if views.has_alpha or views.region is None:
         return None
     method = methods.for_purpose(OPEN_PURPOSE)
-    if progress is not None:
-        progress.say(f"{data}: images without alpha: --method {method} fits their background too")
+    say(f"{data}: images without alpha: --method {method} fits their background too")
     return method
 
 

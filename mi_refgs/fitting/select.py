@@ -47,7 +47,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
         elif len(old[LIGHT]) == height:
             wanted[LIGHT] = old[LIGHT]
         else:
-            radiance = EnvironmentLight(trainer.params[LIGHT]).radiance().numpy()
+            radiance = EnvironmentLight(trainer.fit.params[LIGHT]).radiance().numpy()
             wanted[LIGHT] = EnvironmentLight.from_radiance(resample(radiance, height)).raw.numpy()
     dropped = (PARAMS, OPTIMISER) if method.mesh is not None else (PARAMS, OPTIMISER, MESH)
     new = {name: value for name, value in state.items() if not name.startswith(dropped)}
@@ -126,7 +126,7 @@ def install_trials(trainer: Trainer, tell: Callable[[str], None] = lambda _: Non
         while names := _undecided(trainer, select):
             if trainer.iteration < select.component[names[0]].after:
                 return
-            seconds, begin = trainer.seconds, time.perf_counter()
+            seconds, begin = trainer.fit.seconds, time.perf_counter()
             decision = _try(trainer, names[0], select, judges)
             tell(sentence(decision))
             # All that a trial took counts: the loser's steps and the validation images.
@@ -182,7 +182,7 @@ def _run(trainer: Trainer, steps: int, judges: Dataset, release: Callable[[], No
         dr.sync_thread()
         seconds.append(time.process_time() - begin)
         release()
-    entries = sum(int(np.prod(tensor.shape)) for tensor in trainer.params.values())
+    entries = sum(int(np.prod(tensor.shape)) for tensor in trainer.fit.params.values())
     # The first half may compile kernels.
     return ComponentTrial(
         validation_psnr(trainer, judges),

@@ -27,7 +27,7 @@ from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import Schedule, SharedPrefilter
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method
+from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexColours, VertexSurfels
 from mi_refgs.occlusion.visibility import Occluder
@@ -228,9 +228,8 @@ class FitState:
         """The environment map, also attached."""
         return light_of(self.params)
 
-    def shading(self, method: Method, iteration: int | None = None) -> Shading:
-        """Shading options of the present (or another) iteration."""
-        _, stage = method.stage_at(iteration or max(self.iteration, 1))
+    def shading(self, stage: Stage) -> Shading:
+        """Shading options of a stage with the present occluder."""
         return Shading.resolve(stage.shading, not self.occluder.empty)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -269,7 +268,8 @@ class FitState:
         if "exposure" in state:
             made.exposure = json.loads(state["exposure"].tobytes())
         made.occluder = _occluder_of(state)
-        made.prefilter.restore(made.light, made.shading(setup.method), state)
+        _, stage = setup.method.stage_at(max(made.iteration, 1))
+        made.prefilter.restore(made.light, made.shading(stage), state)
         return made
 
 

@@ -39,7 +39,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Float, TensorXf
+from mi_refgs.types import Float
 
 
 class Trainer:
@@ -125,25 +125,6 @@ class Trainer:
         """Steps done."""
         return self.fit.iteration
 
-    @iteration.setter
-    def iteration(self, value: int) -> None:
-        self.fit.iteration = value
-
-    @property
-    def seconds(self) -> float:
-        """Time spent in steps and trials."""
-        return self.fit.seconds
-
-    @property
-    def decisions(self) -> list[dict[str, Any]]:
-        """Decisions about components of the method."""
-        return self.fit.decisions
-
-    @property
-    def params(self) -> dict[str, TensorXf]:
-        """The parameters by name, raw."""
-        return self.fit.params
-
     @property
     def surfels(self) -> Surfels:
         """The object, attached to the leaves that the optimiser owns."""
@@ -161,7 +142,7 @@ class Trainer:
 
     def shading(self, iteration: int | None = None) -> Shading:
         """Shading options of the present (or another) iteration."""
-        return self.fit.shading(self.method, iteration)
+        return self.fit.shading(self.method.stage_at(iteration or max(self.iteration, 1))[1])
 
     def view(self, camera: Camera, aovs: bool = True, object_only: bool = False) -> Frame:
         """Render the present state, without derivatives; `object_only`: without the background."""
@@ -244,13 +225,13 @@ class Trainer:
         if iteration > 1 and stage.restart and self.method.stage_at(iteration - 1)[0] != name:
             control.restart(stage.restart, iteration)
         self._gradient_step(iteration, stage, control)
-        self.iteration = iteration
+        self.fit.iteration = iteration
         if control.changes_rows(iteration):
             self.check()
         control.refine(iteration)
         self._decide_exposure()
         mesh = self.method.mesh
-        if mesh is not None and self._shading(stage).traceable and mesh.extract.due(iteration):
+        if mesh is not None and self.fit.shading(stage).traceable and mesh.extract.due(iteration):
             self.extract_mesh()
 
     def extract_mesh(self, cameras: Sequence[Camera] | None = None) -> Mesh:
@@ -279,9 +260,9 @@ class Trainer:
         begin = max((x.until for _, x in setup.method.stages() if x.until < end), default=0)
         again = min(begin + 1, end - 1)  # the first iteration of a stage may reset materials
         if first is not None:
-            self.iteration = first
+            self.fit.iteration = first
         elif not again <= before < end:
-            self.iteration = max(again, end - 100)
+            self.fit.iteration = max(again, end - 100)
         light = setup.method.light
         if light is not None and not share_light:
             light = replace(light, every=1)
@@ -291,12 +272,12 @@ class Trainer:
 
         def prepare() -> None:
             if self.iteration >= end:
-                self.iteration = again
+                self.fit.iteration = again
 
         try:
             yield prepare
         finally:
-            self.setup, self.iteration = setup, before
+            self.setup, self.fit.iteration = setup, before
 
     # ---------------- one step ----------------
 
@@ -312,7 +293,7 @@ class Trainer:
         dr.enable_grad(offset)
 
         # Render the view, and differentiate its loss.
-        shading = self._shading(stage)
+        shading = self.fit.shading(stage)
         update_missing_caches(fit.occluder, surfels, fit.light, shading)
         light = fit.prefilter.light(fit.light, shading)
         scene = SurfelScene(surfels, shading, light, fit.occluder, around)
@@ -337,9 +318,6 @@ class Trainer:
         fit.optimiser.step(iteration - 1, self.loss)
         control.wander(iteration)
 
-    def _shading(self, stage: Stage) -> Shading:
-        return Shading.resolve(stage.shading, not self.fit.occluder.empty)
-
     def _decide_exposure(self) -> None:
         """Decide about gains, if that is due, and continue with them or without."""
         if not exposure.is_due(self.setup, self.fit):
@@ -351,7 +329,7 @@ class Trainer:
         decision = exposure.decide(self.setup, self.iteration, shown)
         self.fit.exposure = decision
         self.tell(exposure.sentence(decision))
-        if decision["gains"] or GAIN in self.params:
+        if decision["gains"] or GAIN in self.fit.params:
             log = None
             if decision["gains"]:
                 log = np.log(

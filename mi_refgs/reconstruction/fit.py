@@ -14,7 +14,7 @@ from mi_refgs.capture.triangulate import with_points
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.fitting import runner
-from mi_refgs.fitting.progress import Progress
+from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import write_png
 from mi_refgs.kernels.device import require_supported_variant

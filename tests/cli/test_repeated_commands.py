@@ -25,7 +25,7 @@ from mi_refgs.compare import execute, jobs
 from mi_refgs.compare.jobs import Job
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import cost_model, plan
-from mi_refgs.fitting.progress import Progress
+from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import BusyError
 from mi_refgs.io.resources import resource_dir

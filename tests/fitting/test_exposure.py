@@ -152,7 +152,7 @@ def fit(method: Method, data: Dataset) -> Trainer:
 
 def decide(trainer: Trainer, iteration: int) -> None:
     """Decide about gains as a step does that ends with this iteration."""
-    trainer.iteration = iteration
+    trainer.fit.iteration = iteration
     trainer._decide_exposure()
 
 
@@ -180,15 +180,15 @@ def test_gains_are_switched_on_where_images_have_them(
     decide(trainer, DECIDED - 1)
     assert trainer.fit.exposure is None
     decide(trainer, DECIDED)
-    decision, gains = trainer.fit.exposure, exposure.gains_of(trainer.params)
+    decision, gains = trainer.fit.exposure, exposure.gains_of(trainer.fit.params)
     assert decision is not None and decision["gains"] and decision["iteration"] == DECIDED
     assert decision["psnr_gain"] > decision["psnr"] + 10 and len(said) == 1 and "gains stay" in said[0]
     assert gains is not None
     np.testing.assert_allclose(np.log(gains), log - log.mean(axis=0), atol=5e-3)
     record = exposure.record(trainer.setup, trainer.fit)
     assert record is not None and record["gain"]["3"] == gains[3].round(5).tolist()
-    trainer.params[GAIN] = trainer.params[GAIN] + 0.3  # what all have in common is the scene's
-    used = exposure.log_gain(trainer.params, 3)
+    trainer.fit.params[GAIN] = trainer.fit.params[GAIN] + 0.3  # what all have in common is the scene's
+    used = exposure.log_gain(trainer.fit.params, 3)
     assert used is not None
     np.testing.assert_allclose([float(value[0]) for value in used], np.log(gains[3]), atol=1e-6)
     decide(trainer, DECIDED + 1)
@@ -215,14 +215,14 @@ def test_rejected_gains_leave_fit_unchanged(method: Method, one_thread: None) ->
     assert trainer.fit.exposure is not None and not trainer.fit.exposure["gains"]
     assert without.fit.exposure is None
     found, expected = trainer.state(), without.state()
-    assert found.keys() - expected.keys() == {"exposure"} and GAIN not in trainer.params
+    assert found.keys() - expected.keys() == {"exposure"} and GAIN not in trainer.fit.params
     for name in expected.keys() - {"seconds"}:
         assert np.array_equal(found[name], expected[name]), name
     choices: list[tuple[Any, bool]] = [("off", False), ("on", True)]
     for gains, there in choices:
         chosen = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains, after=2)), ball())
         decide(chosen, method.iterations)
-        assert (chosen.fit.exposure is not None) == (GAIN in chosen.params) == there
+        assert (chosen.fit.exposure is not None) == (GAIN in chosen.fit.params) == there
 
 
 @pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED + 3])
@@ -268,10 +268,10 @@ def test_warm_step_with_gains_compiles_nothing(method: Method) -> None:
     assert dr.detail.launch_stats()[2] == misses
     for _ in range(2):
         trainer.fit.optimiser.reset(GAIN)
-        before = trainer.params[GAIN].numpy()
+        before = trainer.fit.params[GAIN].numpy()
         trainer.step()
         index = trainer.setup.schedule.view(trainer.iteration)
-        moved = np.flatnonzero(np.any(trainer.params[GAIN].numpy() != before, axis=1))
+        moved = np.flatnonzero(np.any(trainer.fit.params[GAIN].numpy() != before, axis=1))
         assert moved.tolist() == [index]
 
 
@@ -304,9 +304,9 @@ def test_exif_data_tell_exposure(tmp_path: Path, method: Method) -> None:
     assert gains is not None
     np.testing.assert_allclose(gains[:, 1], np.log([1, 2, 0.5, 0.25]) + np.log(2) / 2, atol=1e-5)
     trainer = Trainer(method, dataclasses.replace(data, views=tuple(known)))
-    np.testing.assert_array_equal(trainer.params[GAIN].numpy(), gains)
+    np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), gains)
     trainer.step()  # gains wait for the decision
-    np.testing.assert_array_equal(trainer.params[GAIN].numpy(), gains)
+    np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), gains)
     alike = tuple(dataclasses.replace(view, exposure=log[0]) for view in known)
     assert exif_gains(dataclasses.replace(data, views=alike)) is None
     assert exif_gains(dataclasses.replace(data, views=(*known[:-1], data.views[-1]))) is None

@@ -65,7 +65,7 @@ def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
     def look(state: Trainer) -> None:
         if state.iteration == failed[0]:
             # Nothing of the step has been applied.
-            assert all(np.all(np.isfinite(tensor.numpy())) for tensor in state.params.values())
+            assert all(np.all(np.isfinite(tensor.numpy())) for tensor in state.fit.params.values())
             monkeypatch.undo()
 
     trainer.train(look)
@@ -122,9 +122,9 @@ def test_fit_in_which_every_step_fails_ends_with_one_sentence(
 def test_light_that_is_not_finite_ends_fit_with_one_sentence(method: Method, tmp_path: Path) -> None:
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
-    light = np.array(trainer.params["light"].numpy())
+    light = np.array(trainer.fit.params["light"].numpy())
     light[3, 4, 1] = np.nan
-    trainer.params["light"] = mi.TensorXf(light)
+    trainer.fit.params["light"] = mi.TensorXf(light)
     with pytest.raises(InputError, match="light: a texel is not finite or too large; "):
         trainer.train()
     assert not run.checkpoints()

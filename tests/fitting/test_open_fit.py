@@ -21,7 +21,6 @@ from mi_refgs.fitting.runner import begin, default_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
-from mi_refgs.reconstruction.fit import ProgressBar
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
@@ -206,19 +205,15 @@ def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> N
 
 
 def test_method_for_photographs_is_default_without_alpha(
-    data: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert default_method(data.path, progress=ProgressBar()) == "photographs"
-    assert "without alpha" in capsys.readouterr().err
-    assert default_method(write_data(tmp_path, views=3, truth=False)) is None
-    assert capsys.readouterr().err == ""
-
-
-def test_default_method_is_chosen_without_decoding_images(
-    data: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    """It is chosen without decoding an image."""
+    said: list[str] = []
+    small = write_data(tmp_path, views=3, truth=False)
     monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("an image was decoded"))
-    assert default_method(data.path) == "photographs"
+    assert default_method(data.path, say=said.append) == "photographs"
+    assert "without alpha" in said.pop()
+    assert default_method(small, say=said.append) is None and not said
 
 
 @pytest.mark.parametrize(

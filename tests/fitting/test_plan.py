@@ -128,7 +128,7 @@ class Machine:
     def step(self, trainer: Trainer) -> None:
         """Take 1 + P seconds, later 2 + P; each seventh step is disturbed."""
         self.steps += 1
-        trainer.iteration += 1
+        trainer.fit.iteration += 1
         view = trainer.data.views[0]
         late = trainer.method.stage_at(trainer.iteration)[0] == "deferred"
         self.work(1 + late + view.width * view.height + 5 * (self.steps % 7 == 0))

@@ -116,14 +116,14 @@ def test_components_are_kept_if_gain_exceeds_cost(
     """Degree 1 gains too little; the two others are kept. Validation views are fitted at the end only."""
     seen = judged(monkeypatch, [20.01, 20.0, 25.0, 20.0, 27.0, 25.0])
     trainer = fitted(variant, views, tmp_path / "run")
-    assert [(row["component"], row["iteration"], row["stays"]) for row in trainer.decisions] == [
+    assert [(row["component"], row["iteration"], row["stays"]) for row in trainer.fit.decisions] == [
         ("degree", 2, False),
         ("specular", 5, True),
         ("interreflection", 8, True),
     ]
     assert seen == [6] * 6 and len(trainer.data.views) == 9 and trainer.iteration == 12
     assert trainer.method.components == ("specular", "interreflection")
-    assert {*trainer.params} >= {LIGHT, "indirect_sh"} and not trainer.fit.occluder.empty
+    assert {*trainer.fit.params} >= {LIGHT, "indirect_sh"} and not trainer.fit.occluder.empty
     assert trainer.surfels.sh_degree() == 0
 
 
@@ -132,10 +132,10 @@ def test_component_without_its_requirement_is_not_tried(
 ) -> None:
     judged(monkeypatch, [21.0, 20.0, 19.0, 20.0])
     trainer = fitted(variant, views, tmp_path / "run")
-    assert [row["stays"] for row in trainer.decisions] == [True, False, False]
-    assert trainer.decisions[2]["reason"] == "needs specular"
-    assert trainer.surfels.sh_degree() == 1 and LIGHT not in trainer.params
-    text = select.table(trainer.decisions)
+    assert [row["stays"] for row in trainer.fit.decisions] == [True, False, False]
+    assert trainer.fit.decisions[2]["reason"] == "needs specular"
+    assert trainer.surfels.sh_degree() == 1 and LIGHT not in trainer.fit.params
+    text = select.table(trainer.fit.decisions)
     assert "left out (needs specular)" in text and "+1.00 dB" in text and len(text.splitlines()) == 4
 
 
@@ -177,7 +177,7 @@ def test_component_that_is_off_is_absent(
             trainer.step()
             dr.sync_thread()
             kernels = dr.kernel_history([dr.KernelType.JIT])
-        counted[name] = (len(trainer.params), features[-1], len(kernels), sum(rays))
+        counted[name] = (len(trainer.fit.params), features[-1], len(kernels), sum(rays))
     assert counted["off"][:2] == (5, 6) and counted["off"][3] == 0
     assert counted["on"][0] == 10 and counted["on"][1] == 14 and counted["on"][3] > 0
     assert counted["off"][2] < counted["on"][2]
@@ -200,7 +200,7 @@ def test_interrupted_selection_resumes(
     step = trainer.step
 
     def killed_step() -> None:
-        if len(trainer.decisions) == 2 and trainer.iteration == 7:
+        if len(trainer.fit.decisions) == 2 and trainer.iteration == 7:
             raise KilledError
         step()
 
@@ -209,11 +209,11 @@ def test_interrupted_selection_resumes(
         trainer.train()
     judged(monkeypatch, scores[4:])
     resumed = begin(run.method(), views, run)
-    assert len(resumed.decisions) == 2 and resumed.method.components == ("specular",)
+    assert len(resumed.fit.decisions) == 2 and resumed.method.components == ("specular",)
     resumed.train()
-    assert [row["stays"] for row in resumed.decisions] == [row["stays"] for row in straight.decisions]
-    for name, tensor in straight.params.items():
-        assert tensor.shape == resumed.params[name].shape
+    assert [row["stays"] for row in resumed.fit.decisions] == [row["stays"] for row in straight.fit.decisions]
+    for name, tensor in straight.fit.params.items():
+        assert tensor.shape == resumed.fit.params[name].shape
 
 
 def test_run_keeps_its_decisions(
@@ -251,28 +251,30 @@ def test_branching_keeps_common_parameters(variant: str, views: Dataset) -> None
     trainer = Trainer(other(variant), views)
     for _ in range(3):
         trainer.step()
-    before = {name: np.array(tensor.numpy()) for name, tensor in trainer.params.items()}
+    before = {name: np.array(tensor.numpy()) for name, tensor in trainer.fit.params.items()}
     rich = branched(trainer, other(variant, "degree", "specular"))
     state = rich.state()
-    assert rich.iteration == 3 and {*rich.params} == {*before, "albedo", "metallic", "roughness", LIGHT}
-    np.testing.assert_array_equal(rich.params["position"].numpy(), before["position"])
-    harmonics = rich.params["radiance_sh"].numpy()
+    assert rich.iteration == 3 and {*rich.fit.params} == {*before, "albedo", "metallic", "roughness", LIGHT}
+    np.testing.assert_array_equal(rich.fit.params["position"].numpy(), before["position"])
+    harmonics = rich.fit.params["radiance_sh"].numpy()
     np.testing.assert_array_equal(harmonics[:, :3], before["radiance_sh"])
     assert np.all(harmonics[:, 3:] == 0)
     moments = state["optimiser/radiance_sh/second"].reshape(-1, 12)
     assert np.all(moments[:, 3:] == 0) and np.any(moments[:, :3] > 0)
     assert np.all(state["optimiser/albedo/second"] == 0) and state["optimiser/albedo/steps"] == 0
     poor = branched(rich, other(variant))
-    assert {*poor.params} == {*before}
-    np.testing.assert_array_equal(poor.params["radiance_sh"].numpy(), before["radiance_sh"])
+    assert {*poor.fit.params} == {*before}
+    np.testing.assert_array_equal(poor.fit.params["radiance_sh"].numpy(), before["radiance_sh"])
     rich.step()
     poor.step()
-    np.testing.assert_array_equal(trainer.params["position"].numpy(), before["position"])
+    np.testing.assert_array_equal(trainer.fit.params["position"].numpy(), before["position"])
 
 
 def test_branching_resamples_light(variant: str, views: Dataset) -> None:
     trainer = Trainer(other(variant, "specular"), views)
-    trainer.params[LIGHT] = mi.TensorXf(np.linspace(-1, 2, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32))
+    trainer.fit.params[LIGHT] = mi.TensorXf(
+        np.linspace(-1, 2, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32)
+    )
     method = other(variant, "specular")
     assert method.light is not None
     finer = branched(trainer, replace(method, light=replace(method.light, height=16)))
@@ -315,7 +317,7 @@ def test_trials_end_with_fit(
     settings = ["iterations=7", *SETTINGS[1:]]
     trainer = begin(methods.load(variant, "quick", settings), views, Run(tmp_path / "run"))
     trainer.train()
-    assert trainer.iteration == 7 and len(trainer.decisions) == 2
+    assert trainer.iteration == 7 and len(trainer.fit.decisions) == 2
     assert Run(tmp_path / "run").method().components == ("degree",)
 
 
@@ -327,8 +329,8 @@ def test_rival_that_fails_is_left_out(
 
     monkeypatch.setattr(select, "branched", failing)
     trainer = fitted(variant, views, tmp_path / "run")
-    assert not any(row["stays"] for row in trainer.decisions) and trainer.iteration == 12
-    assert "no surfel is left" in trainer.decisions[0]["reason"]
+    assert not any(row["stays"] for row in trainer.fit.decisions) and trainer.iteration == 12
+    assert "no surfel is left" in trainer.fit.decisions[0]["reason"]
 
 
 def test_seconds_include_trials(
@@ -340,7 +342,7 @@ def test_seconds_include_trials(
     before = time.perf_counter()
     trainer.train()
     wall = time.perf_counter() - before
-    assert 0.5 * wall < trainer.seconds <= wall + 0.1 < time.perf_counter() - begin_ + 0.2
+    assert 0.5 * wall < trainer.fit.seconds <= wall + 0.1 < time.perf_counter() - begin_ + 0.2
 
 
 def test_linear_images_are_scored_as_displayed(

@@ -35,14 +35,14 @@ def test_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
     method = dataclasses.replace(method, refine=methods.Refine(), data=DataOptions(), iterations=60)
     trainer = Trainer(method, data)
-    before = {name: tensor.numpy().copy() for name, tensor in trainer.params.items()}
+    before = {name: tensor.numpy().copy() for name, tensor in trainer.fit.params.items()}
     losses = []
     while trainer.iteration < 60:
         trainer.step()
         losses.append(float(trainer.loss[0]))
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
     assert trainer.fit.optimiser.report().count == 0
-    for name, tensor in trainer.params.items():  # indirect_sh starts at exactly 0 and must leave it
+    for name, tensor in trainer.fit.params.items():  # indirect_sh starts at exactly 0 and must leave it
         assert np.all(np.isfinite(tensor.numpy())), name
         assert not np.array_equal(before[name], tensor.numpy()), name
 
@@ -96,17 +96,17 @@ def test_stage_has_its_own_rates(method: Method) -> None:
     first = {}
     for name, chosen in (("slow", slow), ("own", dataclasses.replace(slow, stage=method.stage))):
         trainer = Trainer(chosen, ball())
-        before = {key: tensor.numpy().copy() for key, tensor in trainer.params.items()}
+        before = {key: tensor.numpy().copy() for key, tensor in trainer.fit.params.items()}
         trainer.step()
-        first[name] = {key: np.abs(x.numpy() - before[key]).max() for key, x in trainer.params.items()}
+        first[name] = {key: np.abs(x.numpy() - before[key]).max() for key, x in trainer.fit.params.items()}
     assert first["slow"]["metallic"] == 0 < first["own"]["metallic"]
     assert first["slow"]["light"] == pytest.approx(0.1 * first["own"]["light"], rel=1e-3)
     assert first["slow"]["albedo"] == pytest.approx(first["own"]["albedo"], rel=1e-3)
     while trainer.iteration < 8:
         trainer.step()
-    before_deferred = trainer.params["metallic"].numpy().copy()
+    before_deferred = trainer.fit.params["metallic"].numpy().copy()
     trainer.step()
-    assert np.abs(trainer.params["metallic"].numpy() - before_deferred).max() > 0
+    assert np.abs(trainer.fit.params["metallic"].numpy() - before_deferred).max() > 0
 
 
 def test_edit_clears_moments_of_what_it_changed(method: Method) -> None:
@@ -326,10 +326,10 @@ def test_another_size_compiles_once(method: Method) -> None:
     method = dataclasses.replace(method, refine=methods.Refine(), mesh=None)
     trainer, misses = Trainer(method, ball()), []
     for iteration in (5, 5, 11, 11, 5, 5, 11, 11):
-        trainer.iteration = iteration
+        trainer.fit.iteration = iteration
         before = dr.detail.launch_stats()[2]
         for _ in range(1 if iteration == 5 else 2):  # 6 ends a size, 12 and 13 lie in two
-            trainer.iteration = iteration
+            trainer.fit.iteration = iteration
             trainer.step()
         dr.sync_thread()
         misses.append(dr.detail.launch_stats()[2] - before)

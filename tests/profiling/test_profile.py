@@ -126,7 +126,7 @@ def test_time_counts_for_innermost_phase(
 ) -> None:
     monkeypatch.setattr(phases, "WARM_UP", 1)
     monkeypatch.setattr(phases, "PhaseClock", lambda: SleepyClock(place, side))
-    used_trainer.iteration = {"initial": 5, "deferred": 35}[at]
+    used_trainer.fit.iteration = {"initial": 5, "deferred": 35}[at]
     found = phases.phase_times(used_trainer.step, 3)
     assert found[phase] > 1e3 * PAUSE
     assert max(ms for other, ms in found.items() if other != phase) < 1e3 * PAUSE
@@ -150,7 +150,7 @@ class Notes:
 
 def test_hooks_enclose_the_phases_of_their_names(trainer: Trainer) -> None:
     notes = Notes()
-    trainer.iteration = 35
+    trainer.fit.iteration = 35
     with timing.listening(notes):
         trainer.step()
     assert sorted(notes.calls) == sorted([*phases.PHASES[:8], "optimiser"])
@@ -190,7 +190,7 @@ def test_step_with_clock_is_same_step(
     for timed in (False, True):
         resolved = methods.load(str(method), "quick", [*SETTINGS, "iterations=40"])
         trainer = Trainer(resolved, data_module.read_dataset(data, "train"))
-        trainer.iteration = 1
+        trainer.fit.iteration = 1
         if timed:
             phases.phase_times(trainer.step, 1)
         else:
@@ -324,7 +324,7 @@ def test_work_is_counted_over_views(trainer: Trainer) -> None:
     hidden = trainer.surfels.to_numpy()
     hidden["opacity"][:20] = -20.0
     for name, values in hidden.items():
-        trainer.params[name] = type(trainer.params[name])(values)
+        trainer.fit.params[name] = type(trainer.fit.params[name])(values)
     fewer = count_work(trainer)
     assert fewer.unseen_share >= 0.25 > work.unseen_share
     assert fewer.contributing < work.contributing
