@@ -40,7 +40,7 @@ class DeliveredImage:
     image: np.ndarray  # (H, W, 3) uint8
     progress: int  # from resolution.COARSE to resolution.DONE
     seconds: float  # of its last sample
-    depth: np.ndarray | None = None  # (H, W) float32, if the page requires it
+    depth: np.ndarray | None = None  # (H, W) float32, if overlays require it
     samples: int = 1  # per pixel
 
 
@@ -51,10 +51,6 @@ class Client:
     deliver: Callable[[DeliveredImage], None]
     pose: Pose | None = None
     window: tuple[int, int] = (0, 0)  # pixels
-    look: DisplayOptions = field(default_factory=DisplayOptions)
-    largest: int = resolution.FINEST  # finest resolution level at rest
-    fixed: int | None = None  # resolution level during motion; None: by the time per image
-    depth: bool = False  # whether it requires depth
     comparison: Comparison | None = None  # replaces its image
     side: int = resolution.COARSEST  # resolution level of the next image during motion
     changed: float = -math.inf  # time of the last change of its view or of the scene
@@ -69,6 +65,7 @@ class RenderLoop:
     def __init__(self, scene: ViewerScene, clock: Callable[[], float] = time.monotonic) -> None:
         self.scene, self.clock = scene, clock
         self.clients: dict[int, Client] = {}
+        self.look = DisplayOptions(backdrop=scene.backdrops[0])
         self.report: Callable[[str], None] = lambda message: None  # called with a sentence about a failure
         self.delivered = 0  # images
         self.smooth = True  # whether images at rest are supersampled
@@ -102,6 +99,12 @@ class RenderLoop:
                 client.changed, client.progress, client.sums = self.clock(), NOTHING, []
                 client.version += 1
             self._wake.notify()
+
+    def display(self, **fields: Any) -> None:
+        """Set fields of the display options; every image is outdated."""
+        with self._wake:
+            self.look = replace(self.look, **fields)
+            self.change()
 
     def enter(self, number: int, client: Client) -> None:
         """Add the client of an opened page."""
@@ -178,16 +181,16 @@ class RenderLoop:
         """Draw a client's next sample and deliver the image, unless it is outdated by then."""
         with self._wake:
             version, before, comparison = client.version, client.progress, client.comparison
-            sums, pose, window = client.sums, client.pose, client.window
+            sums, pose, window, look = client.sums, client.pose, client.window, self.look
         assert pose is not None
         begin = self.clock()
         image, depth, progress, still, side = None, None, DONE, 0, 0
         if comparison is not None:
-            image = comparison(self.scene, client.look, window)
+            image = comparison(self.scene, look, window)
         else:
             # Resolution level, and progress after this sample.
-            still = resolution.still_side(*window, client.largest)
-            side = (client.fixed or min(client.side, still)) if before == NOTHING else still
+            still = resolution.still_side(*window, look.largest)
+            side = (look.fixed or min(client.side, still)) if before == NOTHING else still
             progress = before + 1 if before >= LARGE else LARGE if side >= still else COARSE
 
             # One sample per pixel, added to those before.
@@ -198,11 +201,10 @@ class RenderLoop:
             request = SampleRequest(
                 replace(pose, aspect=aspect),
                 *resolution.size_of(side, shape),
-                client.look,
+                look,
                 resolution.offsets()[index] if progress > LARGE else (0.0, 0.0),
                 index,
                 settled=progress >= LARGE,
-                depth=client.depth,
             )
             drawn = self.scene.draw(request)
             sums = added(sums, drawn.planes)
@@ -211,14 +213,14 @@ class RenderLoop:
             if progress <= LARGE or progress in SHOWN_AT:
                 share = dr.opaque(type(sums[0]), 1 / (index + 1))
                 mean = [plane * share for plane in sums] if index else sums
-                image = to_bytes(displayed_planes(mean, client.look), request.width, request.height)
-                if client.depth and drawn.depth is not None:
+                image = to_bytes(displayed_planes(mean, look), request.width, request.height)
+                if look.overlays and drawn.depth is not None:
                     far = dr.select(drawn.depth > 0, drawn.depth, FAR)
                     depth = np.array(image_array(far, request.height, request.width))
             dr.sync_thread()
         taken = self.clock() - begin
         with self._wake:
-            if comparison is None and before == NOTHING and client.fixed is None:
+            if comparison is None and before == NOTHING and look.fixed is None:
                 client.side = resolution.moving_side(side, taken, still)
             if client.version == version:
                 client.progress, client.sums = progress, sums if LARGE < progress < DONE else []

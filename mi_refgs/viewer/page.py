@@ -10,7 +10,6 @@ import socket
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
-from mi_refgs.viewer.resolution import COARSE, DONE
-from mi_refgs.viewer.tonemap import DisplayOptions
+from mi_refgs.viewer.resolution import COARSE, COARSEST, DONE
 from mi_refgs.viewer.viewer_scene import ViewerScene
 
 MOVING_JPEG, STILL_JPEG = 70, 92
@@ -88,10 +86,10 @@ class Page:
         self.up = up_of(self.views)
         self.loop = RenderLoop(scene)
         self.loop.report = self.complain
-        # What new clients begin with.
         distance = float(np.linalg.norm(self.start().position - scene.centre))
         depths = max(distance - scene.radius, 0.0), distance + scene.radius
-        self.settings: dict[str, Any] = {"look": DisplayOptions(backdrop=scene.backdrops[0], depths=depths)}
+        self.loop.display(depths=depths)
+        self.moving_side = COARSEST  # first resolution level of a client during motion
         # What panels set.
         self.status: Callable[[str], None] = lambda text: None
         self.look_changed: Callable[[], None] = lambda: None
@@ -152,7 +150,8 @@ class Page:
         self.server.on_client_disconnect(self._left)
 
     async def _connected(self, client: Any) -> None:
-        self.loop.enter(client.client_id, Client(lambda shown: self._deliver(client, shown), **self.settings))
+        new = Client(lambda shown: self._deliver(client, shown), side=self.moving_side)
+        self.loop.enter(client.client_id, new)
 
         async def moved(camera: Any) -> None:
             self._moved(client.client_id, camera)
@@ -192,10 +191,8 @@ class Page:
     # ---------------- for panels ----------------
 
     def set(self, **fields: Any) -> None:
-        """Set fields of every client: `fixed`, `largest`, `depth`, `side`, or those of DisplayOptions."""
-        own = {name: fields.pop(name) for name in ("fixed", "largest", "depth", "side") if name in fields}
-        self.settings |= own | {"look": replace(self.settings["look"], **fields)}
-        self.loop.change(**own, look=self.settings["look"])
+        """Set fields of the display options."""
+        self.loop.display(**fields)
         self.look_changed()
 
     def complain(self, message: str) -> None:

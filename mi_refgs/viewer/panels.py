@@ -230,7 +230,7 @@ def add_mesh(page: Page, box: Any, scene: TrainedScene) -> None:
     nodes: dict[bool, Any] = {}
 
     def show() -> None:
-        object_only = page.settings["look"].object_only and scene.surroundings is not None
+        object_only = page.loop.look.object_only and scene.surroundings is not None
         if box.value and object_only not in nodes:
             mesh = object_mesh(scene) if object_only else scene.mesh
             if mesh is None or not len(mesh.faces):
@@ -279,4 +279,4 @@ def add_cameras(page: Page, box: Any) -> None:
                     nodes.append(node)
         for node in nodes:
             node.visible = box.value
-        page.set(depth=box.value)
+        page.set(overlays=box.value)

@@ -40,7 +40,7 @@ def add_saving(page: Page) -> None:
     def save(suffix: str, number: int) -> None:
         client = page.loop.clients.get(number)
         if client is not None and client.pose is not None:
-            request = SampleRequest(client.pose, *client.window, client.look)
+            request = SampleRequest(client.pose, *client.window, page.loop.look)
             saved.content = f"saved {write_view(page.scene, request, page.views_folder, suffix)}"
 
     for suffix, button in buttons.items():

@@ -96,7 +96,7 @@ def splits_of(run: Run, data: Path | None, tell: Tell) -> dict[str, Dataset]:
 def warm_up(page: Page, tell: Tell) -> None:
     """Compile the kernels of all sizes that a desktop window needs; choose the first level during motion."""
     tell("preparing: compiling for each image size")
-    fastest, look = resolution.COARSEST, page.settings["look"]
+    fastest, look = resolution.COARSEST, page.loop.look
     for shape, side in itertools.product(USUAL_SHAPES, resolution.SIDES):
         if side > resolution.FINEST:
             continue
@@ -109,4 +109,4 @@ def warm_up(page: Page, tell: Tell) -> None:
             fastest = max(side, fastest)
     dr.sync_thread()
     dr.flush_malloc_cache()
-    page.set(side=fastest)
+    page.moving_side = fastest

@@ -15,6 +15,7 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Float
+from mi_refgs.viewer.resolution import FINEST
 
 IMAGE = "image"
 """What is displayed unless an AOV is chosen."""
@@ -33,12 +34,15 @@ def backdrops_of(background: bool, light: bool) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class DisplayOptions:
-    """What is displayed of a scene, and how."""
+    """What is displayed of a scene, and how: on all pages, which share their controls."""
 
     what: str = IMAGE  # or a type of `plugins.aovs`
     exposure: float = 0.0  # stops
     backdrop: str = "white"  # one of `backdrops_of`
     depths: tuple[float, float] = (0.0, 1.0)  # distances that are displayed as white and as black
+    largest: int = FINEST  # finest resolution level at rest
+    fixed: int | None = None  # resolution level during motion; None: by the time per image
+    overlays: bool = False  # whether the browser draws over the image, which requires depth
 
     @property
     def object_only(self) -> bool:

@@ -34,12 +34,11 @@ class SampleRequest:
     index: int = 0  # of the sample
     settled: bool = False  # whether nothing has moved for a while, so that it may take longer
     exact: Camera | None = None  # replaces the pose, and has its own pixels
-    depth: bool = False  # whether depth is required, too
 
     @property
     def aovs(self) -> frozenset[str]:
         """The AOVs to render."""
-        return frozenset({self.look.what, *(["depth"] if self.depth else [])} - {IMAGE, "alpha"})
+        return frozenset({self.look.what, *(["depth"] if self.look.overlays else [])} - {IMAGE, "alpha"})
 
     def camera(self) -> Camera:
         """Return the renderer's camera."""

@@ -203,7 +203,7 @@ class Loop(RenderLoop):
         self.enter(number, Client(seen.append))
         return seen
 
-    def look(self, number: int = 7, fov: float = 0.7) -> None:
+    def move(self, number: int = 7, fov: float = 0.7) -> None:
         """Move a client's camera."""
         self.change(number, pose=Pose(np.eye(4), fov, 1.0), window=(640, 400))
 
@@ -228,7 +228,7 @@ def broken() -> None:
 
 def test_the_loop_waits_then_draws_coarse_large_and_supersampled(loop: Loop) -> None:
     assert loop.step() == math.inf
-    loop.look()
+    loop.move()
     assert loop.step() == 0
     assert loop.step() == pytest.approx(resolution.STILL_AFTER)
     loop.time.now += resolution.STILL_AFTER + 1e-6
@@ -245,9 +245,9 @@ def test_the_loop_waits_then_draws_coarse_large_and_supersampled(loop: Loop) -> 
 
 
 def test_motion_drops_the_image_that_it_outdates(loop: Loop) -> None:
-    loop.look()
+    loop.move()
     loop.steps(1, 1)
-    loop.plain.during = lambda: loop.look(fov=0.8)
+    loop.plain.during = lambda: loop.move(fov=0.8)
     loop.steps(1)  # a large image, of the view before
     loop.plain.during = lambda: None
     assert progress(loop.seen) == [COARSE]
@@ -257,7 +257,7 @@ def test_motion_drops_the_image_that_it_outdates(loop: Loop) -> None:
 
 def test_coarse_images_are_delivered_during_motion(loop: Loop) -> None:
     """Each is outdated by the time that it is drawn."""
-    loop.plain.during = lambda: loop.look(fov=0.7 + 0.01 * len(loop.plain.samples))
+    loop.plain.during = lambda: loop.move(fov=0.7 + 0.01 * len(loop.plain.samples))
     loop.plain.during()
     assert [loop.step() for _ in range(5)] == [0] * 5
     assert len(loop.seen) == 5
@@ -271,7 +271,7 @@ def test_a_supersampled_image_is_the_mean_of_its_samples_and_restarts_after_a_ch
     def encoded(grey: float) -> int:
         return round(255 * (1.055 * grey ** (1 / 2.4) - 0.055))
 
-    loop.look()
+    loop.move()
     loop.steps(1, 1)
     for grey in (9.0, *[0.1, 0.3] * 8):
         loop.plain.grey = grey
@@ -293,7 +293,7 @@ def test_the_last_task_of_a_key_runs_once_and_bad_input_is_reported(loop: Loop) 
         raise InputError("no such thing")
 
     done: list[int] = []
-    loop.look()
+    loop.move()
     loop.steps(1)
     loop.submit("a", lambda: done.append(1))
     loop.submit("a", lambda: done.append(2))
@@ -308,7 +308,7 @@ def test_a_failure_is_reported_and_other_clients_continue(
 ) -> None:
     """Failures of a task and of an image; a failed image is drawn again only after a change."""
     loop.submit("a", broken)
-    loop.submit("b", loop.look)
+    loop.submit("b", loop.move)
     loop.plain.during = broken
     assert (loop.step(), loop.step()) == (0, math.inf)
     assert (len(loop.plain.samples), len(loop.reported), loop.seen) == (1, 2, [])
@@ -316,10 +316,10 @@ def test_a_failure_is_reported_and_other_clients_continue(
     assert capsys.readouterr().err.count("RuntimeError: out of memory\nand much more") == 2
     loop.plain.during = lambda: None
     other = loop.add(8)
-    loop.look(8)
+    loop.move(8)
     loop.steps(1)
     assert (loop.seen, progress(other)) == ([], [COARSE])
-    loop.look()
+    loop.move()
     loop.steps(1)
     assert progress(loop.seen) == [COARSE]
 
@@ -327,20 +327,20 @@ def test_a_failure_is_reported_and_other_clients_continue(
 def test_an_image_that_fails_after_a_change_is_drawn_again(loop: Loop) -> None:
     def moved_and_broken() -> None:
         loop.plain.during = lambda: None
-        loop.look()
+        loop.move()
         broken()
 
-    loop.look()
+    loop.move()
     loop.plain.during = moved_and_broken
     assert loop.step() == loop.step() == 0
     assert progress(loop.seen) == [COARSE]
 
 
 def test_the_client_with_least_progress_goes_first_and_closed_pages_are_forgotten(loop: Loop) -> None:
-    loop.look()
+    loop.move()
     loop.steps(1, 1)
     other = loop.add(8)
-    loop.look(8)
+    loop.move(8)
     loop.steps(1, 1)
     assert (len(loop.seen), len(other)) == (1, 1)
     loop.leave(7)
