@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,6 +65,15 @@ class _Sums:
         return float(np.mean(self.absolute)) / self.count if self.count else None
 
 
+class MeasuredView(NamedTuple):
+    """A test view, and what is rendered of it."""
+
+    rendered: RenderedView
+    maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), by material
+    view: View  # with its image decoded
+    concave: np.ndarray | None  # (H, W) bool; None without a true surface
+
+
 @dataclass
 class Decomposition:
     """Accumulates the errors of materials, and of concave pixels, over views."""
@@ -76,10 +85,9 @@ class Decomposition:
     angles: list[np.ndarray] = field(default_factory=list)  # degrees, of concave pixels
     squares: list[np.ndarray] = field(default_factory=list)  # squared differences of displayed colours there
 
-    def add(
-        self, rendered: RenderedView, maps: dict[str, np.ndarray], view: View, concave: np.ndarray | None
-    ) -> None:
-        """Add a view: its image and normals, our maps by material, and which pixels are concave."""
+    def add(self, measured: MeasuredView) -> None:
+        """Add the pixels of a view."""
+        rendered, maps, view, concave = measured
         front = view.covered() > metrics.FOREGROUND_ALPHA
         self.foreground += int(front.sum())
         regions = {"": front}
@@ -143,14 +151,9 @@ def material_maps(
     return lambda camera, rendered: RenderedView.maps_of(render(camera), *rendered.alpha.shape)
 
 
-def panels(
-    rendered: RenderedView,
-    maps: dict[str, np.ndarray],
-    view: View,
-    concave: np.ndarray | None,
-    scale: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Return fitted and ground-truth maps side by side, by title; albedo after its scale."""
+def panels(measured: MeasuredView, scale: np.ndarray) -> dict[str, np.ndarray]:
+    """Return fitted and ground-truth maps side by side, by title; albedo after its scale (3,)."""
+    rendered, maps, view, concave = measured
     pairs, covered = {"image": [rendered.image, view.displayed]}, view.covered()
     if view.normal is not None:
         shown = normal_colours(rendered.normal, rendered.alpha), normal_colours(view.normal, covered)

@@ -7,7 +7,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,38 +118,22 @@ def evaluate(
     }
 
     # The sheets.
-    rows = [shown.panels() for shown in measured.sheet_views]
-    write_png(run.path / SHEET, contact_sheet(rows, footer))
+    write_png(run.path / SHEET, contact_sheet(measured.panels, footer))
     scale = measured.errors.scale()
-    rows = [decomposition.panels(x.rendered, x.maps, x.view, x.concave, scale) for x in measured.sheet_views]
+    rows = [decomposition.panels(materials, scale) for materials in measured.materials]
     write_png(run.path / DECOMPOSITION, contact_sheet(rows, footer))
     run.write_json(METRICS, result)
     return result
 
 
-@dataclass(frozen=True)
-class SheetView:
-    """A test view of the sheets, and what is rendered of it."""
-
-    view: View  # with its image decoded
-    rendered: RenderedView
-    maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), by material
-    concave: np.ndarray | None  # (H, W); None without a true surface
-    object_only: np.ndarray | None  # (H, W, 3), display-encoded; None without a background
-
-    def panels(self) -> dict[str, np.ndarray]:
-        """Return the panels of its row in SHEET."""
-        more = {} if self.object_only is None else {"object only": self.object_only}
-        return panels(self.rendered, self.view) | more
-
-
-@dataclass(frozen=True)
+@dataclass
 class Measured:
-    """Scores of each test view, errors of all, and the views of the sheets."""
+    """Scores of each test view, errors of all, and what the sheets show of some views."""
 
-    per_view: list[dict[str, Any]]
-    errors: decomposition.Decomposition
-    sheet_views: list[SheetView]
+    per_view: list[dict[str, Any]] = field(default_factory=list)
+    errors: decomposition.Decomposition = field(default_factory=decomposition.Decomposition)
+    panels: list[dict[str, np.ndarray]] = field(default_factory=list)  # rows of SHEET
+    materials: list[decomposition.MeasuredView] = field(default_factory=list)  # rows of DECOMPOSITION
 
 
 def _measure(
@@ -167,7 +151,7 @@ def _measure(
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     material_maps = decomposition.material_maps(fitted, samples)
     in_sheets = evenly_spread(len(views.views), SHEET_VIEWS)
-    measured = Measured([], decomposition.Decomposition(), [])
+    measured = Measured()
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
@@ -179,17 +163,20 @@ def _measure(
         measured.per_view.append(scores)
 
         # Errors of materials and of concave pixels.
-        maps = material_maps(view.camera(), rendered)
         concave = None if surface is None else surface.concave(view)
-        measured.errors.add(rendered, maps, view, concave)
+        materials = decomposition.MeasuredView(
+            rendered, material_maps(view.camera(), rendered), view, concave
+        )
+        measured.errors.add(materials)
 
         # Images.
         write_png(images[index], rendered.image)
         if index in in_sheets:
-            alone = None
+            row = panels(rendered, view)
             if object_only is not None:
-                alone = RenderedView.of(object_only(view.camera()), views, view).image
-            measured.sheet_views.append(SheetView(view, rendered, maps, concave, alone))
+                row["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
+            measured.panels.append(row)
+            measured.materials.append(materials)
     return measured
 
 
