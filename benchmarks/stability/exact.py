@@ -68,11 +68,11 @@ def product_order(case: Case, pixels: Array) -> Array:
     (width, height), (left, top) = camera.tile, camera.tile_offset
     x, y = (pixels % camera.width + left) // width, (pixels // camera.width + top) // height
     order = np.empty((count, len(pixels)), int)
-    for tile in np.unique(y * lists.tiles_x + x):
+    for tile in np.unique(y * camera.tiles[0] + x):
         first = listed[begin[tile] : end[tile]]
         rest = np.ones(count, bool)
         rest[first] = False
-        order[:, y * lists.tiles_x + x == tile] = np.concatenate([first, np.nonzero(rest)[0]])[:, None]
+        order[:, y * camera.tiles[0] + x == tile] = np.concatenate([first, np.nonzero(rest)[0]])[:, None]
     return order
 
 

@@ -1,90 +1,15 @@
-"""Rows of floats, read and written in a few wide accesses per row, not in one per column."""
+"""Columns of a table of rows, and tables one after the other, under AD."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.types import Float
-
 ACCESS = 8
 """Floats per access: Dr.Jit's LLVM code splits wider ones into these."""
-
-COPIES_BYTES = 1 << 30
-"""Largest memory of the copies per thread that `PackedRows.add` makes; above it, additions are atomic. The
-gradient of a million surfels with 14 features, 24 floats per row, has 96 MB per copy: 11 threads fit."""
-
-
-@dataclass(frozen=True)
-class PackedRows:
-    """N rows of `width` floats, each padded with zeros to whole accesses; no derivative."""
-
-    data: Float  # (N · accesses · ACCESS,)
-    count: int
-    width: int
-
-    @property
-    def accesses(self) -> int:
-        """Accesses per row."""
-        return _padded(self.width) // ACCESS
-
-    @staticmethod
-    def zeros(count: int, width: int) -> PackedRows:
-        """Rows of zeros."""
-        return PackedRows(dr.zeros(mi.Float, count * _padded(width)), count, width)
-
-    @staticmethod
-    def pack(columns: list[Any]) -> PackedRows:
-        """Pack columns (N,)."""
-        count, width = dr.width(columns[0]), len(columns)
-        rows = PackedRows(dr.empty(mi.Float, count * _padded(width)), count, width)
-        values = [dr.detach(column) for column in columns]
-        for place, group in rows._groups(dr.arange(mi.UInt32, count), values):
-            # Without the promise of no conflicts every group would be a kernel of its own.
-            dr.scatter(rows.data, group, place, mode=dr.ReduceMode.NoConflicts)
-        return rows
-
-    def columns(self) -> list[Any]:
-        """Columns (N,)."""
-        return self.fetch(dr.arange(mi.UInt32, self.count))[: self.width]
-
-    def unpadded(self) -> Any:
-        """The rows without their padding, (N · width,)."""
-        entry = dr.arange(mi.UInt32, self.count * self.width)
-        row = entry // self.width
-        return dr.gather(mi.Float, self.data, row * (self.accesses * ACCESS) + (entry - row * self.width))
-
-    def fetch(self, row: Any, active: Any = True) -> list[Any]:
-        """Values of rows, one array per column, then per column of the padding."""
-        shape = (ACCESS, dr.width(row))
-        places = [row * self.accesses + i for i in range(self.accesses)]
-        groups = [dr.gather(mi.ArrayXf, self.data, place, active, shape=shape) for place in places]
-        return [value for group in groups for value in group]
-
-    def add(self, row: Any, values: list[Any], active: Any) -> None:
-        """Add values, one array per column, to rows.
-
-        On the CPU each thread has a copy until the rows are read, if all copies fit into COPIES_BYTES.
-        """
-        # Dr.Jit itself always adds atomically to more than a million entries.
-        copies = 4 * dr.width(self.data) * dr.thread_count()
-        mode = dr.ReduceMode.Expand if copies <= COPIES_BYTES else dr.ReduceMode.Local
-        for place, group in self._groups(row, values):
-            dr.scatter_add(self.data, group, place, active, mode=mode)
-
-    def _groups(self, row: Any, values: list[Any]) -> list[tuple[Any, Any]]:
-        padded = values + [mi.Float(0)] * (self.accesses * ACCESS - len(values))
-        groups = [padded[i : i + ACCESS] for i in range(0, len(padded), ACCESS)]
-        return [(row * self.accesses + i, mi.ArrayXf(group)) for i, group in enumerate(groups)]
-
-
-def _padded(width: int) -> int:
-    """Floats of a row with its padding."""
-    return -(-width // ACCESS) * ACCESS
 
 
 def columns_of(array: Any, width: int) -> list[Any]:
@@ -129,18 +54,23 @@ class _Columns(dr.CustomOp):
     def _join(self, columns: list[Any]) -> Any:
         if self.width == 1:
             return columns[0]
-        if self.access == 1 and self.width > ACCESS:
+        size = self.access
+        if size == 1 and self.width > ACCESS:
             # To write column by column, 16 cache lines each time, takes four times as long.
-            return PackedRows.pack(columns).unpadded()
-        count, accesses = dr.width(columns), self.width // self.access
-        flat, row = dr.empty(mi.Float, count * self.width), dr.arange(mi.UInt32, count) * accesses
+            size, columns = ACCESS, columns + [mi.Float(0)] * (-self.width % ACCESS)
+        count, accesses = dr.width(columns), len(columns) // size
+        flat, row = dr.empty(mi.Float, count * len(columns)), dr.arange(mi.UInt32, count) * accesses
         for i in range(accesses):
-            group = columns[i * self.access : (i + 1) * self.access]
-            value = group[0] if self.access == 1 else mi.ArrayXf(group)
+            group = columns[i * size : (i + 1) * size]
+            value = group[0] if size == 1 else mi.ArrayXf(group)
             # Without the promise of no conflicts every group would be a kernel of its own.
             dr.scatter(flat, value, row + i, mode=dr.ReduceMode.NoConflicts)
         dr.eval(flat)  # it may become the gradient itself, which others write into
-        return flat
+        if len(columns) == self.width:
+            return flat
+        entry = dr.arange(mi.UInt32, count * self.width)
+        row = entry // self.width
+        return dr.gather(mi.Float, flat, row * len(columns) + (entry - row * self.width))
 
 
 def joined(first: list[Any], second: list[Any]) -> list[Any]:

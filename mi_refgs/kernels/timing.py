@@ -39,15 +39,16 @@ def listening(listener: Listener) -> Iterator[None]:
         _listener = before
 
 
-def phase(name: str) -> Callable[[Function], Function]:
-    """Decorator: every call of the function is the phase `name`."""
+def phase(name: str, backward: str | None = None) -> Callable[[Function], Function]:
+    """Decorator: every call of the function is the phase `name`, and its result a boundary to `backward`."""
 
     def decorate(function: Function) -> Function:
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
             if _listener is None:
                 return function(*args, **kwargs)
-            return _listener.call(name, functools.partial(function, *args, **kwargs), (args, kwargs))
+            result = _listener.call(name, functools.partial(function, *args, **kwargs), (args, kwargs))
+            return result if backward is None else _listener.boundary(result, backward)
 
         return call  # type: ignore[return-value]
 

@@ -50,10 +50,10 @@ def count(footprints: Footprints, lists: TileLists, camera: Camera) -> Counts:
     width, height = camera.tile
     if not lists.pairs:
         return Counts(surfels, pixels, width * height, 0, 0, 0, 0, pixels_of_surfel)
-    lane = dr.arange(mi.UInt32, lists.tiles_x * lists.tiles_y * width * height)
+    lane = dr.arange(mi.UInt32, camera.tiles[0] * camera.tiles[1] * width * height)
     tile, local = lane // (width * height), lane % (width * height)
-    x = (tile % lists.tiles_x) * width + local % width - camera.tile_offset[0]
-    y = (tile // lists.tiles_x) * height + local // width - camera.tile_offset[1]
+    x = (tile % camera.tiles[0]) * width + local % width - camera.tile_offset[0]
+    y = (tile // camera.tiles[0]) * height + local // width - camera.tile_offset[1]
     pixel = mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5)
     begin = dr.gather(mi.UInt32, lists.pair_begin, tile)
     end = dr.gather(mi.UInt32, lists.pair_end, tile)

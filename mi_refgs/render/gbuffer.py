@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.splat import Camera, splat
+from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float, Point2f
@@ -34,15 +34,18 @@ class GBuffer:
         slots: Mapping[str, Any],  # (N,) each: mi.Float, or an array of several such as mi.Color3f
         camera: Camera,
         screen_offset: Point2f | None,
-        forward_only: bool,
+        compact: bool,
         depth: bool,
     ) -> GBuffer:
-        """Blend values of surfels by name; arguments as in `splat`.
+        """Blend values of surfels by name with `splat_compact`, or `splat`, which has the depth anyway.
 
         Every component is a feature, which costs time in every surfel-tile pair.
         """
         features = [part for value in slots.values() for part in parts(value)]
-        blended = splat(surfels, features, camera, screen_offset, forward_only, depth)
+        if compact:
+            blended = splat_compact(surfels, features, camera, depth=depth)
+        else:
+            blended = splat(surfels, features, camera, screen_offset)
         rest, maps = list(blended.features), {}
         for name, value in slots.items():
             width = len(parts(value))

@@ -209,8 +209,7 @@ class _View:
             own = self.scene.surfels.count
             slots = joined_slots(slots, others, (own, self.geometry.count - own))
         # Antialiasing reads neighbours in the image.
-        compact = self.request.forward_only and not self.scene.shading.antialias
-        depth = not compact or "depth" in self.asked
+        compact, depth = self.request.forward_only and not self.scene.shading.antialias, "depth" in self.asked
         return GBuffer.blend(self.geometry, slots, self.camera, self.request.screen_offset, compact, depth)
 
 

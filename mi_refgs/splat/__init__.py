@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from mi_refgs.kernels.timing import boundary, phase
+from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.composite import Composited, composite
+from mi_refgs.splat.composite import Composited, composite, composite_compact
 from mi_refgs.splat.tiles import TileLists, list_by_tile
 from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float, Point2f
 
-__all__ = ["Camera", "Composited", "Footprints", "TileLists", "composite", "list_by_tile", "project", "splat"]
+__all__ = [
+    "Camera",
+    "Composited",
+    "Footprints",
+    "TileLists",
+    "composite",
+    "list_by_tile",
+    "project",
+    "splat",
+    "splat_compact",
+]
 
 
 @phase("project")
@@ -24,18 +34,17 @@ def splat(
     features: list[Float],  # K × (N,)
     camera: Camera,
     screen_offset: Point2f | None = None,  # (N,) zeros, pixels; receives the gradient of a translation
-    forward_only: bool = False,
-    depth: bool = True,
 ) -> Composited:
-    """Splat features of surfels to maps of H·W pixels.
-
-    Derivatives, `forward_only` and `depth` as in `composite`.
-    """
+    """Splat features of surfels to maps of H·W pixels in raster order; derivatives as in `composite`."""
     if surfels.count == 0:
-        return Composited.nothing(len(features), camera, depth or not forward_only)
+        return Composited.nothing(len(features), camera)
     footprints = project(surfels, camera, screen_offset)
-    lists = list_by_tile(footprints, camera)
-    if forward_only:
-        return composite(footprints, features, lists, camera, forward_only, depth)
-    footprints, features = boundary((footprints, features), "surfels backward")
-    return boundary(composite(footprints, features, lists, camera), "splat backward")
+    lists = list_by_tile(footprints, camera, features)
+    return composite(footprints, features, lists)
+
+
+def splat_compact(surfels: Surfels, features: list[Float], camera: Camera, *, depth: bool) -> Composited:
+    """Splat features of surfels as `composite_compact` does: only pixels near surfels, no derivatives."""
+    if surfels.count == 0:
+        return Composited.nothing(len(features), camera, depth)
+    return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth)

@@ -57,6 +57,12 @@ class Camera:
         """Column and row of the first pixel in its tile."""
         return self.offset[0] % self.tile[0], self.offset[1] % self.tile[1]
 
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Columns and rows of tiles."""
+        size = self.width + self.tile_offset[0], self.height + self.tile_offset[1]
+        return -(-size[0] // self.tile[0]), -(-size[1] // self.tile[1])
+
     @staticmethod
     def from_pose(
         width: int,

@@ -28,12 +28,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.kernels.rows import PackedRows
-from mi_refgs.kernels.timing import phase
+from mi_refgs.kernels.timing import boundary, phase
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.lanes import CompactedPixels, Grid, Lanes, advance, any_of, walk
+from mi_refgs.splat.lanes import CompactedPixels, Lanes, advance, any_of, walk
+from mi_refgs.splat.rows import PackedRows
 from mi_refgs.splat.tiles import TileLists
-from mi_refgs.surfels.primitives import Footprints, Primitive
+from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.types import Float
 
 
@@ -53,174 +53,157 @@ class Composited:
         return Composited(maps, z if depth else None, alpha)
 
 
-@phase("splat forward")
-def composite(
-    footprints: Footprints,
-    features: list[Float],  # K × (N,)
-    lists: TileLists,
-    camera: Camera,
-    forward_only: bool = False,
-    depth: bool = True,
-) -> Composited:
-    """Composite features of surfels; differentiable in these and in the columns of the footprints.
+@phase("splat forward", backward="splat backward")
+def composite(footprints: Footprints, features: list[Float], lists: TileLists) -> Composited:
+    """Maps of H·W pixels; differentiable in the columns of the footprints and in features (N,).
 
-    `forward_only`: no derivatives, depth only if `depth` (with derivatives it is always there), and pixels of
-    empty patchs left out, so that what shades the others is faster: maps are in the order of `pixels`. Alpha
-    is then 1 - T instead of one more sum, and equal to rounding.
+    `lists` has the values of both.
     """
-    if not forward_only:
-        out = dr.custom(_Composite, footprints.columns + features, footprints.primitive, lists, camera)
-        return Composited(out[: len(features)], *out[-2:])
+    footprints, features = boundary((footprints, features), "surfels backward")
+    out = dr.custom(_Composite, footprints.columns + features, lists)
+    return Composited(out[: len(features)], *out[-2:])
+
+
+@phase("splat forward")
+def composite_compact(lists: TileLists, depth: bool) -> Composited:
+    """Maps of the pixels of patches that list a surfel, in the order of `pixels`, without derivatives.
+
+    Shading the pixels is then faster. Depth only if `depth`. Alpha is 1 - T instead of one more sum, and
+    equal to rounding.
+    """
     if not lists.pairs:
-        return Composited.nothing(len(features), camera, depth)
-    rows = PackedRows.pack(footprints.columns + features)
-    dr.eval(rows.data)
-    grid = Grid(lists, camera)
-    chosen = grid.filled()
-    lanes, loop = Lanes.of(grid, chosen), _Loop(rows, footprints.primitive, lists, camera)
-    transmittance, sums = loop.forward(lanes, len(features) + depth)
+        return Composited.nothing(lists.features, lists.camera, depth)
+    dr.eval(lists.rows.data)
+    chosen = Lanes.filled(lists)
+    lanes = Lanes.of(lists, chosen)
+    transmittance, sums = _forward(lists, lanes, lists.features + depth)
     values = [[*of_block, 1 - T] for of_block, T in zip(sums, transmittance, strict=True)]
     maps = CompactedPixels.scattered(values, dr.width(chosen))
-    pixels = CompactedPixels.of(grid, chosen, lanes)
-    return Composited(maps[: len(features)], maps[-2] if depth else None, maps[-1], pixels)
+    pixels = CompactedPixels.of(lists.camera, chosen, lanes)
+    return Composited(maps[: lists.features], maps[-2] if depth else None, maps[-1], pixels)
 
 
-@dataclass(frozen=True)
-class _Loop:
-    """What the three loops over the tile lists read."""
+def _values(lists: TileLists, row: list[Float], z: Float) -> list[Float]:
+    """What a surfel adds to each map, times its weight: features, depth, and 1 for alpha."""
+    return [*row[lists.primitive.columns :][: lists.features], z, mi.Float(1)]
 
-    rows: PackedRows  # columns of the footprints, then features
-    primitive: Primitive
-    lists: TileLists
-    camera: Camera
 
-    @property
-    def features(self) -> int:
-        """Number of features K."""
-        return self.rows.width - self.primitive.columns
+def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], list[list[Float]]]:
+    """Transmittance and the first `maps` maps, per block of the lanes."""
 
-    def values(self, row: list[Float], z: Float) -> list[Float]:
-        """What a surfel adds to each map, times its weight: features, depth, and 1 for alpha."""
-        return [*row[self.primitive.columns :][: self.features], z, mi.Float(1)]
+    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+        row = lists.rows.fetch(surfel, some)
+        after = []
+        for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
+            sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
+            weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
+            values = _values(lists, row, sample.z)[:maps]
+            out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
+            after.append((goes_on, transmittance_after, out))
+        return after
 
-    def forward(self, lanes: Lanes, maps: int) -> tuple[list[Float], list[list[Float]]]:
-        """Transmittance and the first `maps` maps, per block of the lanes."""
+    start = [(mi.Bool(inside), mi.Float(1), [mi.Float(0)] * maps) for inside in lanes.inside]
+    _, transmittance, out = walk(lists, lanes, step, start, "composite")
+    return transmittance, out
 
-        def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
-            row = self.rows.fetch(surfel, some)
-            after = []
-            for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
-                sample = self.primitive.evaluate(row, pixel, self.camera.near)
-                weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-                values = self.values(row, sample.z)[:maps]
-                out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
-                after.append((goes_on, transmittance_after, out))
-            return after
 
-        start = [(mi.Bool(inside), mi.Float(1), [mi.Float(0)] * maps) for inside in lanes.inside]
-        _, transmittance, out = walk(self.lists, lanes, step, start, "composite")
-        return transmittance, out
+def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[list[Float]]) -> PackedRows:
+    """Adjoint of the rows, for adjoints δ of the maps and the maps themselves, per block of the lanes."""
+    behind = [
+        sum((a * b for a, b in zip(of_block, total, strict=True)), start=mi.Float(0))
+        for of_block, total in zip(δ, out, strict=True)
+    ]
+    δrows = PackedRows.zeros(lists.rows.count, lists.rows.width)
 
-    def backward(self, lanes: Lanes, δ: list[list[Float]], out: list[list[Float]]) -> PackedRows:
-        """Adjoint of the rows, for adjoints δ of the maps and the maps themselves, per block of the lanes."""
-        behind = [
-            sum((a * b for a, b in zip(of_block, total, strict=True)), start=mi.Float(0))
-            for of_block, total in zip(δ, out, strict=True)
-        ]
-        δrows = PackedRows.zeros(self.rows.count, self.rows.width)
+    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+        row = lists.rows.fetch(surfel, some)
+        after, weights = [], []
+        geometry = lists.primitive.adjoint()
+        # Adjoints of α and z per pixel, summed over the pixels of the lane.
+        for pixel, _, _, active_here, transmittance, behind_here, δhere in lanes.each(active, *state, δ):
+            sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
+            weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
+            g = mi.Float(0)
+            for adjoint, value in zip(δhere, _values(lists, row, sample.z), strict=True):
+                g = dr.fma(adjoint, value, g)
+            rest = dr.fma(-weight, g, behind_here)
+            δalpha = dr.select(weight > 0, dr.fma(transmittance, g, -rest / (1 - sample.alpha)), 0)
+            geometry.add(sample, δalpha, weight * δhere[-2])
+            after.append((goes_on, transmittance_after, rest))
+            weights.append(weight)
+        # One addition per lane to the adjoint of the row.
+        δrow = geometry.columns(row)
+        for k in range(lists.features):
+            δfeature = mi.Float(0)
+            for weight, δhere in zip(weights, δ, strict=True):
+                δfeature = dr.fma(weight, δhere[k], δfeature)
+            δrow.append(δfeature)
+        δrows.add(surfel, δrow, any_of([weight > 0 for weight in weights]))
+        return after
 
-        def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
-            row = self.rows.fetch(surfel, some)
-            after, weights = [], []
-            geometry = self.primitive.adjoint()
-            # Adjoints of α and z per pixel, summed over the pixels of the lane.
-            for pixel, _, _, active_here, transmittance, behind_here, δhere in lanes.each(active, *state, δ):
-                sample = self.primitive.evaluate(row, pixel, self.camera.near)
-                weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-                g = mi.Float(0)
-                for adjoint, value in zip(δhere, self.values(row, sample.z), strict=True):
-                    g = dr.fma(adjoint, value, g)
-                rest = dr.fma(-weight, g, behind_here)
-                δalpha = dr.select(weight > 0, dr.fma(transmittance, g, -rest / (1 - sample.alpha)), 0)
-                geometry.add(sample, δalpha, weight * δhere[-2])
-                after.append((goes_on, transmittance_after, rest))
-                weights.append(weight)
-            # One addition per lane to the adjoint of the row.
-            δrow = geometry.columns(row)
-            for k in range(self.features):
-                δfeature = mi.Float(0)
-                for weight, δhere in zip(weights, δ, strict=True):
-                    δfeature = dr.fma(weight, δhere[k], δfeature)
-                δrow.append(δfeature)
-            δrows.add(surfel, δrow, any_of([weight > 0 for weight in weights]))
-            return after
+    inside = zip(lanes.inside, behind, strict=True)
+    start = [(mi.Bool(inside_here), mi.Float(1), total) for inside_here, total in inside]
+    walk(lists, lanes, step, start, "composite_backward")
+    dr.eval(δrows.data)
+    return δrows
 
-        inside = zip(lanes.inside, behind, strict=True)
-        start = [(mi.Bool(inside_here), mi.Float(1), total) for inside_here, total in inside]
-        walk(self.lists, lanes, step, start, "composite_backward")
-        dr.eval(δrows.data)
-        return δrows
 
-    def tangent(self, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:
-        """Tangents of the maps, per block of the lanes, for tangents of the rows."""
+def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:
+    """Tangents of the maps, per block of the lanes, for tangents of the rows."""
 
-        def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
-            row, drow = self.rows.fetch(surfel, some), drows.fetch(surfel, some)
-            after = []
-            for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
-                sample = self.primitive.evaluate(row, pixel, self.camera.near)
-                weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-                hit = weight > 0
-                dalpha, dz = self.primitive.evaluate_forward(row, sample, drow)
-                dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)
-                dvalues = [*drow[self.primitive.columns :][: self.features], dz, mi.Float(0)]
-                dout = [
-                    total + dweight * value + dr.select(hit, weight * dvalue, 0)
-                    for total, value, dvalue in zip(dout, self.values(row, sample.z), dvalues, strict=True)
-                ]
-                dafter = dtransmittance * (1 - sample.alpha) - transmittance * dalpha
-                after.append((goes_on, transmittance_after, dr.select(hit, dafter, dtransmittance), dout))
-            return after
+    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+        row, drow = lists.rows.fetch(surfel, some), drows.fetch(surfel, some)
+        after = []
+        for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
+            sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
+            weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
+            hit = weight > 0
+            dalpha, dz = lists.primitive.evaluate_forward(row, sample, drow)
+            dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)
+            dvalues = [*drow[lists.primitive.columns :][: lists.features], dz, mi.Float(0)]
+            dout = [
+                total + dweight * value + dr.select(hit, weight * dvalue, 0)
+                for total, value, dvalue in zip(dout, _values(lists, row, sample.z), dvalues, strict=True)
+            ]
+            dafter = dtransmittance * (1 - sample.alpha) - transmittance * dalpha
+            after.append((goes_on, transmittance_after, dr.select(hit, dafter, dtransmittance), dout))
+        return after
 
-        zeros = [mi.Float(0)] * (self.features + 2)
-        start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), zeros) for inside in lanes.inside]
-        *_, dout = walk(self.lists, lanes, step, start, "composite_forward")
-        return dout
+    zeros = [mi.Float(0)] * (lists.features + 2)
+    start = [(mi.Bool(inside), mi.Float(1), mi.Float(0), zeros) for inside in lanes.inside]
+    *_, dout = walk(lists, lanes, step, start, "composite_forward")
+    return dout
 
 
 class _Composite(dr.CustomOp):
-    """Columns (N,) → [features…, depth, alpha] (H·W,)."""
+    """Columns (N,) of the footprints, then features, → [features…, depth, alpha] (H·W,)."""
 
-    def eval(self, columns: list[Any], primitive: Primitive, lists: TileLists, camera: Camera) -> list[Any]:
-        self.loop = _Loop(PackedRows.pack(columns), primitive, lists, camera)
-        dr.eval(self.loop.rows.data)
-        if lists.pairs:
-            lanes = self._lanes()
-            self.out = lanes.to_raster(camera, self.loop.forward(lanes, self.loop.features + 2)[1])
-        else:  # Dr.Jit refuses to gather from an empty list, even fully masked
-            self.out = _blank(self.loop.features + 2, camera)
+    def eval(self, columns: list[Any], lists: TileLists) -> list[Any]:
+        self.lists = lists
+        dr.eval(lists.rows.data)
+        self.out = _blank(lists.features + 2, lists.camera)
+        if lists.pairs:  # Dr.Jit refuses to gather from an empty list, even fully masked
+            lanes = Lanes.of(lists)
+            self.out = lanes.to_raster(lists.camera, _forward(lists, lanes, lists.features + 2)[1])
         return self.out
 
     def forward(self) -> None:
-        if not self.loop.lists.pairs:
-            self.set_grad_out(_blank(self.loop.features + 2, self.loop.camera))
-            return
-        lanes, drows = self._lanes(), PackedRows.pack(self.grad_in("columns"))
-        self.set_grad_out(lanes.to_raster(self.loop.camera, self.loop.tangent(lanes, drows)))
+        lists, dout = self.lists, _blank(self.lists.features + 2, self.lists.camera)
+        if lists.pairs:
+            lanes, drows = Lanes.of(lists), PackedRows.pack(self.grad_in("columns"))
+            dout = lanes.to_raster(lists.camera, _tangent(lists, lanes, drows))
+        self.set_grad_out(dout)
 
     def backward(self) -> None:
-        if not self.loop.lists.pairs:
+        if not self.lists.pairs:
             return
-        δout, lanes = self.grad_out(), self._lanes()
+        δout, lanes = self.grad_out(), Lanes.of(self.lists)
         dr.eval(δout)  # together: to gather from them would evaluate one by one what they have in common
-        δrows = self.loop.backward(lanes, lanes.from_raster(δout), lanes.from_raster(self.out))
+        δrows = _backward(self.lists, lanes, lanes.from_raster(δout), lanes.from_raster(self.out))
         self.set_grad_in("columns", δrows.columns())
 
     def name(self) -> str:
         return "composite"
-
-    def _lanes(self) -> Lanes:
-        return Lanes.of(Grid(self.loop.lists, self.loop.camera))
 
 
 def _blank(count: int, camera: Camera) -> list[Float]:

@@ -42,7 +42,6 @@ NOWHERE = 0xFFFFFFFF
 class Grid:
     """Patches of tiles over an image, row by row."""
 
-    lists: TileLists
     camera: Camera
 
     @property
@@ -58,18 +57,12 @@ class Grid:
     @property
     def columns(self) -> int:
         """Patches per row of patches."""
-        return -(-self.lists.tiles_x // self.tiles[0])
+        return -(-self.camera.tiles[0] // self.tiles[0])
 
     @property
     def patches(self) -> int:
         """Number of patches."""
-        return self.columns * -(-self.lists.tiles_y // self.tiles[1])
-
-    def filled(self) -> UInt32:
-        """The patches with a tile that lists a surfel; waits for the device."""
-        lanes = Lanes.of(self)
-        listed = dr.select(lanes.begin < lanes.end, mi.UInt32(1), 0)
-        return dr.compress(dr.block_reduce(dr.ReduceOp.Or, listed, PATCH_LANES) > 0)
+        return self.columns * -(-self.camera.tiles[1] // self.tiles[1])
 
 
 @dataclass(frozen=True)
@@ -83,9 +76,10 @@ class Lanes:
     end: UInt32  # (L,): one past its last pair
 
     @staticmethod
-    def of(grid: Grid, chosen: UInt32 | None = None) -> Lanes:
+    def of(lists: TileLists, chosen: UInt32 | None = None) -> Lanes:
         """The lanes of all patches, or of those `chosen`."""
-        camera, lists, (lanes_x, lanes_y), (side_x, side_y) = grid.camera, grid.lists, grid.lanes, grid.tiles
+        camera, grid = lists.camera, Grid(lists.camera)
+        (lanes_x, lanes_y), (side_x, side_y), (tiles_x, tiles_y) = grid.lanes, grid.tiles, camera.tiles
         # Patch, tile in the patch, place in the block.
         count = grid.patches if chosen is None else dr.width(chosen)
         lane = dr.arange(mi.UInt32, count * PATCH_LANES)
@@ -95,8 +89,8 @@ class Lanes:
         tile, lane = lane // (lanes_x * lanes_y), lane % (lanes_x * lanes_y)
         tile_x = patch % grid.columns * side_x + tile % side_x
         tile_y = patch // grid.columns * side_y + tile // side_x
-        there = (tile_x < lists.tiles_x) & (tile_y < lists.tiles_y)
-        tile = tile_y * lists.tiles_x + tile_x
+        there = (tile_x < tiles_x) & (tile_y < tiles_y)
+        tile = tile_y * tiles_x + tile_x
         # Pixels. Those before the image wrap round to huge numbers, and are not inside either.
         corner_x = tile_x * camera.tile[0] + lane % lanes_x - camera.tile_offset[0]
         corner_y = tile_y * camera.tile[1] + lane // lanes_x - camera.tile_offset[1]
@@ -109,6 +103,13 @@ class Lanes:
             dr.gather(mi.UInt32, lists.pair_begin, tile, there),
             dr.gather(mi.UInt32, lists.pair_end, tile, there),
         )
+
+    @staticmethod
+    def filled(lists: TileLists) -> UInt32:
+        """The patches with a tile that lists a surfel; waits for the device."""
+        lanes = Lanes.of(lists)
+        listed = dr.select(lanes.begin < lanes.end, mi.UInt32(1), 0)
+        return dr.compress(dr.block_reduce(dr.ReduceOp.Or, listed, PATCH_LANES) > 0)
 
     def each(self, *values: list[Any]) -> Any:
         """Iterate over the blocks: pixel, raster index, inside, and further lists of one value per block."""
@@ -140,9 +141,10 @@ class CompactedPixels:
     there: Bool  # (H·W,): whether it is one of them
 
     @staticmethod
-    def of(grid: Grid, chosen: UInt32, lanes: Lanes) -> CompactedPixels:
+    def of(camera: Camera, chosen: UInt32, lanes: Lanes) -> CompactedPixels:
         """The pixels of the `chosen` patches, to which these lanes belong."""
-        camera, (lanes_x, lanes_y), patches = grid.camera, grid.lanes, dr.width(chosen)
+        grid, patches = Grid(camera), dr.width(chosen)
+        lanes_x, lanes_y = grid.lanes
         raster = dr.empty(mi.UInt32, BLOCKS * patches * PATCH_LANES)
         for index, of_block in zip(CompactedPixels._indices(patches), lanes.raster, strict=True):
             dr.scatter(raster, of_block, index, mode=dr.ReduceMode.NoConflicts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.kernels.rows import PackedRows
 from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.primitives import Footprints
+from mi_refgs.splat.rows import PackedRows
+from mi_refgs.surfels.primitives import Footprints, Primitive
 from mi_refgs.types import Float, UInt32
 
 MAX_PAIR_BITS = 27
@@ -30,40 +30,43 @@ A view of 50,000 surfels at 1024² has a million."""
 class TileLists:
     """M surfel-tile pairs, sorted by tile, then by the surfel's depth there; no derivative."""
 
+    camera: Camera
+    primitive: Primitive
+    rows: PackedRows  # (N,): columns of the footprints, then features
     surfel_from_pair: UInt32  # (M,)
     pair_begin: UInt32  # (tiles,): first pair of a tile
     pair_end: UInt32  # (tiles,): one past its last pair
-    tiles_x: int
-    tiles_y: int
 
     @property
     def pairs(self) -> int:
         """Number of surfel-tile pairs."""
         return dr.width(self.surfel_from_pair)
 
+    @property
+    def features(self) -> int:
+        """Number of features K."""
+        return self.rows.width - self.primitive.columns
+
 
 @phase("tile lists")
-def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
-    """List every surfel in each tile that its footprint may touch.
+def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Float] = ()) -> TileLists:
+    """List every surfel in each tile that its footprint may touch, and pack footprints and features (N,).
 
     Both sorts are stable, so surfels of equal depth keep their order in memory. Raises InputError for more
     than 2^MAX_PAIR_BITS pairs.
     """
-    offset_x, offset_y = camera.tile_offset
-    tiles_x = -(-(camera.width + offset_x) // camera.tile[0])
-    tiles_y = -(-(camera.height + offset_y) // camera.tile[1])
-    tiles = tiles_x * tiles_y
+    tiles = camera.tiles[0] * camera.tiles[1]
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
-    rows = PackedRows.pack(footprints.columns)
+    rows = PackedRows.pack([*footprints.columns, *features])
     tile_size, primitive = mi.Vector2f(*camera.tile), footprints.primitive
     found: list[tuple[Any, Any]] = []
     count = 0
     for surfel, tile_x, tile_y in _candidates(footprints, camera):
         row = rows.fetch(surfel)
-        corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(offset_x, offset_y)
+        corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(*camera.tile_offset)
         # Between the centres of the outermost pixels.
         touches = primitive.overlaps(row, corner + 0.5, corner + (tile_size - 0.5))
-        tile = mi.UInt32(tile_y * tiles_x + tile_x)
+        tile = mi.UInt32(tile_y * camera.tiles[0] + tile_x)
         depth = primitive.depth_near(row, corner + tile_size / 2)
         dr.eval(found, touches, tile, surfel, depth)
         kept = dr.compress(touches)
@@ -78,10 +81,10 @@ def list_by_tile(footprints: Footprints, camera: Camera) -> TileLists:
             found.append((pairs, dr.gather(mi.Float, depth, kept)))
     if not found:
         none = dr.zeros(mi.UInt32, tiles)
-        return TileLists(mi.UInt32(), none, none, tiles_x, tiles_y)
+        return TileLists(camera, primitive, rows, mi.UInt32(), none, none)
     pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
     tile, surfel = _sorted(pairs, depth, tiles)
-    return TileLists(surfel, *_runs(tile, tiles), tiles_x, tiles_y)
+    return TileLists(camera, primitive, rows, surfel, *_runs(tile, tiles))
 
 
 @phase("sort")

@@ -192,7 +192,7 @@ def listed_pairs(lists: TileLists) -> set[tuple[int, int]]:
 def needed_pairs(alpha: np.ndarray, camera: Camera, lists: TileLists) -> set[tuple[int, int]]:
     """Surfel and tile of each footprint (N, H·W) that contributes, without those at the threshold itself."""
     y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
-    tile = y // camera.tile[1] * lists.tiles_x + x // camera.tile[0]
+    tile = y // camera.tile[1] * camera.tiles[0] + x // camera.tile[0]
     return {
         (int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(alpha >= ALPHA_MIN * 1.001), strict=True)
     }

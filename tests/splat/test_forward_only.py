@@ -132,13 +132,13 @@ def test_empty_view_is_projected_once(name: str, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("name", ["", *sorted(ALL)])
 def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """And blends no more channels than that takes."""
-    composite, blended = splat.composite, []
+    composite, blended = splat.composite_compact, []
 
-    def counted(footprints: Any, features: list[Any], *rest: Any) -> Any:
-        blended.append(len(features) + rest[-1])
-        return composite(footprints, features, *rest)
+    def counted(lists: splat.TileLists, depth: bool) -> Any:
+        blended.append(lists.features + depth)
+        return composite(lists, depth)
 
-    monkeypatch.setattr(splat, "composite", counted)
+    monkeypatch.setattr(splat, "composite_compact", counted)
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
     scene = SurfelScene(things(), shading, shading.light_of(light), Occluder(two_balls()))
@@ -156,10 +156,9 @@ def test_compacted_pixels_contain_each_pixel_of_chosen_patches_once() -> None:
     view = camera_at(30.0, (3, 2))
     footprints = splat.project(things(), view)
     lists = splat.list_by_tile(footprints, view)
-    grid = Grid(lists, view)
-    chosen = grid.filled()
-    assert 0 < dr.width(chosen) < grid.patches
-    pixels = CompactedPixels.of(grid, chosen, Lanes.of(grid, chosen))
+    chosen = Lanes.filled(lists)
+    assert 0 < dr.width(chosen) < Grid(view).patches
+    pixels = CompactedPixels.of(view, chosen, Lanes.of(lists, chosen))
     there, raster = np.array(pixels.there), np.array(pixels.raster)
     back = raster[np.array(pixels.index)[there]]
     np.testing.assert_array_equal(back, np.flatnonzero(there))

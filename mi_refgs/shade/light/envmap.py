@@ -26,7 +26,7 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
 from mi_refgs.kernels.device import upload, upload_tensor
-from mi_refgs.kernels.timing import boundary, phase
+from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
@@ -236,12 +236,9 @@ class EnvironmentLight:
         """Number of raw values that are not < RAW_LIMIT, which are black; waits for the device."""
         return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
 
+    @phase("prefilter forward", backward="prefilter backward")
     def prefilter(self, levels: Levels = LEVELS) -> PrefilteredLight:
         """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""
-        return boundary(self._prefilter(levels), "prefilter backward")
-
-    @phase("prefilter forward")
-    def _prefilter(self, levels: Levels) -> PrefilteredLight:
         return PrefilteredLight(*prefilter(self.radiance(), levels))
 
     def unfiltered(self) -> UnfilteredLight:
