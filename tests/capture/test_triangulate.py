@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +13,9 @@ from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
 from mi_refgs.fitting.runner import begin
 from mi_refgs.methods import load
 from mi_refgs.runs.run import Run
-from tests.helpers import with_pixels
+from tests.helpers import read_loaded, with_pixels
 from tests.scenes import photographed as scene
+from tests.scenes.layouts import write_transforms
 
 COUNT = 10
 pytestmark = pytest.mark.skipif(not colmap.installed(), reason='pip install "mi_refgs[capture]"')
@@ -30,11 +30,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = shot.rotation.T @ np.diag([1.0, -1, -1]), shot.origin
         frames.append({"file_path": f"{i}.png", "transform_matrix": pose.tolist()})
-    content = {"fl_x": scene.FOCAL, "frames": frames}
-    for split in ("train", "test"):
-        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-    data = read_dataset(folder, "train")
-    return replace(data, views=tuple(view.load() for view in data.views))
+    return read_loaded(write_transforms(folder, frames, fl_x=scene.FOCAL), "train")
 
 
 @pytest.fixture(scope="module")

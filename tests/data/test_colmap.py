@@ -16,10 +16,10 @@ from mi_refgs.data.colmap_model import read_cameras, read_images, read_points
 from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.region import region_of
-from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
+from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png
 from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
-from tests.scenes.layouts import SHOTS, VALUES, WRITERS, write_binary, write_colmap, write_text
+from tests.scenes.layouts import SHOTS, VALUES, WRITERS, write_binary, write_colmap, write_copies, write_text
 
 KINDS = ("txt", "bin")
 
@@ -77,18 +77,10 @@ def test_unsupported_lens_models_are_refused(kind: str, tmp_path: Path) -> None:
     refused(lambda: read_dataset(data, "train"), "b.png: camera 7: k4, k5, k6:", "undistort")
 
 
-def copies(folder: Path, factor: int, ending: str = ".png") -> None:
-    (folder / f"images_{factor}").mkdir()
-    for path in sorted((folder / "images").iterdir()):
-        small = box_downscale(read_png(path), factor)
-        write_png(folder / f"images_{factor}" / path.with_suffix(ending).name, 0.5 * small)
-
-
 def test_smaller_copies_are_used_where_they_divide_the_downscale(tmp_path: Path) -> None:
-    """The copies here are half as bright, so that an image tells its file."""
     data = write_colmap(tmp_path)
-    copies(data, 2)
-    copies(data, 4, ".PNG")
+    write_copies(data, 2)
+    write_copies(data, 4, ".PNG")
     for downscale, bright in ((1, True), (2, False), (3, True), (4, False), (8, False)):
         view = read_dataset(data, "train", downscale=downscale).views[0].load()
         assert (view.width, view.height) == (96 // downscale, 72 // downscale)
@@ -113,21 +105,6 @@ def test_copy_of_rounded_size_scales_intrinsics(tmp_path: Path) -> None:
     view = read_dataset(data, "train", downscale=2).views[0].load()
     assert (view.width, view.height) == (49, 37)
     assert (view.fx, view.cy) == pytest.approx((110 * 49 / 97, 34.6 * 37 / 73))
-
-
-def test_colmap_masks_become_alpha(tmp_path: Path) -> None:
-    data = write_colmap(tmp_path)
-    copies(data, 2)
-    (data / "masks").mkdir()
-    mask = np.zeros((72, 96, 3))
-    mask[:, 48:] = 1
-    for i, shot in enumerate(SHOTS):
-        write_png(data / "masks" / (shot.name + ".png", shot.name)[i % 2], mask)
-    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
-    assert view.alpha is not None and view.alpha.sum() == 24 * 36
-    assert not view.image[:, :24].any() and view.image[:, 24:].max() > 0.9  # not of the copies
-    (data / "masks" / "b.png").unlink()
-    refused(lambda: read_dataset(data, "train"), "masks/b.png.png: mask: missing")
 
 
 def test_unreliable_points_are_left_out(tmp_path: Path) -> None:

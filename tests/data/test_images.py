@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import threading
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from mi_refgs.io.images import box_downscale, read_bytes, read_grey, read_png, w
 from mi_refgs.methods.method import CoarseImages, DataOptions
 from tests.helpers import ROOT, refused, run_python
 from tests.scenes.highlight import ball
+from tests.scenes.layouts import write_transforms
 from tests.scenes.tiny import write_data
 
 VIEWS, WIDTH, HEIGHT = 24, 2000, 1500
@@ -284,10 +284,7 @@ def photographs(folder: Path, rng: np.random.Generator) -> Path:
         cos, sin = np.cos(angle), np.sin(angle)
         pose = [[-sin, 0, cos, 4 * cos], [cos, 0, sin, 4 * sin], [0, 1, 0, 0], [0, 0, 0, 1]]
         frames.append({"file_path": name, "transform_matrix": pose})
-    content: dict[str, Any] = {"camera_angle_x": 0.7, "frames": frames}
-    for split in ("train", "test"):
-        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-    return folder
+    return write_transforms(folder, frames, camera_angle_x=0.7)
 
 
 PEAK = """

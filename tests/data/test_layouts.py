@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,10 +16,20 @@ from PIL import Image
 from mi_refgs.data.array_pickle import read_arrays
 from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
-from mi_refgs.io.images import box_downscale, linear_from_srgb, read_png, write_png
+from mi_refgs.io.images import linear_from_srgb, write_png
 from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
-from tests.scenes.layouts import SHOTS, change_transforms, write_glossy, write_llff, write_nerfstudio
+from tests.scenes.layouts import (
+    SHOTS,
+    change_transforms,
+    ply_bytes,
+    write_colmap,
+    write_copies,
+    write_glossy,
+    write_llff,
+    write_nerfstudio,
+    write_transforms,
+)
 
 # ---------------- nerfstudio and instant-ngp ----------------
 
@@ -38,25 +48,14 @@ def test_nerfstudio_intrinsics_per_frame(fisheye: bool, tmp_path: Path) -> None:
         check(view, shot, tolerance=0.06)
 
 
-def write_ply(path: Path, kind: str) -> None:
-    head = "element vertex 9\n" + "".join(f"property double {c}\n" for c in "xyz")
-    head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
-    if kind == "ascii":
-        lines = zip(POINTS.tolist(), COLOURS.tolist(), strict=True)
-        rows = "".join(f"{' '.join(map(str, (*p, *c)))}\n" for p, c in lines).encode()
-    else:
-        table = np.zeros(9, dtype=[("p", "<f8", 3), ("c", "u1", 3)])
-        table["p"], table["c"] = POINTS, COLOURS
-        rows = table.tobytes()
-    path.write_bytes(f"ply\nformat {kind} 1.0\n{head}".encode() + rows)
-
-
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
 def test_ply_file_path_gives_points(kind: str, tmp_path: Path) -> None:
     """Poses and points share a frame: `applied_transform` was applied to both."""
     moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
     data = write_nerfstudio(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=moved)
-    write_ply(data / "sparse_pc.ply", kind)
+    columns = dict(zip("xyz", POINTS.T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), COLOURS.T.astype(np.uint8), strict=True))
+    (data / "sparse_pc.ply").write_bytes(ply_bytes(columns, kind))
     found = read_dataset(data, "train")
     assert found.points is not None and found.points.colour is not None
     np.testing.assert_allclose(found.points.position, POINTS)
@@ -70,17 +69,6 @@ def test_ply_file_path_gives_points(kind: str, tmp_path: Path) -> None:
 )
 def test_missing_ply_file_is_refused(name: Any, said: str, tmp_path: Path) -> None:
     refused(lambda: read_dataset(write_nerfstudio(tmp_path, ply_file_path=name), "train"), said)
-
-
-def test_mask_path_becomes_alpha(tmp_path: Path) -> None:
-    data = write_nerfstudio(tmp_path)
-    mask = np.zeros((72, 96, 3))
-    mask[36:] = 1
-    write_png(data / "mask.png", mask)
-    change_transforms(data, lambda content: [f.update(mask_path="mask.png") for f in content["frames"]])
-    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
-    assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
-    assert not view.image[:18].any() and view.image[18:].any()
 
 
 def test_filenames_define_splits(tmp_path: Path) -> None:
@@ -110,6 +98,25 @@ def test_file_path_matches_any_ending(name: str, written: bool, tmp_path: Path) 
     check(view, SHOTS[1])
 
 
+@pytest.mark.parametrize("write", [write_nerfstudio, write_llff, write_colmap])
+def test_masks_become_alpha(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    """Masks have the size of the largest images, so that smaller copies are not used; all images need one."""
+    data = write(tmp_path)
+    write_copies(data, 2)
+    (data / "masks").mkdir()
+    mask = np.zeros((72, 96, 3))
+    mask[36:] = 1
+    for i, shot in enumerate(SHOTS):
+        write_png(data / "masks" / (shot.name + ".png", shot.name)[i % 2], mask)
+    if write is write_nerfstudio:
+        change_transforms(data, lambda made: [f.update(mask_path="masks/b.png") for f in made["frames"]])
+    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
+    assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
+    assert not view.image[:18].any() and view.image[18:].max() > 0.9  # not of the copies
+    (data / "masks/b.png").unlink()
+    refused(lambda: read_dataset(data, "train"), "masks/b.png", "missing")
+
+
 # ---------------- Shiny Blender ----------------
 
 
@@ -128,10 +135,7 @@ def shiny(folder: Path, alpha: bool = True) -> Path:
     if not alpha:
         write_png(folder / "test/r_0_alpha.png", np.repeat(inside[..., None], 3, axis=-1))
     frame = {"file_path": "test/r_0", "transform_matrix": SHOTS[0].camera_to_world.tolist()}
-    for split in ("train", "test"):
-        content = json.dumps({"camera_angle_x": 0.7, "frames": [frame]})
-        (folder / f"transforms_{split}.json").write_text(content)
-    return folder
+    return write_transforms(folder, [frame], camera_angle_x=0.7)
 
 
 @pytest.mark.parametrize("alpha", [True, False])
@@ -179,29 +183,10 @@ def test_llff_cameras_project_points_onto_images(factor: int, tmp_path: Path) ->
     for view in train.views:
         shot = next(shot for shot in SHOTS if shot.name == view.name)
         check(view, replace(shot, focal=(107.0, 107.0), centre=(48.0, 36.0)))
-    (data / "images_2").mkdir()
-    for path in (data / "images").iterdir():
-        write_png(data / "images_2" / path.name, 0.5 * box_downscale(read_png(path), 2))
+    write_copies(data, 2)
     view = read_dataset(data, "train", downscale=4).views[0].load()
     assert view.width == 24 and view.fx == pytest.approx(107 / 4) and view.image.max() <= 0.5
     assert fitting_downscale(data, "png", 2000) == (2, 96, 72)
-
-
-def test_llff_masks_become_alpha(tmp_path: Path) -> None:
-    """Masks have the size of the largest images, so that smaller copies are not used; all images need one."""
-    data = write_llff(tmp_path)
-    for folder in ("images_2", "masks"):
-        (data / folder).mkdir()
-    mask = np.zeros((72, 96, 3))
-    mask[36:] = 1
-    for path in (data / "images").iterdir():
-        write_png(data / "images_2" / path.name, box_downscale(read_png(path), 2))
-        write_png(data / "masks" / path.name, mask)
-    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
-    assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
-    assert not view.image[:18].any() and view.image[18:].any()
-    (data / "masks/c.png").unlink()
-    refused(lambda: read_dataset(data, "train"), "masks/c.png.png: mask: missing")
 
 
 def test_broken_llff_poses_are_refused(tmp_path: Path) -> None:

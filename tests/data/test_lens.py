@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import write_png
 from tests.helpers import refused
+from tests.scenes.dots import dots
+from tests.scenes.layouts import change_transforms, write_transforms
 
 WIDTH, HEIGHT = 96, 120
 PINHOLE = {"fl_x": 80.0, "fl_y": 84.0, "cx": 50.0, "cy": 57.0}
@@ -47,14 +48,10 @@ def seen_by(lens: dict[str, Any], x: float, y: float) -> tuple[float, float]:
     return PINHOLE["fl_x"] * x + PINHOLE["cx"], PINHOLE["fl_y"] * y + PINHOLE["cy"]
 
 
-def dot(u: float, v: float) -> np.ndarray:
-    columns, rows = np.arange(WIDTH) + 0.5, np.arange(HEIGHT)[:, None] + 0.5
-    return np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2 * SIGMA**2))
-
-
 def dataset(folder: Path, lens: dict[str, Any], alpha: bool = False) -> Path:
     """Two views of dots through a lens, linear, with maps."""
-    image = np.stack([sum(dot(*seen_by(lens, x, y)) for x, y in DOTS)] * 3, axis=-1)
+    across, down = np.array([seen_by(lens, x, y) for x, y in DOTS]).T
+    image = np.repeat(dots(WIDTH, HEIGHT, across, down, SIGMA)[..., None], 3, axis=-1)
     covered = (image[..., 0] > 0.2).astype(float)
     frames = []
     for name in "ab":
@@ -63,17 +60,7 @@ def dataset(folder: Path, lens: dict[str, Any], alpha: bool = False) -> Path:
         frames.append({"file_path": name, "transform_matrix": np.eye(4).tolist()})
     write_exr(folder / "depth.exr", 3 * covered)
     frames[0]["depth_path"] = "depth.exr"
-    content = {**PINHOLE, **lens, "frames": frames}
-    (folder / "transforms_train.json").write_text(json.dumps(content))
-    (folder / "transforms_test.json").write_text(json.dumps(content))
-    return folder
-
-
-def claim(folder: Path, lens: dict[str, Any]) -> Path:
-    """Change the lens in the file of the training views, but not their images."""
-    file = folder / "transforms_train.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | lens))
-    return file
+    return write_transforms(folder, frames, **PINHOLE, **lens)
 
 
 def centroid(image: np.ndarray, u: float, v: float) -> tuple[float, float]:
@@ -142,7 +129,8 @@ def test_downscaled_undistortion_has_the_same_camera(tmp_path: Path) -> None:
 def test_zero_distortion_changes_no_pixel(tmp_path: Path) -> None:
     folder = dataset(tmp_path, {})
     plain = read_dataset(folder, "train").views[0].load()
-    claim(folder, dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | {"is_fisheye": False})
+    zeros = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | {"is_fisheye": False}
+    change_transforms(folder, lambda content: content.update(zeros))
     view = read_dataset(folder, "train").views[0].load()
     np.testing.assert_array_equal(view.image, plain.image)
     assert (view.fx, view.fy) == (plain.fx, plain.fy)
@@ -166,5 +154,5 @@ def test_zero_distortion_changes_no_pixel(tmp_path: Path) -> None:
     ],
 )
 def test_unsupported_lenses_are_refused(tmp_path: Path, lens: dict[str, Any], words: list[str]) -> None:
-    file = claim(dataset(tmp_path, {}), lens)
-    refused(lambda: read_dataset(tmp_path, "train", images="exr"), file, *words)
+    change_transforms(dataset(tmp_path, {}), lambda content: content.update(lens))
+    refused(lambda: read_dataset(tmp_path, "train", images="exr"), "transforms_train.json: ", *words)

@@ -12,19 +12,14 @@ import pytest
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.region import REGION_FILE, Region, read_region, region_of, region_pixels
 from mi_refgs.data.view import View
+from mi_refgs.reference.camera import look_at
 from tests.helpers import refused
 
 
 def view_from(origin: np.ndarray, focal: float = 100.0) -> View:
     """A view of 100² pixels that looks at the world's origin."""
-    forward = -origin / np.linalg.norm(origin)
-    left = np.cross([0.0, 0.0, 1.0], forward)
-    left /= np.linalg.norm(left)
-    to_world = np.eye(4)
-    to_world[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
-    to_world[:3, 3] = origin
-    image = np.zeros((100, 100, 3), np.float32)
-    return View("v", 100, 100, focal, focal, 50, 50, to_world, Pixels(image))
+    pixels = Pixels(np.zeros((100, 100, 3), np.float32))
+    return View("v", 100, 100, focal, focal, 50, 50, look_at(origin, np.zeros(3)), pixels)
 
 
 def test_region_pixels_are_those_whose_rays_hit_it() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from mi_refgs.cli import main
@@ -14,7 +16,7 @@ from mi_refgs.data.survey import Survey, survey
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from tests.helpers import refused
 from tests.scenes.dots import Shot
-from tests.scenes.layouts import SHOTS, write_colmap
+from tests.scenes.layouts import SHOTS, change_transforms, write_colmap
 from tests.scenes.tiny import DISTANCE, train_command, write_data, write_method
 
 
@@ -64,10 +66,8 @@ def test_cameras_in_one_place_are_refused(
 ) -> None:
     """Named before anything is computed, with the exit code of bad input."""
     data = write_data(tmp_path / "ball", views=count, truth=False)
-    content = json.loads((data / "transforms_train.json").read_text())
-    for frame in content["frames"]:
-        frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
-    (data / "transforms_train.json").write_text(json.dumps(content))
+    same = {"transform_matrix": np.eye(4).tolist()}
+    change_transforms(data, lambda made: [frame.update(same) for frame in made["frames"]], "train")
     assert words in said(capsys, str(data))
     assert main(train_command(data, tmp_path / "run", write_method(tmp_path))) == 2
     error = capsys.readouterr().err
@@ -76,19 +76,17 @@ def test_cameras_in_one_place_are_refused(
 
 def test_images_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_data(tmp_path / "ball", views=6)
-    for split, count in (("train", 6), ("test", 2)):
-        content = json.loads((data / f"transforms_{split}.json").read_text())
-        focal = content.pop("fl_x")
-        for key in ("fl_y", "w", "h"):
-            del content[key]
-        for i in range(count):
-            frame, path = content["frames"][i], data / split / f"r_{i}.png"
-            frame["fl_x"] = focal
-            if i % 2:  # a strip at the right is cut off
-                write_png(path, read_png(path)[:, :16])
-                frame["cx"] = 10.0
-                frame.pop("normal_path")
-        (data / f"transforms_{split}.json").write_text(json.dumps(content))
+
+    def cut(content: dict[str, Any]) -> None:
+        """Cut off a strip at the right of every other image."""
+        del content["w"], content["h"]
+        for frame in content["frames"][1::2]:
+            path = data / f"{frame['file_path']}.png"
+            write_png(path, read_png(path)[:, :16])
+            frame["cx"] = 10.0
+            del frame["normal_path"]
+
+    change_transforms(data, cut)
     assert "20 × 20, of 2 sizes" in said(capsys, str(data))
     run = tmp_path / "run"
     assert main(train_command(data, run, write_method(tmp_path))) == 0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -136,13 +136,14 @@ PLACES = {"small": (1e-5, 0 * UTM), "large": (1e5, 0 * UTM), "far": (1.0, UTM), 
 
 def move_cameras(data: Path, move: Callable[[np.ndarray], np.ndarray]) -> None:
     """Change the positions of the cameras of a data set."""
-    for path in data.glob("transforms*.json"):
-        content = json.loads(path.read_text())
+
+    def change(content: dict[str, Any]) -> None:
         for frame in content["frames"]:
             matrix = np.array(frame["transform_matrix"])
             matrix[:3, 3] = move(matrix[:3, 3])
             frame["transform_matrix"] = matrix.tolist()
-        path.write_text(json.dumps(content))
+
+    layouts.change_transforms(data, change)
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -154,8 +155,7 @@ def test_data_set_is_independent_of_unit_and_origin(place: str, tmp_path: Path) 
     move_cameras(data, lambda position: scale * position + offset)
     write_region(data, Region(tuple(offset.tolist()), 0.5 * scale))
     for folder in (plain, data):  # a lone test view, whose own mean has another round number
-        content = json.loads((folder / "transforms_test.json").read_text())
-        (folder / "transforms_test.json").write_text(json.dumps(content | {"frames": content["frames"][:1]}))
+        layouts.change_transforms(folder, lambda made: made.update(frames=made["frames"][:1]), "test")
     before, after = (read_dataset(folder, "train") for folder in (plain, data))
     test = read_dataset(data, "test")
     assert after.offset == test.offset and after.region == test.region

@@ -11,7 +11,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mi_refgs.data.dataset import READERS, reader_of
 from mi_refgs.data.lens import Lens
@@ -19,7 +18,7 @@ from mi_refgs.fitting.runner import load_method
 from mi_refgs.formats import Shot
 from mi_refgs.formats.cameras import write as write_cameras
 from mi_refgs.io.exr import write_exr
-from mi_refgs.io.images import box_downscale, read_png, write_png
+from mi_refgs.io.images import read_png, write_png
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.trained_scene import TrainedScene
 from tests.helpers import read_loaded
@@ -56,13 +55,9 @@ def colmap(folder: Path, camera: str, values: tuple[float, ...]) -> Path:
 def llff(folder: Path, masks: bool = False) -> Path:
     """LLFF with smaller copies of another ending."""
     data = layouts.write_llff(folder)
-    (data / "images_2").mkdir()
-    for path in (data / "images").iterdir():
-        half = np.round(255 * box_downscale(read_png(path), 2)).astype(np.uint8)
-        Image.fromarray(half).save(data / "images_2" / f"{path.stem}.jpg")
-        if masks:
-            (data / "masks").mkdir(exist_ok=True)
-            shutil.copy(path, data / "masks")
+    layouts.write_copies(data, 2, ".jpg")
+    if masks:
+        shutil.copytree(data / "images", data / "masks")
     return data
 
 

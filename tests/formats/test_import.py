@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from pathlib import Path
 
 import drjit as dr
@@ -29,6 +28,7 @@ from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera
 from tests.helpers import refused
+from tests.scenes.layouts import ply_bytes
 
 SIZE, FOCAL, COUNT = 48, 60.0, 40
 BACKGROUND = np.array([0.2, 0.5, 0.9])
@@ -54,18 +54,15 @@ def raw_of(sizes: int, degree: int, rng: np.random.Generator) -> dict[str, np.nd
 
 def their_bytes(raw: dict[str, np.ndarray]) -> bytes:
     """The file as the released code writes it: f_rest channel after channel, zero normals."""
-    terms, sizes = raw["rest"].shape[2], raw["scale"].shape[1]
-    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
-    names += [f"f_rest_{i}" for i in range(3 * terms)]
-    names += ["opacity", *(f"scale_{i}" for i in range(sizes)), *(f"rot_{i}" for i in range(4))]
-    header = "ply\nformat binary_little_endian 1.0\n" + f"element vertex {COUNT}\n"
-    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
-    body = b""
-    for i in range(COUNT):
-        row = [*raw["position"][i], 0.0, 0.0, 0.0, *raw["dc"][i], *raw["rest"][i].ravel()]
-        row += [*raw["opacity"][i], *raw["scale"][i], *raw["rotation"][i]]
-        body += struct.pack(f"<{len(names)}f", *row)
-    return header.encode() + body
+    columns = dict(zip("xyz", raw["position"].T, strict=True))
+    columns |= {name: np.zeros(COUNT, np.float32) for name in ("nx", "ny", "nz")}
+    rest = np.concatenate([*raw["rest"].transpose(1, 0, 2)], axis=1)
+    for name, values in (("f_dc", raw["dc"]), ("f_rest", rest)):
+        columns |= {f"{name}_{i}": column for i, column in enumerate(values.T)}
+    columns["opacity"] = raw["opacity"][:, 0]
+    for name, values in (("scale", raw["scale"]), ("rot", raw["rotation"])):
+        columns |= {f"{name}_{i}": column for i, column in enumerate(values.T)}
+    return ply_bytes(columns)
 
 
 def pinhole() -> PinholeCamera:

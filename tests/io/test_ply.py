@@ -13,6 +13,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
+from tests.scenes.layouts import ply_bytes
 
 GEOMETRY = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
 
@@ -25,21 +26,8 @@ def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
 def write_file(
     path: Path, columns: dict[str, np.ndarray], kind: str = "binary_little_endian", dtype: str = "f4"
 ) -> Path:
-    """A PLY file by hand, as another program would write it."""
-    count = len(next(iter(columns.values())))
-    names = {"f4": "float", "f8": "double"}
-    header = f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {count}\n"
-    header += "".join(f"property {names[dtype]} {name}\n" for name in columns) + "end_header\n"
-    if kind == "ascii":
-        lines = zip(*(c.tolist() for c in columns.values()), strict=True)
-        body = "".join(" ".join(map(repr, line)) + "\n" for line in lines).encode()
-    else:
-        order = "<" if "little" in kind else ">"
-        rows = np.zeros(count, dtype=[(name, order + dtype) for name in columns])
-        for name, values in columns.items():
-            rows[name] = values
-        body = rows.tobytes()
-    path.write_bytes(header.encode() + body)
+    typed = {name: np.asarray(values, dtype) for name, values in columns.items()}
+    path.write_bytes(ply_bytes(typed, kind))
     return path
 
 

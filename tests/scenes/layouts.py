@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import pickle
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from mi_refgs.data.colmap_model import MODELS
+from mi_refgs.io.images import box_downscale, read_png, write_png
 from tests.scenes.dots import COLOURS, POINTS, Shot
 
 SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
@@ -21,18 +24,9 @@ SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
 MODEL, VALUES = "PINHOLE", (110.0, 104.0, 50.3, 34.6)
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """w, x, y, z, by the eigenvector of Bar-Itzhack's matrix."""
-    m = rotation
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [0, m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2]],
-            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[2, 1] + m[1, 2]],
-            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(k, UPLO="U")[1][:, -1]
+def quaternion(rotation: np.ndarray) -> list[float]:
+    """w, x, y, z of a rotation matrix."""
+    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1).tolist()
 
 
 def write_text(
@@ -44,7 +38,7 @@ def write_text(
     (model / "cameras.txt").write_text(f"# comment\n7 {camera} {size} {' '.join(map(repr, values))}\n")
     lines = ["# Image list with two lines of data per image:"]
     for i, shot in enumerate(shots):
-        pose = " ".join(map(repr, [*quaternion(shot.rotation).tolist(), *shot.translation.tolist()]))
+        pose = " ".join(map(repr, [*quaternion(shot.rotation), *shot.translation.tolist()]))
         seen = "1.5 2.5 3 10.0 20.0 -1" if i % 2 else ""
         lines += [f"{i + 1} {pose} 7 {shot.name}", seen]
     (model / "images.txt").write_text("\n".join(lines) + "\n")
@@ -106,10 +100,44 @@ def write_nerfstudio(folder: Path, shots: list[Shot] = SHOTS, **content: Any) ->
     return folder
 
 
-def change_transforms(data: Path, change: Any) -> None:
-    content = json.loads((data / "transforms.json").read_text())
-    change(content)
-    (data / "transforms.json").write_text(json.dumps(content))
+def write_transforms(folder: Path, frames: list[dict[str, Any]], **content: Any) -> Path:
+    """Files of both splits with the same frames."""
+    for split in ("train", "test"):
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content | {"frames": frames}))
+    return folder
+
+
+def change_transforms(data: Path, change: Callable[[dict[str, Any]], object], split: str = "") -> None:
+    """Change the content of the transforms files, or of that of one split, in place."""
+    for path in data.glob(f"transforms*{split}.json"):
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+
+def write_copies(data: Path, factor: int, ending: str = ".png") -> None:
+    """Smaller copies of the images, half as bright, so that an image tells its file."""
+    (data / f"images_{factor}").mkdir()
+    for path in sorted((data / "images").iterdir()):
+        small = 0.5 * box_downscale(read_png(path), factor)
+        write_png(data / f"images_{factor}" / path.with_suffix(ending).name, small)
+
+
+def ply_bytes(columns: dict[str, np.ndarray], kind: str = "binary_little_endian") -> bytes:
+    """A PLY file by hand, as another program would write it; properties have the types of the columns."""
+    count, names = len(next(iter(columns.values()))), {"f4": "float", "f8": "double", "u1": "uchar"}
+    header = f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {count}\n"
+    header += "".join(f"property {names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
+    if kind == "ascii":
+        rows = zip(*(c.tolist() for c in columns.values()), strict=True)
+        body = "".join(" ".join(map(repr, row)) + "\n" for row in rows).encode()
+    else:
+        order = "<" if "little" in kind else ">"
+        table = np.empty(count, dtype=[(name, order + c.dtype.str[1:]) for name, c in columns.items()])
+        for name, values in columns.items():
+            table[name] = values
+        body = table.tobytes()
+    return f"{header}end_header\n".encode() + body
 
 
 def write_llff(folder: Path, factor: int = 1) -> Path:
