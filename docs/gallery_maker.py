@@ -19,7 +19,7 @@ import tyro
 from PIL import Image
 
 from mi_refgs import __version__, methods
-from mi_refgs.editing import EditOptions
+from mi_refgs.editing.options import EditOptions
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.images import contact_sheet

@@ -12,7 +12,7 @@ from mi_refgs.data.dataset import Dataset as Dataset
 from mi_refgs.data.dataset import read_dataset as read_dataset
 from mi_refgs.data.images import Pixels as Pixels
 from mi_refgs.data.view import View as View
-from mi_refgs.editing.edit import EditOptions as EditOptions
+from mi_refgs.editing.options import EditOptions as EditOptions
 from mi_refgs.errors import InputError as InputError
 from mi_refgs.evaluation.evaluate import evaluate as evaluate
 from mi_refgs.fitting.objective import Loss as Loss
@@ -53,7 +53,7 @@ from mi_refgs.surfels.ply import write_ply as write_ply
 from mi_refgs.surfels.primitives import Primitive as Primitive
 from mi_refgs.surfels.table import Surfels as Surfels
 from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
-from mi_refgs.synthesis.settings import DatasetOptions as DatasetOptions
+from mi_refgs.synthesis.options import DatasetOptions as DatasetOptions
 
 FormatOption = mi_refgs.formats.format.Option
 load_method = mi_refgs.methods.read.load

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from mi_refgs.cli.command import Flag, Output, Rendering, Result, optional, separated
 from mi_refgs.errors import InputError
-from mi_refgs.synthesis.settings import DatasetOptions
+from mi_refgs.synthesis.options import DatasetOptions
 
 
 @dataclass(frozen=True, kw_only=True)

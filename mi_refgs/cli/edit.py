@@ -17,65 +17,14 @@ from mi_refgs.cli.command import (
     Rendering,
     Result,
     RunFolder,
-    Settings,
     joined,
     optional,
 )
+from mi_refgs.editing.options import Change, Selection
 from mi_refgs.errors import InputError
 from mi_refgs.progress import say
 
 PREVIEW = "preview.png"
-Vector = Annotated[tuple[float, float, float] | None, optional("X Y Z")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Selection:
-    """Surfels that meet all of these (default: all surfels)."""
-
-    where: Annotated[str | None, optional("EXPRESSION")] = None
-    """such as "metallic > 0.5 and z < 0"; an unknown name lists the known ones"""
-    box: Annotated[tuple[float, float, float, float, float, float] | None, optional("X0 Y0 Z0 X1 Y1 Z1")] = (
-        None
-    )
-    """inside an axis-aligned box"""
-    nearest: Annotated[tuple[float, float, float, float] | None, optional("X Y Z R")] = None
-    """within R of the surfel that is nearest to the point"""
-    mask: Annotated[Path | None, optional("PNG")] = None
-    """visible where an image of a view is white"""
-    view: Annotated[str, arg(metavar="I|CAMERA.json")] = "0"
-    """view of --mask: its number, or a camera that the page of `refgs view` saved"""
-    split: Literal["test", "train"] = "test"
-    """split of --view"""
-    invert: Flag = False
-    """all other surfels instead"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Change:
-    """What is done to the selected surfels, in this order."""
-
-    materials: Flag = False
-    """first replace colours that were fitted to the environment map by materials"""
-    set: Annotated[
-        Settings,
-        optional(
-            "NAME=VALUE …",
-            help='such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5 "metallic=max(metallic, 0.5)"; '
-            "colour=R,G,B for methods with fitted colours",
-        ),
-    ] = ()
-    scale: Annotated[float, arg(metavar="F")] = 1.0
-    """scale about the middle of the selection"""
-    rotate: Annotated[tuple[str, str] | None, optional("AXIS DEG")] = None
-    """rotate about the middle of the selection and the axis x, y, z or X,Y,Z, counter-clockwise"""
-    move: Vector = None
-    """translate, scene units"""
-    duplicate: Vector = None
-    """change a copy that is translated by this; the original stays"""
-    cut: Flag = False
-    """remove the selection"""
-    keep: Flag = False
-    """remove everything else"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +41,10 @@ class Edit:
     join: Annotated[Path | None, optional("OTHER")] = None
     """add run OTHER, lit by the environment map of RUN; selection and change then apply to OTHER"""
     data: OtherData = None
+    view: Annotated[str, arg(metavar="I|CAMERA.json")] = "0"
+    """view of --mask: its number, or a camera that the page of `refgs view` saved"""
+    split: Literal["test", "train"] = "test"
+    """split of --view"""
     preview: Flag = False
     """also write preview.png: views before and after"""
     selection: Selection = Selection()
@@ -100,7 +53,7 @@ class Edit:
 
     def run(self) -> Result:
         """Edit the run."""
-        from mi_refgs.editing import assignments
+        from mi_refgs.editing.change import assignments
         from mi_refgs.editing.expression import parse_condition
         from mi_refgs.formats.cameras import read_cameras
         from mi_refgs.io.images import write_png
@@ -108,24 +61,22 @@ class Edit:
         from mi_refgs.runs.run import Run
 
         _require_free(self.output)
-        options = vars(self.selection) | vars(self.change) | {"set": joined(self.change.set)}
+        options = vars(self.selection) | vars(self.change)
+        options["set"] = joined(options["set"])
         # Formulas are checked before the run is read, which takes seconds.
         assignments(options["set"])
         if self.selection.where is not None:
             parse_condition(self.selection.where)
 
         # A number of a view or a file of a camera.
-        view = self.selection.view
-        if re.fullmatch(r"-?\d{1,9}", view, re.ASCII):
-            options["view"] = int(view)
-        else:
-            options["view"] = read_cameras(Path(view))[0]
+        number = re.fullmatch(r"-?\d{1,9}", self.view, re.ASCII)
+        view = int(self.view) if number else read_cameras(Path(self.view))[0]
 
         whole = load(self.run_folder, write=False)
         whole = replace(whole, provenance=whole.provenance.with_data(self.data))
         join = None if self.join is None else load(self.join, write=False)
         try:
-            edited = whole.edit(**options, join=join)
+            edited = whole.edit(**options, view=view, split=self.split, join=join)
         except InputError as error:
             runs = " + ".join(str(path) for path in (self.run_folder, self.join) if path is not None)
             raise InputError(f"{runs}: {error}") from error
@@ -142,7 +93,7 @@ class Edit:
 
 def _preview(before: Any, after: Any) -> Any:
     """Render test views before and after, or cameras around the object without the data set."""
-    from mi_refgs.editing import before_and_after
+    from mi_refgs.editing.edit import before_and_after
 
     cameras = before.cameras()
     if not before.provenance.has_data:

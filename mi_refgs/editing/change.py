@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.editing.expression import COLOUR, Expression, SurfelValues, parse_numbers
+from mi_refgs.editing.options import Assignments, Change, Rotate
 from mi_refgs.editing.placement import MAJORITY, TINY, Owners, Placement, joined_mesh
 from mi_refgs.editing.selection import finite
 from mi_refgs.errors import InputError, abbreviated
@@ -26,11 +27,6 @@ SCALES = (1e-6, 1e6)
 """Range of --scale: float32 represents no scene beyond."""
 COLOUR_FLOOR = 1e-3
 """Colour below which a surfel's SH of higher degrees are set to 0 by a new colour instead of scaled."""
-
-Value = float | str | Sequence[float | str]
-Assignments = Mapping[str, Value] | Iterable[str]
-Rotate = tuple[str | Sequence[float], float | str] | Sequence[str]
-"""An axis, "x", "y", "z" or three numbers, and degrees."""
 
 
 @dataclass(frozen=True)
@@ -72,80 +68,48 @@ def assignments(given: Assignments) -> tuple[Assignment, ...]:
     return tuple(Assignment.parse(text) for text in ([given] if isinstance(given, str) else given))
 
 
-@dataclass(frozen=True)
-class Change:
-    """What is done to selected surfels, in this order: set; scale, rotate and move; duplicate, cut or keep.
+def placement_of(
+    change: Change,
+    raw: Mapping[str, np.ndarray],  # raw attributes of the selected surfels
+) -> Placement:
+    """Return the transform of selected surfels; raises InputError for bad numbers.
 
-    The pivot is the mean of the selected positions, weighted by opacity, before the change. With `duplicate`
-    a copy is changed and the original stays. Raises InputError for options that contradict each other.
+    The pivot is the mean of the positions, weighted by opacity, before the change. The translation includes
+    that of a duplicate.
     """
+    if not SCALES[0] <= change.scale <= SCALES[1]:
+        raise InputError(f"--scale: {change.scale:g} is out of range; give {SCALES[0]:g} to {SCALES[1]:g}")
+    options = (("--move", change.move), ("--duplicate", change.duplicate))
+    shift = sum((finite(name, x, 3) for name, x in options if x is not None), np.zeros(3))
+    # Not the median, which does not rotate with the surfels: a rotation and its inverse would shift them.
+    weight = sigmoid(raw["opacity"][:, 0]) + TINY
+    pivot = np.average(raw["position"].astype(np.float64), axis=0, weights=weight)
+    return Placement(pivot, shift, _rotation(change.rotate), float(change.scale))
 
-    set: tuple[Assignment, ...] = ()  # see `assignments`
-    cut: bool = False  # remove the selected surfels
-    keep: bool = False  # remove the others
-    move: Sequence[float] | None = None  # (3,) scene units
-    rotate: Rotate | None = None
-    scale: float = 1.0
-    duplicate: Sequence[float] | None = None  # (3,) scene units by which the copy is moved
 
-    def __post_init__(self) -> None:
-        if self.cut and not replace(self, cut=False).is_empty:
-            raise InputError("--cut: what is removed cannot be changed, too; leave the rest out")
-        if self.keep and self.duplicate is not None:
-            raise InputError("--keep: not possible with --duplicate; do one after the other")
-        if not SCALES[0] <= self.scale <= SCALES[1]:
-            raise InputError(f"--scale: {self.scale:g} is out of range; give {SCALES[0]:g} to {SCALES[1]:g}")
-        _ = self.rotation, self.shift  # raise for bad values
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether it changes nothing."""
-        options = (self.move, self.rotate, self.duplicate)
-        changes = self.set or self.cut or self.keep or self.scale != 1
-        return not changes and all(option is None for option in options)
-
-    @property
-    def moves(self) -> bool:
-        """Whether it places surfels elsewhere, or larger."""
-        return not replace(self, set=(), cut=False, keep=False).is_empty
-
-    @property
-    def rotation(self) -> Rotation:
-        """The rotation about the pivot; raises InputError for a bad axis or angle."""
-        if self.rotate is None:
-            return Rotation.identity()
-        if isinstance(self.rotate, str) or len(self.rotate) != 2:
-            raise InputError(f"--rotate: {abbreviated(self.rotate)}: not an axis and an angle; example: z 90")
-        given, angle = self.rotate
-        try:
-            numbers = AXES.get(given) or given.split(",") if isinstance(given, str) else given
-            axis = finite("--rotate", [float(number) for number in numbers], 3)
-        except (ValueError, TypeError) as error:
-            remedy = "no axis; give x, y, z, or three numbers like 0,0,1"
-            raise InputError(f"--rotate: {abbreviated(given)}: {remedy}") from error
-        try:
-            degrees = float(angle)
-        except (ValueError, TypeError) as error:
-            raise InputError(f"--rotate: {abbreviated(angle)}: no angle; give degrees, like z 90") from error
-        length = np.linalg.norm(axis)
-        if not (np.isfinite(degrees) and length > 0):
-            raise InputError("--rotate: an axis without length, or an infinite angle; give them like z 90")
-        if degrees % 360 == 0:
-            return Rotation.identity()
-        return Rotation.from_rotvec(np.radians(degrees) * axis / length)
-
-    @property
-    def shift(self) -> np.ndarray:
-        """The translation (3,), that of a duplicate included; raises InputError for bad vectors."""
-        options = (("--move", self.move), ("--duplicate", self.duplicate))
-        return sum((finite(name, x, 3) for name, x in options if x is not None), np.zeros(3))
-
-    def placement(self, raw: Mapping[str, np.ndarray]) -> Placement:
-        """Return the transform of selected surfels with these raw attributes."""
-        # Not the median, which does not rotate with the surfels: a rotation and its inverse would shift them.
-        weight = sigmoid(raw["opacity"][:, 0]) + TINY
-        pivot = np.average(raw["position"].astype(np.float64), axis=0, weights=weight)
-        return Placement(pivot, self.shift, self.rotation, float(self.scale))
+def _rotation(given: Rotate | None) -> Rotation:
+    """Return a rotation by an axis and an angle; raises InputError for bad ones."""
+    if given is None:
+        return Rotation.identity()
+    if isinstance(given, str) or len(given) != 2:
+        raise InputError(f"--rotate: {abbreviated(given)}: not an axis and an angle; example: z 90")
+    name, angle = given
+    try:
+        numbers = AXES.get(name) or name.split(",") if isinstance(name, str) else name
+        axis = finite("--rotate", [float(number) for number in numbers], 3)
+    except (ValueError, TypeError) as error:
+        remedy = "no axis; give x, y, z, or three numbers like 0,0,1"
+        raise InputError(f"--rotate: {abbreviated(name)}: {remedy}") from error
+    try:
+        degrees = float(angle)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"--rotate: {abbreviated(angle)}: no angle; give degrees, like z 90") from error
+    length = np.linalg.norm(axis)
+    if not (np.isfinite(degrees) and length > 0):
+        raise InputError("--rotate: an axis without length, or an infinite angle; give them like z 90")
+    if degrees % 360 == 0:
+        return Rotation.identity()
+    return Rotation.from_rotvec(np.radians(degrees) * axis / length)
 
 
 def apply(
@@ -153,11 +117,16 @@ def apply(
     chosen: np.ndarray,  # (N,) bool
     change: Change,
 ) -> TrainedScene:
-    """Return the scene with the chosen surfels and their triangles changed.
+    """Return the scene with the chosen surfels and their triangles changed; `materials` is the caller's.
 
     All other surfels keep their values bit for bit, and the order stays; a duplicate comes after all. Raises
-    InputError for an empty selection, for values that cannot be set, and if no surfel would be left.
+    InputError for an empty selection, for values that cannot be set, for options that contradict each other,
+    and if no surfel would be left.
     """
+    if change.cut and (change.set or change.keep or change.moves):
+        raise InputError("--cut: what is removed cannot be changed, too; leave the rest out")
+    if change.keep and change.duplicate is not None:
+        raise InputError("--keep: not possible with --duplicate; do one after the other")
     if chosen.shape != (scene.surfels.count,) or not chosen.any():
         raise InputError("selection: no surfel is in it; choose a wider one")
     if change.cut and chosen.all():
@@ -165,8 +134,8 @@ def apply(
     values = SurfelValues(scene)
     raw = values.raw
     own = {name: table[chosen] for name, table in raw.items()}
-    placement = change.placement(own)
-    for assignment in change.set:
+    placement = placement_of(change, own)
+    for assignment in assignments(change.set):
         _assign(values, own, chosen, assignment)
     mesh = _mesh(scene, chosen, own["opacity"], change, placement)
     placement.surfels(own)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
 from mi_refgs.data.view import evenly_spread
-from mi_refgs.editing.change import Assignments, Change, Rotate, apply, assignments
+from mi_refgs.editing.change import apply, assignments
 from mi_refgs.editing.expression import COLOUR
 from mi_refgs.editing.joining import join
-from mi_refgs.editing.selection import Selection, select
+from mi_refgs.editing.options import Change, EditOptions, Selection
+from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import contact_sheet, image_array
 from mi_refgs.render.display import displayed
@@ -25,46 +26,6 @@ from mi_refgs.splat import Camera
 PREVIEWS = 4
 """Views of `before_and_after`, spread evenly over the cameras."""
 WHITE = np.ones(3, np.float32)
-WHICH = {"where", "box", "nearest", "mask", "invert"}
-"""Options that select surfels."""
-
-
-class EditOptions(TypedDict, total=False):
-    """Keywords of `Reconstruction.edit`, options of `refgs edit`: which surfels, and what is done to them.
-
-    The surfels that meet every given condition are selected, without a condition all of them. Changes are
-    applied in the order below. Lengths are in scene units.
-    """
-
-    where: str | None
-    """An expression such as "metallic > 0.5 and z < 0" of activated values: x y z, opacity, size (the largest
-    standard deviation), normal.x … .z (outwards), the run's materials such as albedo.r, roughness and
-    metallic, colour.r … .b (the fitted radiance, its SH term of degree 0), luminance; with + - * / **,
-    comparisons, and or not, abs sqrt min max."""
-    box: Sequence[float] | None
-    """(6,): two opposite corners, between which centres lie."""
-    nearest: Sequence[float] | None
-    """(x, y, z, r): centres within r of the surfel that is nearest to the point."""
-    mask: np.ndarray | str | Path | None
-    """(H, W) bool, or an image painted white: the surfels that the view shows there, not those behind."""
-    invert: bool
-    """Select the others instead."""
-    materials: bool
-    """First replace the fitted colours of the whole scene by materials, which follow the light."""
-    set: Assignments
-    """{"roughness": 0.3, "albedo": (0.9, 0.6, "0.5 * albedo.b")}, or texts such as "roughness*=0.5"."""
-    scale: float
-    """Factor of the size, about the mean of the selected positions weighted by opacity."""
-    rotate: Rotate | None
-    """("z", degrees), or three numbers for z: counter-clockwise rotation about an axis through that mean."""
-    move: Sequence[float] | None
-    """(3,)."""
-    duplicate: Sequence[float] | None
-    """(3,): change a copy instead, which is moved by this vector; the original stays."""
-    cut: bool
-    """Remove the selected surfels."""
-    keep: bool
-    """Remove the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +52,14 @@ def edit(
     for name in options.keys() - known:
         raise InputError(f"edit: {name}: unknown option; use some of {', '.join(known)}")
     given: dict[str, Any] = {**options}
-    materials = given.pop("materials", False)
-    which = {name: given.pop(name) for name in WHICH & given.keys()}
-    change = Change(**given | {"set": assignments(given.get("set", ()))})
-    if change.is_empty and not materials and into is None:
+    selection = Selection(**{f.name: given.pop(f.name) for f in fields(Selection) if f.name in given})
+    given["set"] = tuple(assignment.text for assignment in assignments(given.get("set", ())))
+    change = Change(**given)
+    if change.is_empty and into is None:
         raise InputError("edit: nothing to do; give --set, --cut, --move or another change")
-    if materials:
+    if change.materials:
         scene, into = relightable(scene), None if into is None else relightable(into)
-    chosen = select(scene, Selection(camera=camera, **which))
+    chosen = select(scene, selection, camera)
     notes = notes_of(scene, change, into is not None)
     changed = scene if change.is_empty else apply(scene, chosen, change)
     if into is not None:
@@ -113,7 +74,7 @@ def _recorded(options: EditOptions, change: Change) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in options.items():
         if name == "set" and change.set:
-            found[name] = [assignment.text for assignment in change.set]
+            found[name] = [*change.set]
         elif name == "mask" and isinstance(value, str | Path):
             found[name] = str(value)
         elif name not in ("set", "mask") and not (
@@ -133,7 +94,7 @@ def _plain(value: Any) -> Any:
 def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[str]:
     """Return what of a fit does not follow a change: values that depend on its light and its place."""
     shading, surfels = scene.shading, scene.surfels
-    names = [assignment.name.partition(".")[0] for assignment in change.set]
+    names = [assignment.name.partition(".")[0] for assignment in assignments(change.set)]
     placed = joined or change.moves
     indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
     read = {*shading.required_attributes, *surfels.primitive.widths}

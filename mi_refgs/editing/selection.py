@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -12,6 +11,7 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.editing.expression import SurfelValues, parse_condition
+from mi_refgs.editing.options import Selection
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, read_mask
 from mi_refgs.kernels.device import upload
@@ -28,19 +28,11 @@ mirror ball of 12,000 surfels, painted completely, 0.6 % of the far side are sel
 a limit), and 99.1 % of the weight that the image blends (96.6 % at 1, 99.7 % at 6)."""
 
 
-@dataclass(frozen=True)
-class Selection:
-    """Surfels that meet every condition that is given; all surfels without any."""
-
-    where: str | None = None  # an expression, see `expression`
-    box: Sequence[float] | None = None  # x0 y0 z0 x1 y1 z1: two opposite corners; centres lie inside
-    nearest: Sequence[float] | None = None  # x y z r: centres within r of the surfel nearest to the point
-    mask: np.ndarray | str | Path | None = None  # of the view of `camera`: see `painted`, `read_painted`
-    camera: Camera | None = None
-    invert: bool = False  # select the others instead
-
-
-def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
+def select(
+    scene: TrainedScene,
+    selection: Selection,
+    camera: Camera | None = None,  # of the view that the mask belongs to
+) -> np.ndarray:
     """Return the selected surfels (N,) bool; raises InputError for bad conditions, or if none is selected."""
     count = scene.surfels.count
     chosen = np.ones(count, bool)
@@ -59,7 +51,7 @@ def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
         middle = position[np.argmin(np.linalg.norm(position - point, axis=1))]
         chosen &= np.linalg.norm(position - middle, axis=1) <= radius
     if selection.mask is not None:
-        given, camera = selection.mask, selection.camera
+        given = selection.mask
         if camera is None:
             raise InputError("--mask: the view that it was painted in is missing; give its camera")
         mask = given if isinstance(given, np.ndarray) else read_painted(Path(given), camera)

@@ -15,9 +15,11 @@ from typing import Any, TypeAlias, Unpack
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs import editing, formats
+from mi_refgs import formats
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
+from mi_refgs.editing import edit as editing
+from mi_refgs.editing.options import EditOptions
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.images import image_array
@@ -237,7 +239,7 @@ class Reconstruction:
         view: CameraLike = 0,
         split: str = "test",
         join: Reconstruction | str | Path | None = None,
-        **options: Unpack[editing.EditOptions],
+        **options: Unpack[EditOptions],
     ) -> Reconstruction:
         """Change some surfels, as `refgs edit` does; `provenance.edits[-1]` then records how many.
 

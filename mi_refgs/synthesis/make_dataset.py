@@ -45,12 +45,11 @@ from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.progress import with_bar
 from mi_refgs.synthesis.ground_truth import surface_mesh
+from mi_refgs.synthesis.options import DatasetOptions, LightFile
 from mi_refgs.synthesis.pathtrace import MAPS, Cameras, Tracer, bounding_sphere, environment_image, reach
 from mi_refgs.synthesis.settings import (
     RELIGHT,
     SURFACE,
-    DatasetOptions,
-    LightFile,
     load_scene,
     prepare_folder,
     under_light,

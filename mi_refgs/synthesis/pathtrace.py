@@ -14,7 +14,7 @@ from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis.ground_truth import materials_at
-from mi_refgs.synthesis.settings import DatasetOptions
+from mi_refgs.synthesis.options import DatasetOptions
 from mi_refgs.types import Point2f
 
 SAMPLES_PER_LAUNCH = 1 << 24

@@ -1,27 +1,21 @@
-"""Options of a path-traced data set, the folder that records them, and its scene files."""
+"""The folder of a path-traced data set, which records its settings, and its scene under each light."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
-import math
-import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from tyro.conf import Suppress, arg
 
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import mitsuba_exr
-from mi_refgs.io.files import make_folder, read_json, require_file, write_json
+from mi_refgs.io.files import make_folder, read_json, write_json
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.shade.light.light_file import read_radiance
+from mi_refgs.synthesis.options import LightFile
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
 RELIGHT = "relight"  # folder of the test views under other environment maps
@@ -37,39 +31,6 @@ Z_UP = (1, 0, 0), 90.0
 """Axis and angle in degrees that rotate y of a lat-long map to z, in scenes without an `envmap`."""
 LATER = {"light": "", "light_sha256": "", "height": 0, "objects": [], "distance": [0, 0]}
 """Values of settings that records of older versions lack."""
-
-
-@dataclass(frozen=True)
-class LightFile:
-    """A lat-long map that replaces the environment of a scene."""
-
-    path: Path
-    name: str  # of the folder of its relit views
-    sha256: str
-
-    @staticmethod
-    def of(path: Path) -> LightFile:
-        """Hash a file; raises InputError if it is missing."""
-        require_file(path)
-        name = re.sub(r"[^0-9A-Za-z_-]+", "_", path.stem).strip("_") or "light"
-        return LightFile(path, name, hashlib.sha256(path.read_bytes()).hexdigest())
-
-
-def scene_hash(scene: Path) -> str:
-    """SHA-256 of a scene's XML and the files in it; raises InputError if it is missing or no XML."""
-    if not scene.is_file():
-        raise InputError(f"{scene}: scene: missing; give the path of a Mitsuba XML file")
-    try:
-        root = ElementTree.fromstring(scene.read_bytes())
-    except ElementTree.ParseError as error:
-        raise InputError(f"{scene}: scene: not XML ({error}); give a Mitsuba scene") from error
-    digest = hashlib.sha256(scene.read_bytes())
-    names = [e.get("value") for e in root.iter("string") if e.get("name") == "filename"]
-    for name in [*names, *(e.get("filename") for e in root.iter("include"))]:
-        file = scene.parent / (name or "")
-        if file.is_file():
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
 
 
 def load_scene(scene: Path, whole: bool = False) -> Any:
@@ -111,92 +72,6 @@ def under_light(scene: Any, light: Path) -> Any:
     parts = {f"part_{i}": part for i, part in enumerate([*scene.shapes(), *lamps])}
     environment = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
     return mi.load_dict({"type": "scene", **parts, "environment": environment})
-
-
-Count = Annotated[int, arg(metavar="N")]
-Range = tuple[float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatasetOptions:
-    """What determines the pixels of a data set, beside its scene."""
-
-    views: Count = 80
-    """training views"""
-    test_views: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """test views (default: a quarter of --views)"""
-    size: Annotated[int | tuple[int, int], Suppress] = 160
-    """pixels per side, or width and height"""
-    spp: Annotated[int, arg(metavar="N", name="samples")] = 128
-    """samples per pixel; path tracing is noisy, so that the default is larger than that of other commands"""
-    objects: Annotated[tuple[str, ...], arg(metavar="NAME …", name="shapes", help_behavior_hint="")] = ()
-    """shapes of interest of an open scene: opaque images, ground truth of these shapes only"""
-    distance: Annotated[Range | None, arg(metavar="NEAR FAR", help_behavior_hint="")] = None
-    """distance of cameras from the object's centre, scene units (default: the object fills the image)"""
-    elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)
-    """elevation of cameras, degrees"""
-    fov: Annotated[float, arg(metavar="DEG")] = 40.0
-    """field of view of the shorter side"""
-    fill: Annotated[float, Suppress] = 0.95
-    """fraction of the shorter side that the object's bounding sphere fills, where `distance` is not given"""
-    seed: Count = 0
-    """seed of cameras and paths"""
-    max_depth: Count = 6
-    """largest path depth"""
-    environment_height: Annotated[int, Suppress] = 256
-    """rows of environment.exr; 0 writes none"""
-    light: Annotated[str | Path | None, arg(metavar="ENV", help_behavior_hint="")] = None
-    """lat-long map (EXR, HDR) instead of the scene's environment map, rotated as that is"""
-
-    @property
-    def resolution(self) -> tuple[int, int]:
-        """Width and height, pixels."""
-        return (self.size, self.size) if isinstance(self.size, int) else self.size
-
-    @property
-    def focal(self) -> float:
-        """Focal length, pixels."""
-        return 0.5 * min(self.resolution) / math.tan(math.radians(self.fov) / 2)
-
-    def count(self, split: str) -> int:
-        """Number of views of a split."""
-        if split == "train":
-            return self.views
-        return max(1, self.views // 4) if self.test_views is None else self.test_views
-
-    def record(self, scene: Path) -> dict[str, Any]:
-        """The content of dataset.json. Raises InputError for a scene or light that cannot be read, and for an
-        option that is out of range.
-        """
-        light = None if self.light is None else LightFile.of(Path(self.light))
-        width, height = self.resolution
-        values = vars(self) | {
-            "scene": scene.name,
-            "scene_sha256": scene_hash(scene),  # of the XML and the files in it
-            "test_views": self.count("test"),
-            "size": width,
-            "height": 0 if height == width else height,
-            "light": "" if light is None else light.path.name,
-            "light_sha256": "" if light is None else light.sha256,
-            "distance": self.distance or (0, 0),
-        }
-
-        def need(good: Any, field: str, remedy: str) -> None:
-            if not good:
-                raise InputError(f"{scene}: {field}: {values[field]} is out of range; {remedy}")
-
-        for field in ("views", "test_views", "size", "spp", "max_depth"):
-            need(values[field] >= 1, field, "give a number of at least 1")
-        low, high = self.elevation
-        need(-90 < low < high < 90, "elevation", "give two angles in degrees, -90 < low < high < 90")
-        need(0 < self.fov < 170, "fov", "give degrees between 0 and 170")
-        need(0 < self.fill <= 1, "fill", "give a fraction between 0 and 1")
-        need(self.seed >= 0, "seed", "give a number of at least 0")
-        need(height >= 1, "height", "give a number of at least 1")
-        near, far = self.distance or (1, 1)
-        need(0 < near <= far < np.inf, "distance", "give two lengths, 0 < NEAR <= FAR")
-        content: dict[str, Any] = json.loads(json.dumps(values, default=lambda array: array.tolist()))
-        return content
 
 
 def prepare_folder(

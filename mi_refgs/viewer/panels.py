@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.editing import Change, Selection, apply, assignments, select
+from mi_refgs.editing.change import apply
+from mi_refgs.editing.options import Change, Selection
 from mi_refgs.editing.placement import object_mesh
+from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -190,7 +192,7 @@ class MaterialsPanel:
         self._update()
 
     def _change(self) -> SceneChange:
-        mask, change = self.mask, Change(set=assignments(dict(self.values)))
+        mask, change = self.mask, Change(set=dict(self.values))
         return lambda scene: apply(scene, mask, change)
 
     def _update(self) -> None:

@@ -15,10 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.editing import Change, Selection, apply, assignments, edit, join, select
+from mi_refgs.editing.change import apply, assignments, placement_of
+from mi_refgs.editing.edit import edit
 from mi_refgs.editing.expression import SurfelValues
-from mi_refgs.editing.joining import joined_shading
+from mi_refgs.editing.joining import join, joined_shading
+from mi_refgs.editing.options import Change, Selection
 from mi_refgs.editing.placement import rotated_sh
+from mi_refgs.editing.selection import select
 from mi_refgs.io.images import write_png
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.reference.camera import look_at
@@ -137,12 +140,12 @@ def test_a_painted_mask_selects_the_surfels_in_front(scene: TrainedScene) -> Non
     local = (raw["position"] - origin) @ FRONT[:3, :3]
     pixel = -1.6 * SIZE * local[:, :2] / local[:, 2:] + SIZE / 2
     mask = (column - 16) ** 2 + (row - 24) ** 2 < 6**2
-    chosen = select(scene, Selection(mask=mask, camera=camera))
+    chosen = select(scene, Selection(mask=mask), camera)
     inside = (pixel[:, 0] - 16.5) ** 2 + (pixel[:, 1] - 24.5) ** 2
     assert chosen[(inside < 5**2) & (facing > 0.2)].mean() > 0.99
     assert not chosen[facing < -0.2].any() and not chosen[inside > 7.5**2].any()
-    small = Selection(mask=np.ones((2, 3), bool), camera=camera)
-    refused(lambda: select(scene, small), "--mask: 3 × 2 pixels, but the view has 48 × 48")
+    small = Selection(mask=np.ones((2, 3), bool))
+    refused(lambda: select(scene, small, camera), "--mask: 3 × 2 pixels, but the view has 48 × 48")
 
 
 # ---------------- materials ----------------
@@ -275,7 +278,7 @@ def test_sh_rotates_exactly(rng: np.random.Generator) -> None:
 
 def moved_pose(scene: TrainedScene, change: Change) -> np.ndarray:
     """FRONT, transformed as the scene is."""
-    place, pose = change.placement(scene.surfels.to_numpy()), FRONT.copy()
+    place, pose = placement_of(change, scene.surfels.to_numpy()), FRONT.copy()
     pose[:3, :3] = place.rotation.as_matrix() @ FRONT[:3, :3]
     pose[:3, 3] = place.points(FRONT[None, :3, 3])[0]
     return pose

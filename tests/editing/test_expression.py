@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mi_refgs.editing import assignments
+from mi_refgs.editing.change import assignments
 from mi_refgs.editing.expression import MAX_DEPTH, parse_condition, parse_numbers
 from mi_refgs.errors import InputError
 from tests.helpers import refused

@@ -23,7 +23,8 @@ from mi_refgs.io.ownership import RECORD
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
-from mi_refgs.synthesis.settings import DatasetOptions, load_scene, under_light
+from mi_refgs.synthesis.options import DatasetOptions
+from mi_refgs.synthesis.settings import load_scene, under_light
 from tests.helpers import read_loaded, refused
 from tests.scenes.integrator import sky
 from tests.scenes.sphere import CENTRE, RADIUS, SCENE

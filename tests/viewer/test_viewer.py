@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.editing import Change, Selection, apply, assignments, select
+from mi_refgs.editing.change import apply
+from mi_refgs.editing.options import Change, Selection
+from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.fitting.train import Trainer
@@ -422,7 +424,7 @@ def test_relit_materials_are_those_of_relight_and_edits_stay(scene: TrainedScene
 
 def test_an_edit_is_displayed_as_the_edited_scene(scene: TrainedScene) -> None:
     metal = select(scene, Selection(where="metallic > 0.5"))
-    change = Change(set=assignments({"roughness": 0.9, "metallic": 0.2}))
+    change = Change(set={"roughness": 0.9, "metallic": 0.2})
     drawable = ReconstructionView(scene)
     drawable.set_changes([lambda given: apply(given, metal, change)])
     assert np.array_equal(shown(drawable), shown(apply(scene, metal, change)))

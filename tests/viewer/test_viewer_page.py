@@ -26,7 +26,9 @@ import pytest
 from PIL import Image
 
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.editing import Change, Selection, apply, assignments, select
+from mi_refgs.editing.change import apply
+from mi_refgs.editing.options import Change, Selection
+from mi_refgs.editing.selection import select
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.methods.read import load
@@ -302,7 +304,7 @@ def test_the_roughness_slider_displays_and_saves_the_edited_scene(
     tab.press("EXR")
     path = saved_view(folder, ".exr", known)
     chosen = select(scene, Selection(where="metallic > 0.5"))
-    edited = apply(scene, chosen, Change(set=assignments({"roughness": 0.9})))
+    edited = apply(scene, chosen, Change(set={"roughness": 0.9}))
     found, camera = read_exr_image(path), camera_of(path)
     unlike, like = (np.abs(found - rendered(given, camera)) for given in (scene, edited))
     assert unlike.max() > 0.1
