@@ -346,7 +346,9 @@ def test_shared_light_learns_sum_of_gradients(method: Method, monkeypatch: pytes
         seen: list[np.ndarray] = []
         real = trainer.fit.optimiser.step
 
-        def step(iteration: int, loss: Any, fit: Any = trainer, seen: Any = seen, real: Any = real) -> None:
+        def step(
+            iteration: int, loss: Any, fit: Any = trainer.fit, seen: Any = seen, real: Any = real
+        ) -> None:
             seen.append(np.array(dr.grad(fit.params["light"]).array))
             real(iteration, loss)
 
