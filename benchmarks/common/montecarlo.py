@@ -19,7 +19,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from benchmarks.common.view import Points
-from mi_refgs.reference.shade import split_sum
+from mi_refgs.reference.lobe import split_sum_entry
 
 LATTICES = (34, 55, 89, 144, 233, 377, 610, 987, 1597, 2584, 4181)
 """Fibonacci numbers: the good sizes of a rank-1 lattice with the predecessor as its generator."""
@@ -70,7 +70,7 @@ class Lobe:
 
 @cache
 def _table_spline(roughness: float) -> Any:
-    pairs = np.array([split_sum(float(c), roughness, TABLE_NODES) for c in TABLE_COSINES])
+    pairs = np.array([split_sum_entry(float(c), roughness, TABLE_NODES) for c in TABLE_COSINES])
     return CubicSpline(np.sqrt(TABLE_COSINES), pairs)
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from mi_refgs import constants as c
 from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
 from mi_refgs.reference.footprint import GEOMETRY, Rules
-from mi_refgs.reference.models import MATERIALS, MODELS, Light, Options, Points, harmonics, positive, unit
-from mi_refgs.reference.shade import bilinear
+from mi_refgs.reference.light import Light, radiance_of
+from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points, harmonics, positive, unit
 from mi_refgs.reference.splat import STEP, Blend, primitive_of
 
 Array = np.ndarray
@@ -179,9 +179,9 @@ class Resolve:
         camera = scene.camera
         ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
         self.ray = unit(ray @ camera.to_world[:3, :3].T)
-        self.visibility = None
+        self.found = {}
         if scene.visibility is not None:
-            self.visibility = scene.visibility(unit(sums[:, :3]), self.ray)
+            self.found["visibility"] = scene.visibility(unit(sums[:, :3]), self.ray)[:, None]
 
     def __call__(self, sums: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
         scene, alpha = self.scene, sums[:, -1:]
@@ -200,7 +200,7 @@ class Resolve:
                     values["roughness"],
                 )  # fmt: skip
             found: list[tuple[Array, Array, Array]] = []
-            points = Points(blended["normal"], -self.ray, values, self.visibility)
+            points = Points(blended["normal"], -self.ray, values | self.found)
             terms = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
             taps += [(texel, share, factor * alpha) for texel, share, factor in found]
             maps |= {name: term * alpha for name, term in zip(TERMS, terms, strict=True)}
@@ -258,7 +258,7 @@ def render_open(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
     if scene.at == "surfel":  # one slot for the normals of both
         maps["normal"] = maps["normal"] + blend.weight[count:].T @ _facing(other, direction)
     texels = np.log1p(np.exp(np.asarray(open_scene.background, np.float64)))
-    maps["background"] = bilinear(texels, resolve.ray)
+    maps["background"] = radiance_of(texels, resolve.ray)
     return maps, blend.band(1e-4)
 
 

@@ -82,6 +82,73 @@ def reflected(
     return (weight[:, None] * schlick(v_h, f0) * incoming(direction)).sum(0)
 
 
+def split_sum_entry(n_dot_v: float, roughness: float, nodes: int = 800) -> tuple[float, float]:
+    """(A, B) with ∫ f cosθ dω = A F0 + B at one cosine: an entry of the split-sum table."""
+    view = np.array([math.sqrt(1 - n_dot_v**2), 0, n_dot_v])
+    _, v_h, weight = lobe_nodes(np.array([0, 0, 1.0]), view, roughness, nodes, nodes // 8)
+    fresnel = (1 - v_h) ** 5
+    return float(weight @ (1 - fresnel)), float(weight @ fresnel)
+
+
+def normal_reflectance(albedo: np.ndarray, metallic: float | np.ndarray) -> np.ndarray:
+    """F0 of a dielectric of 4 % or a metal of its albedo, or a mixture."""
+    return 0.04 * (1 - metallic) + albedo * metallic
+
+
+def diffuse_reflectance(
+    albedo: np.ndarray, metallic: float, roughness: float, n_dot_v: float, nodes: int = 400
+) -> np.ndarray:
+    """(1 - F0 A - B) (1 - metallic) albedo, (3,): what the base reflects of what the specular layer leaves;
+    0 from behind."""
+    if n_dot_v <= 0:
+        return np.zeros(3)
+    a, b = split_sum_entry(n_dot_v, roughness, nodes)
+    return (1 - normal_reflectance(albedo, metallic) * a - b) * (1 - metallic) * albedo
+
+
+def brdf_cosine(
+    albedo: np.ndarray,
+    metallic: float,
+    roughness: float,
+    normal: np.ndarray,
+    view: np.ndarray,
+    lights: np.ndarray,
+) -> np.ndarray:
+    """BRDF times n·l, (n, 3), for unit directions `lights` (n, 3): GGX α = roughness², correlated Smith,
+    Schlick, and `diffuse_reflectance` / π; zero below the horizon."""
+    α2 = roughness**4
+    n_l, n_v = lights @ normal, float(normal @ view)
+    lit = (n_l > 0) & (n_v > 0)
+    half = np.where(lit[:, None], lights + view, normal)
+    half = half / np.linalg.norm(half, axis=1, keepdims=True)
+    n_h, v_h = half @ normal, half @ view
+    d = α2 / (math.pi * (n_h**2 * (α2 - 1) + 1) ** 2)
+    safe, n_v = np.where(lit, n_l, 1), n_v if n_v > 0 else 1.0
+    g = 1 / (1 + smith_lambda(safe, roughness**2) + smith_lambda(n_v, roughness**2))
+    specular = schlick(v_h, normal_reflectance(albedo, metallic)) * (d * g / (4 * safe * n_v))[:, None]
+    base = diffuse_reflectance(albedo, metallic, roughness, float(normal @ view))
+    return np.where(lit, n_l, 0)[:, None] * specular + np.maximum(n_l, 0)[:, None] * base / math.pi
+
+
+def reflected_radiance(
+    incoming: Incoming,
+    albedo: np.ndarray,
+    metallic: float,
+    roughness: float,
+    normal: np.ndarray,
+    view: np.ndarray,
+    *,
+    nodes: int = 400,
+) -> np.ndarray:
+    """∫ L f cosθ dω (3,) under `brdf_cosine`, by midpoints: the diffuse part over cos²θ."""
+    s, turn = (x.ravel() for x in np.meshgrid(*[(np.arange(nodes) + 0.5) / nodes] * 2))
+    φ = 2 * math.pi * turn
+    local = np.stack([np.sqrt(1 - s) * np.cos(φ), np.sqrt(1 - s) * np.sin(φ), np.sqrt(s)], axis=1)
+    base = diffuse_reflectance(albedo, metallic, roughness, float(normal @ view))
+    diffuse = base * incoming(local @ frame(normal)).mean(0)
+    return diffuse + reflected(incoming, normal, view, roughness, normal_reflectance(albedo, metallic), nodes)
+
+
 def traced_fraction(
     free: Incoming, normal: np.ndarray, view: np.ndarray, roughness: float, f0: float, nodes: int = 200
 ) -> float:

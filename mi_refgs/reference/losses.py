@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from mi_refgs.reference.shade import bilinear
+from mi_refgs.reference.light import radiance_of
 
 
 def srgb(linear: float) -> float:
@@ -141,13 +141,10 @@ def half_metal(metallic: np.ndarray, alpha: np.ndarray) -> float:
 
 def _irradiances(level: np.ndarray, count: int = 256) -> np.ndarray:
     """Colours (count, 3) of an irradiance map in the directions of a spherical Fibonacci lattice around y."""
-    found = []
-    for i in range(count):
-        z = 1 - (2 * i + 1) / count
-        φ = i * math.pi * (3 - math.sqrt(5))
-        ring = math.sqrt(1 - z * z)
-        found.append(bilinear(level, np.array([ring * math.cos(φ), ring * math.sin(φ), z])))
-    return np.array(found)
+    i = np.arange(count)
+    z = 1 - (2 * i + 1) / count
+    φ, ring = i * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - z * z)
+    return radiance_of(level, np.stack([ring * np.cos(φ), ring * np.sin(φ), z], axis=1))
 
 
 def mean_irradiance(level: np.ndarray) -> float:

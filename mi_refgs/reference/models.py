@@ -9,37 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.shade import clip, sh_basis, table_lookup
+from mi_refgs.reference.light import Light, bilinear, irradiance, specular, table_lookup
+from mi_refgs.reference.lobe import normal_reflectance
 
 Array = np.ndarray
 Taps = list[tuple[Array, Array, Array]]
 
 
-DIELECTRIC_F0 = 0.04
 MATERIALS = ("albedo", "metallic", "roughness", "tint")
-
-
-@dataclass(frozen=True)
-class Light:
-    """Prefiltered levels, the map itself first, and the roughness of the others; the split-sum table."""
-
-    levels: list[Array]  # (h, 2h, 3) each
-    roughness: tuple[float, ...]
-    table: Array  # (n, n, 2): [roughness, n·v]
-    turn: Array | None = None  # (3, 3): from world directions to the map's
-
-    def flat(self) -> Array:
-        """All texels (T, 3), level after level."""
-        return np.concatenate([level.reshape(-1, 3) for level in self.levels])
-
-    def split(self, flat: Array) -> list[Array]:
-        """Inverse of `flat`."""
-        ends = np.cumsum([level.size // 3 for level in self.levels])[:-1]
-        return [x.reshape(y.shape) for x, y in zip(np.split(flat, ends), self.levels, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -60,8 +42,14 @@ class Points:
 
     normal: Array
     view: Array
-    values: dict[str, Array]  # by name, such as albedo (n, 3) and metallic (n, 1)
-    visibility: Array | None = None  # (n,)
+    values: dict[str, Array]  # by name, such as albedo (n, 3), metallic and visibility (n, 1)
+
+    @staticmethod
+    def of(values: dict[str, Any]) -> Points:
+        """Points from arrays (n, …) by name, normal and view among them; what is None is left out."""
+        found = {n: np.asarray(x, np.float64) for n, x in values.items() if x is not None}
+        found = {n: x.reshape(len(x), -1) for n, x in found.items()}
+        return Points(found.pop("normal"), found.pop("view"), found)
 
 
 Model = Callable[[Points, Light | None, Options, Taps], list[Array]]
@@ -73,35 +61,29 @@ def split_sum(points: Points, light: Light | None, options: Options, taps: Taps)
     n, v, values = unit(points.normal), unit(points.view), points.values
     albedo, metallic, roughness = values["albedo"], values["metallic"], values["roughness"][:, 0]
     n_v = np.sum(n * v, 1)
-    f0 = DIELECTRIC_F0 * (1 - metallic) + albedo * metallic
+    f0 = normal_reflectance(albedo, metallic)
     a, b = table_lookup(light.table, n_v, roughness).T
     reflectance = f0 * a[:, None] + b[:, None]
-    free = (np.ones(len(n)) if points.visibility is None else points.visibility)[:, None]
+    free = values.get("visibility", np.ones((len(n), 1)))
     direction = 2 * n_v[:, None] * n - v
     if options.dominant:  # [Lagarde and de Rousiers 2014, §4.9.3]
         smooth = 1 - roughness[:, None] ** 2
         direction = unit(n + smooth * (np.sqrt(smooth) + 1 - smooth) * (direction - n))
-    texel, share = specular(light, direction, roughness)
-    flat = light.flat()
-    taps.append((texel, share, reflectance * free))
-    reflected = reflectance * np.einsum("nk,nkc->nc", share, flat[texel])
-    texel, share = bilinear(light, n, np.full(len(n), len(light.levels) - 1))
-    irradiance = np.einsum("nk,nkc->nc", share, flat[texel])
+    reflected = _looked_up(light, specular(light, direction, roughness), free * reflectance, taps)
     if options.multiscatter:  # [Fdez-Agüera 2019]
         lost = (f0 + (1 - f0) / 21) * (1 - a - b)[:, None]
         further = reflectance * lost / (1 - lost)
-        taps.append((texel, share, further * free))
-        reflected, reflectance = reflected + further * irradiance, reflectance + further
+        reflected = reflected + _looked_up(light, irradiance(light, n), free * further, taps)
+        reflectance = reflectance + further
     if options.diffuse == "sh":
         scattered = (1 - metallic) * values["radiance"]
     else:
-        factor = positive(1 - reflectance) * (1 - metallic) * albedo
-        taps.append((texel, share, factor))
-        scattered = factor * irradiance
+        base = positive(1 - reflectance) * (1 - metallic) * albedo * values.get("ambient", 1.0)
+        scattered = _looked_up(light, irradiance(light, n), base, taps)
     blocked = np.zeros_like(scattered)
-    if points.visibility is not None and "indirect" in values:
+    if "visibility" in values and "indirect" in values:
         blocked = (1 - free) * values["indirect"] * reflectance
-    return [scattered, free * reflected, blocked]
+    return [scattered, reflected, blocked]
 
 
 def radiance(points: Points, light: Light | None, options: Options, taps: Taps) -> list[Array]:
@@ -122,7 +104,8 @@ def mirror(points: Points, light: Light | None, options: Options, taps: Taps) ->
     assert light is not None
     n, v = unit(points.normal), unit(points.view)
     share = points.values["metallic"]
-    reflected = _looked_up(light, 2 * np.sum(n * v, 1, keepdims=True) * n - v, 0, share, taps)
+    lookup = bilinear(light, 2 * np.sum(n * v, 1, keepdims=True) * n - v, np.zeros(len(n), int))
+    reflected = _looked_up(light, lookup, share, taps)
     return _terms((1 - share) * points.values["radiance"], reflected)
 
 
@@ -133,12 +116,10 @@ def gaussian_shader(points: Points, light: Light | None, options: Options, taps:
     tint, roughness = values["tint"], values["roughness"][:, 0]
     cosine = np.sum(n * v, 1)
     scale, bias = table_lookup(light.table, cosine, roughness).T
-    around = _looked_up(light, n, len(light.levels) - 1, 1 - tint, taps)
-    texel, weight = specular(light, 2 * cosine[:, None] * n - v, roughness)
+    around = _looked_up(light, irradiance(light, n), 1 - tint, taps)
+    lookup = specular(light, 2 * cosine[:, None] * n - v, roughness)
     factor = tint * scale[:, None] + bias[:, None]
-    taps.append((texel, weight, factor))
-    reflected = np.einsum("nk,nkc->nc", weight, light.flat()[texel])
-    return _terms(values["radiance"] + around, factor * reflected)
+    return _terms(values["radiance"] + around, _looked_up(light, lookup, factor, taps))
 
 
 def monte_carlo(points: Points, light: Light | None, options: Options, taps: Taps) -> list[Array]:
@@ -165,8 +146,9 @@ def monte_carlo(points: Points, light: Light | None, options: Options, taps: Tap
         f_s = np.where(n_v.real > 0, d * f * smith / 4, 0)
         weight = 2 * math.pi / options.directions * positive(n_l)
         free = 1.0 if options.free is None else options.free[:, j : j + 1]
+        lookup = bilinear(light, w, np.zeros(len(w), int))
         for term, share in enumerate((base / math.pi, f_s)):
-            found[term] = found[term] + _looked_up(light, w, 0, free * weight * share, taps)
+            found[term] = found[term] + _looked_up(light, lookup, free * weight * share, taps)
         if incident is not None:
             found[2] = found[2] + weight * (base / math.pi + f_s) * positive(harmonics(incident, w))
     return found
@@ -201,50 +183,16 @@ MODELS: dict[str, Model] = {
 }
 
 
-def _looked_up(light: Light, direction: Array, level: int, factor: Array, taps: Taps) -> Array:
-    """`factor` (n, …) times the light (n, 3) in unit directions, of one level."""
-    texel, weight = bilinear(light, direction, np.full(len(direction), level))
-    taps.append((texel, weight, np.broadcast_to(factor, (len(direction), 3))))
-    return factor * np.einsum("nk,nkc->nc", weight, light.flat()[texel])
+def _looked_up(light: Light, lookup: tuple[Array, Array], factor: Array, taps: Taps) -> Array:
+    """`factor` (n, …) times the light (n, 3) of a lookup."""
+    texel, weight = lookup
+    taps.append((texel, weight, np.broadcast_to(factor, (len(texel), 3))))
+    return factor * light.look_up(texel, weight)
 
 
 def _terms(*known: Array) -> list[Array]:
     """The three terms, zero where there is none."""
     return [*known, *(np.zeros_like(known[0]) for _ in range(3 - len(known)))]
-
-
-def specular(light: Light, direction: Array, roughness: Array) -> tuple[Array, Array]:
-    """Texels (n, 8) and weights of a lookup between the two levels next to the roughness (n,)."""
-    first, r = light.roughness[0], roughness
-    sharp = r.real <= first
-    level = np.where(sharp, (np.where(sharp, r, first) / first) ** 4, 1.0)
-    inverse = 1 / np.where(sharp, first, r)
-    for a, b in zip(light.roughness, light.roughness[1:], strict=False):
-        level = level + clip((inverse - 1 / a) / (1 / b - 1 / a), 0, 1)
-    lower = np.clip(level.real.astype(int), 0, len(light.levels) - 2)
-    t = (level - lower)[:, None]
-    one, two = (bilinear(light, direction, lower + k) for k in range(2))
-    return np.concatenate([one[0], two[0]], 1), np.concatenate([(1 - t) * one[1], t * two[1]], 1)
-
-
-def bilinear(light: Light, direction: Array, level: Array) -> tuple[Array, Array]:
-    """Texels (n, 4) of the flat levels, and their weights, in unit directions (n, 3) of levels (n,)."""
-    heights = np.array([len(x) for x in light.levels])
-    firsts = np.concatenate([[0], np.cumsum(2 * heights**2)[:-1]])
-    h = heights[level]
-    w, first = 2 * h, firsts[level]
-    x, y, z = direction.T if light.turn is None else light.turn @ direction.T
-    pole = (x.real == 0) & (z.real == 0)
-    sin = np.where(pole, 0, np.sqrt(np.where(pole, 1, x * x + z * z)))
-    turn = atan2(np.where(pole, 0, x), np.where(pole, -1, -z)) / (2 * math.pi)
-    u = np.where(turn.real < 0, turn + 1, turn) * w - 0.5
-    v = atan2(sin, y) / math.pi * (h - 1)
-    j = np.floor(u.real).astype(int)
-    i = np.clip(np.floor(v.real).astype(int), 0, h - 2)
-    s, t = u - j, v - i
-    texel = [first + (i + a) * w + (j + b) % w for a in (0, 1) for b in (0, 1)]
-    share = [(t if a else 1 - t) * (s if b else 1 - s) for a in (0, 1) for b in (0, 1)]
-    return np.stack(texel, 1), np.stack(share, 1)
 
 
 def harmonics(coefficients: Array, direction: Array) -> Array:
@@ -254,21 +202,38 @@ def harmonics(coefficients: Array, direction: Array) -> Array:
     return np.einsum("nk,nkc->nc", basis, coefficients.reshape(-1, count, 3))
 
 
+def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
+    """Real spherical harmonics (…, (degree + 1)²) of unit directions (…, 3), with the Condon-Shortley phase.
+
+    Legendre functions over sin^m θ by recursion; complex steps give derivatives.
+    """
+    x, y, z = np.moveaxis(direction, -1, 0)
+    cos, sin = [np.ones_like(x)], [np.zeros_like(x)]  # sin^m θ cos mφ, sin^m θ sin mφ
+    for _ in range(degree):
+        cos, sin = [*cos, x * cos[-1] - y * sin[-1]], [*sin, x * sin[-1] + y * cos[-1]]
+    p = {(0, 0): np.ones_like(z)}
+    for m in range(1, degree + 1):
+        p[m, m] = -(2 * m - 1) * p[m - 1, m - 1]
+    for m in range(degree):
+        p[m + 1, m] = (2 * m + 1) * z * p[m, m]
+        for n in range(m + 2, degree + 1):
+            p[n, m] = ((2 * n - 1) * z * p[n - 1, m] - (n + m - 1) * p[n - 2, m]) / (n - m)
+    out = []
+    for n in range(degree + 1):
+        for m in range(-n, n + 1):
+            k = abs(m)
+            norm = math.sqrt((2 * n + 1) / (4 * math.pi) * math.factorial(n - k) / math.factorial(n + k))
+            turn = 1 if m == 0 else math.sqrt(2) * (cos[k] if m > 0 else sin[k])
+            out.append(norm * p[n, k] * turn)
+    return np.stack(out, axis=-1)
+
+
 # ---------------- functions of complex steps ----------------
 
 
 def positive(x: Array) -> Array:
     """max(0, x) with slope 1 at 0."""
     return np.where(x.real < 0, 0, x)
-
-
-def atan2(y: Array, x: Array) -> Array:
-    value = np.arctan2(y.real, x.real)
-    if not (np.iscomplexobj(y) or np.iscomplexobj(x)):
-        return value
-    squared = x.real**2 + y.real**2
-    slope = (x.real * np.imag(y) - y.real * np.imag(x)) / np.where(squared > 0, squared, 1)
-    return value + 1j * slope
 
 
 def unit(v: Array) -> Array:

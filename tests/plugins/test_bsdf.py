@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -9,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference import lobe as reference
+from mi_refgs.reference.light import radiance_of
 from mi_refgs.shade.brdf import split_sum
 from tests.helpers import unit, vector
 from tests.scenes.integrator import sky
@@ -262,15 +264,13 @@ def test_path_tracer_equals_quadrature(degrees: int) -> None:
     scene, normal, view = patch(np.radians(degrees), spp=1024)
     image = mi.render(scene, seed=2).numpy()
     column, row = (np.floor(image[..., 3 + k] * n).astype(int) for k, n in ((0, 4), (1, 3)))
-    deviations = []
+    sun, deviations = partial(radiance_of, sky().astype(np.float64)), []
     for j, metallic in enumerate(METALLIC):
         for i, roughness in enumerate(ROUGHNESS):
             pixels = image[(column == i) & (row == j)][:, :3].astype(np.float64)
             assert len(pixels) == BLOCK**2
             error = pixels.std(0, ddof=1) / BLOCK
-            expected = reference.reflected_radiance(
-                sky().astype(np.float64), ALBEDO, metallic, roughness, normal, view, nodes=300
-            )
+            expected = reference.reflected_radiance(sun, ALBEDO, metallic, roughness, normal, view, nodes=300)
             assert (error < 3e-3 * expected).all(), "too noisy to tell"
             deviations.append((pixels.mean(0) - expected) / error)
     assert np.abs(deviations).max() < 3
@@ -317,10 +317,12 @@ def test_derivatives_of_sampled_weights(roughness: float) -> None:
         assert not dr.grad_enabled(detached)
     dr.backward(mean_weight(of, seen_at(n_dot_v)).y)
     got = [dr.grad(value) for value in values]
-    a, b = reference.split_sum(n_dot_v, roughness)
+    a, b = reference.split_sum_entry(n_dot_v, roughness)
     f0 = 0.04 * (1 - metallic) + ALBEDO[1] * metallic
     left, base = 1 - f0 * a - b, (1 - metallic) * ALBEDO[1]  # the reflectance is f0 a + b + left base
-    low, high = (np.array(reference.split_sum(n_dot_v, r)) for r in (roughness - ε, min(roughness + ε, 1)))
+    low, high = (
+        np.array(reference.split_sum_entry(n_dot_v, r)) for r in (roughness - ε, min(roughness + ε, 1))
+    )
     slope = (high - low) @ [f0, 1] / (min(roughness + ε, 1) - roughness + ε)
     assert abs(got[0][0] - (1 - base) * slope) < 5e-3
     assert abs(got[1][0] - ((1 - base) * (ALBEDO[1] - 0.04) * a - left * ALBEDO[1])) < 5e-3

@@ -10,24 +10,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference import image
 from mi_refgs.reference import splat as oracle
-from mi_refgs.reference.camera import look_at, rotation_axes
+from mi_refgs.reference.camera import look_at
+from mi_refgs.reference.models import sh_basis
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.shade import brdf
-from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import level_maps
 from tests.scenes.integrator import HEIGHT, WIDTH, raw_channels, sky
+from tests.scenes.shading_points import exact_light
 
 COLOUR = Shading(at="surfel", reflectance="radiance")
-
-
-def sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-x))
 
 
 def discs(**channels: Any) -> Surfels:
@@ -53,65 +48,25 @@ def channel(frame: Frame, name: str) -> np.ndarray:
     return np.array(getattr(frame, name), dtype=np.float64).T
 
 
-# ---------------- the two orders ----------------
-
-
-def attributes(raw: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
-    """What is blended or shaded, surfel by surfel."""
-    direction = raw["position"] - origin
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    normal = rotation_axes(raw["rotation"])[2]
-    away = np.sum(normal * direction, axis=1) > 0.25
-    coefficients = raw["radiance_sh"].reshape(len(normal), -1, 3)
-    basis = np.array([reference.sh_basis(d, 1) for d in direction])
-    return {
-        "normal": np.where(away[:, None], -normal, normal),
-        "view": -direction,
-        "albedo": sigmoid(raw["albedo"]),
-        "metallic": sigmoid(raw["metallic"][:, 0]),
-        "roughness": sigmoid(raw["roughness"][:, 0]),
-        "radiance": np.maximum(0.5 + np.einsum("ni,nic->nc", basis, coefficients), 0),
-    }
-
-
 @pytest.mark.parametrize("diffuse", ["sh", "irradiance"])
 @pytest.mark.parametrize("at", ["pixel", "surfel"])
 def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
-    """Blend then shade, and shade then blend: both written out with the float64 references."""
+    """Blend then shade, and shade then blend, both in float64."""
     light = EnvironmentLight.from_radiance(sky(8)).prefilter()
-    table, levels = brdf.table().astype(np.float64), level_maps(light)
-
-    def shaded(**point: Any) -> np.ndarray:
-        point |= {"diffuse": diffuse, "visibility": None, "indirect": None}
-        return np.sum(reference.shade(table, levels, lobe_matrices.LEVEL_ROUGHNESS, **point), axis=0)
-
     raw = {name: values.astype(np.float64) for name, values in raw_channels().items()}
     to_world = look_at(np.array([3.0, 1, 2]), np.zeros(3))
-    view = oracle.PinholeCamera(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
-    camera = Camera.from_pose(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world, near=0.01)
+    lens = (WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world)
+    view, camera = oracle.PinholeCamera(*lens), Camera.from_pose(*lens)
     frame = render(SurfelScene(Surfels.from_numpy(raw), Shading(at=at, diffuse=diffuse), light), camera)
-
-    values = attributes(raw, to_world[:3, 3])
-    points = [{name: column[i] for name, column in values.items()} for i in range(len(raw["position"]))]
-    if at == "surfel":
-        features = np.array([shaded(**point) for point in points])
-        expected = oracle.splat(raw, features, view)
-        radiance = expected.features
-    else:
-        del values["view"]
-        widths = [1 if column.ndim == 1 else 3 for column in values.values()]
-        expected = oracle.splat(raw, np.column_stack(list(values.values())), view)
-        radiance = np.zeros((HEIGHT, WIDTH, 3))
-        for row, column in zip(*np.nonzero(expected.alpha > 1e-3), strict=True):
-            a = expected.alpha[row, column]
-            parts = np.split(expected.features[row, column] / a, np.cumsum(widths)[:-1])
-            point = {n: p if len(p) == 3 else p[0] for n, p in zip(values, parts, strict=True)}
-            local = np.array([(column + 0.5 - 8.3) / -19, (row + 0.5 - 5.6) / -20, 1])
-            radiance[row, column] = a * shaded(view=-to_world[:3, :3] @ local, **point)
-    keep = ~expected.band & ((expected.alpha > 2e-3) | (expected.alpha < 5e-4))
-    assert keep.mean() > 0.9 and np.mean(expected.alpha > 0.3) > 0.2
-    found = channel(frame, "radiance").reshape(HEIGHT, WIDTH, 3)
-    np.testing.assert_allclose(found[keep], radiance[keep], atol=3e-4)
+    pixels = np.arange(WIDTH * HEIGHT)
+    order = oracle.sorted_rows(raw, view, pixels)
+    exact = image.Scene(raw, view, pixels, order, at, "split_sum", diffuse, exact_light(light))
+    expected = image.render(exact)
+    alpha = expected.maps["alpha"][:, 0]
+    keep = ~expected.band & ((alpha > 2e-3) | (alpha < 5e-4))
+    assert keep.mean() > 0.9 and np.mean(alpha > 0.3) > 0.2
+    found = channel(frame, "radiance")
+    np.testing.assert_allclose(found[keep], expected.maps["radiance"][keep], atol=3e-4)
 
 
 # ---------------- attributes of one surfel ----------------
@@ -136,7 +91,7 @@ def test_colour_of_harmonics_up_to_a_degree(degree: int | None, rng: np.random.G
     origin = np.array([1.0, -2.0, 3.0])
     camera = seen_from(*origin)
     frame = render(SurfelScene(discs(radiance_sh=coefficients), COLOUR), camera, Request(sh_degree=degree))
-    basis = reference.sh_basis(-origin / np.linalg.norm(origin), 3)
+    basis = sh_basis(-origin / np.linalg.norm(origin), 3)
     basis[(4 if degree is None else degree + 1) ** 2 :] = 0
     expected = np.maximum(0.5 + basis @ coefficients.reshape(16, 3), 0)
     found = channel(frame, "radiance")[0] / channel(frame, "alpha")[0]

@@ -2,60 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference import models
+from mi_refgs.reference.light import Light
 from mi_refgs.shade import brdf
+from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
-from tests.helpers import unit
+from tests.helpers import level_maps, unit, vector
 
-N = 50
-
-
-def shading_values(rng: np.random.Generator, occlusion: str) -> dict[str, Any]:
-    """Points whose normals face the camera, away from the clamps; normals and views need not have unit
-    length."""
-    view = unit(rng.normal(size=(N, 3)))
-    normal = unit(unit(rng.normal(size=(N, 3))) + 1.3 * view)
-    return {
-        "normal": normal * rng.uniform(0.5, 2, (N, 1)),
-        "view": view * rng.uniform(0.5, 2, (N, 1)),
-        "albedo": rng.uniform(0.1, 0.9, (N, 3)),
-        "metallic": rng.uniform(0.1, 0.9, N),
-        "roughness": rng.uniform(0.05, 0.95, N),
-        "radiance": rng.uniform(0.1, 2, (N, 3)),
-        "visibility": None if occlusion == "open" else rng.uniform(0, 1, N),
-        "indirect": rng.uniform(0.1, 1, (N, 3)) if occlusion == "indirect" else None,
-        "ambient": rng.uniform(0, 2, (N, 3)) if occlusion == "ambient" else None,
-    }
+N = 40
+RANGES: dict[str, tuple[float, float, tuple[int, ...]]] = {
+    "albedo": (0.1, 0.9, (3,)),
+    "metallic": (0.1, 0.9, ()),
+    "roughness": (0.05, 0.95, ()),
+    "tint": (0.1, 0.9, (3,)),
+    "radiance": (0.1, 2, (3,)),
+    "visibility": (0, 1, ()),
+    "indirect": (0.1, 1, (3,)),
+    "ambient": (0, 2, (3,)),
+    "incident": (-0.5, 0.5, (9, 3)),
+}
+"""Lowest and highest value of attributes, away from the clamps, and their shape per point."""
 
 
-def points_of(values: dict[str, Any]) -> ShadingPoints:
-    def array(x: Any) -> Any:
-        if x is None:
-            return None
-        return mi.Float(x.astype(np.float32)) if x.ndim == 1 else mi.Vector3f(x.T.astype(np.float32))
-
-    arrays = {name: array(x) for name, x in values.items()}
-    for name in ("albedo", "radiance", "indirect", "ambient"):
-        arrays[name] = None if arrays.get(name) is None else mi.Color3f(arrays[name])
-    return ShadingPoints(**arrays)
-
-
-def exact_shade(levels: list[np.ndarray], **values: Any) -> np.ndarray:
-    """Terms (3, 3) of one point by `reference.shade`, with the table and the levels of the program."""
-    return reference.shade(brdf.table().astype(np.float64), levels, LEVEL_ROUGHNESS, **values)
+def shading_values(rng: np.random.Generator, names: Sequence[str], count: int = N) -> dict[str, np.ndarray]:
+    """Attributes (count, …) of points whose normals face the camera; normals and views of any length."""
+    view = unit(rng.normal(size=(count, 3)))
+    normal = unit(unit(rng.normal(size=(count, 3))) + 1.3 * view)
+    length = rng.uniform(0.5, 2, (2, count, 1))
+    found = {"normal": normal * length[0], "view": view * length[1]}
+    for name in names:
+        if name == "free":  # one bit per direction of the hemisphere
+            found[name] = rng.integers(0, 2**16, count)
+        else:
+            least, most, shape = RANGES[name]
+            found[name] = rng.uniform(least, most, (count, *shape))
+    return found
 
 
-def exact_terms(
-    values: dict[str, Any], levels: list[np.ndarray], options: ShadingOptions, k: int
-) -> np.ndarray:
-    """Terms (3, 3) of point k."""
-    chosen = {name: getattr(options, name) for name in ("diffuse", "dominant", "multiscatter")}
-    one = {name: None if x is None else x[k] for name, x in values.items()}
-    return exact_shade(levels, **chosen, **one)
+def points_of(values: dict[str, np.ndarray]) -> ShadingPoints:
+    def array(name: str, x: np.ndarray) -> Any:
+        if x.dtype.kind == "i":
+            return mi.UInt64(x.astype(np.uint64))
+        if x.ndim == 1:
+            return mi.Float(x.astype(np.float32))
+        if x.ndim == 3:
+            return [mi.Color3f(vector(x[:, i])) for i in range(x.shape[1])]
+        return vector(x) if name in ("normal", "view") else mi.Color3f(vector(x))
+
+    return ShadingPoints(**{name: array(name, x) for name, x in values.items()})
+
+
+def exact_light(light: PrefilteredLight) -> Light:
+    """The float64 reference's light, with the table and the levels of the product."""
+    return Light(level_maps(light), LEVEL_ROUGHNESS, brdf.table().astype(np.float64))
+
+
+def exact_terms(values: dict[str, Any], light: Light, options: ShadingOptions) -> np.ndarray:
+    """Diffuse, specular and indirect radiance (n, 3, 3) of points: arrays (n, …) by name, or None."""
+    free = values["free"][:, None] >> np.arange(options.directions) & 1 if "free" in values else None
+    chosen = models.Options(options.diffuse, options.dominant, options.multiscatter, options.directions, free)
+    points = models.Points.of({name: x for name, x in values.items() if name != "free"})
+    terms = models.MODELS[options.reflectance](points, light, chosen, [])
+    return np.stack(terms, axis=1)

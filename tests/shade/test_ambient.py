@@ -14,22 +14,21 @@ import trimesh
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference.light import specular
 from mi_refgs.reference.occlusion import ambient as exact
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade import ambient
 from mi_refgs.shade.ggx_sampling import lobe_turn
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
-from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflection import TraceContext
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import level_maps, unit, vector
+from tests.helpers import unit, vector
 from tests.scenes.corner import VOXEL, corner, gradient_sky, wall_surfels
 from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, plane_mesh, raw_channels, sensor, sky
-from tests.scenes.shading_points import exact_shade
+from tests.scenes.shading_points import exact_light, exact_terms
 
 RAYS = 12
 LOGIT: dict[str, Any] = {"albedo": (1.0, 0.0, -1.0), "metallic": -0.5, "roughness": 0.2}
@@ -67,17 +66,18 @@ def test_ratios_against_rays_one_by_one() -> None:
     occluder = with_ratios(mesh, surfels, light, RAYS)
     found = occluder.ambient.numpy()
 
-    levels = level_maps(light)
+    exact_levels = exact_light(light)
     normals = occluder.surface(surfels).vertex_surfels.normal.numpy().T.astype(np.float64)
     share = {name: 1 / (1 + np.exp(-np.array(value))) for name, value in LOGIT.items()}
 
     def outgoing(normal: np.ndarray, view: np.ndarray, free: bool, ratio: np.ndarray) -> np.ndarray:
-        lit = {"radiance": np.zeros(3), "visibility": float(free), "indirect": None, "ambient": ratio}
-        terms = exact_shade(levels, normal=normal, view=view, diffuse="irradiance", **lit, **share)
-        return np.asarray(terms.sum(0))
+        here = {"normal": normal, "view": view, "visibility": float(free), "ambient": ratio, **share}
+        values = {name: np.asarray(x)[None] for name, x in here.items()}
+        return exact_terms(values, exact_levels, ShadingOptions(diffuse="irradiance")).sum((0, 1))
 
     def sky(ω: np.ndarray) -> np.ndarray:
-        return reference.specular(levels, LEVEL_ROUGHNESS, ω, ambient.ray_roughness(RAYS))
+        lookup = specular(exact_levels, ω[None], np.array([ambient.ray_roughness(RAYS)]))
+        return exact_levels.look_up(*lookup)[0]
 
     rays = directions(normals, RAYS).astype(np.float64)
     shape = (mesh.vertices.astype(np.float64), mesh.faces.astype(int), normals, rays)

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from mi_refgs.io.exr import write_exr
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference import light as reference
 from mi_refgs.shade.light import envmap, lobe_matrices, prefilter
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from tests.helpers import level_maps, refused, unit, vector
+from tests.scenes.shading_points import exact_light
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
@@ -55,7 +56,7 @@ def test_mirror_is_mitsubas_envmap(rng: np.random.Generator) -> None:
     expected = mitsuba_radiance({"bitmap": mi.Bitmap(radiance)}, d)
     got = EnvironmentLight.from_radiance(radiance).prefilter().radiance(vector(d)).numpy().T
     np.testing.assert_allclose(got, expected, atol=2e-5)
-    np.testing.assert_allclose([reference.bilinear(radiance, x) for x in d[6:]], expected[6:], atol=2e-5)
+    np.testing.assert_allclose(reference.radiance_of(radiance, d[6:]), expected[6:], atol=2e-5)
 
 
 def test_exported_map_round_trip(rng: np.random.Generator, tmp_path: Path) -> None:
@@ -181,7 +182,7 @@ def test_irradiance_is_the_cosine_integral(rng: np.random.Generator) -> None:
     step = np.pi / 400
     θ, φ = np.meshgrid((np.arange(400) + 0.5) * step, (np.arange(800) + 0.5) * step, indexing="ij")
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], -1).reshape(-1, 3)
-    sampled = reference.bilinear(radiance, d) * (np.sin(θ).ravel() * step**2)[:, None]
+    sampled = reference.radiance_of(radiance, d) * (np.sin(θ).ravel() * step**2)[:, None]
     normals = np.concatenate([AXES, unit(rng.normal(size=(10, 3)))])
     expected = np.maximum(normals @ d.T, 0) @ sampled / np.pi
     got = EnvironmentLight.from_radiance(radiance).prefilter().irradiance(vector(normals)).numpy().T
@@ -268,13 +269,11 @@ def test_second_call_compiles_nothing(rng: np.random.Generator) -> None:
 
 def test_specular_against_the_oracle(rng: np.random.Generator) -> None:
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 3, (32, 64, 3))).prefilter()
-    levels = [level.astype(np.float64) for level in level_maps(light)]
-    every = lobe_matrices.LEVEL_ROUGHNESS
+    exact, every = exact_light(light), lobe_matrices.LEVEL_ROUGHNESS
     d, r = unit(rng.normal(size=(400, 3))), np.concatenate([rng.uniform(0, 1, 390), [0, 1, *every, 0.05]])
     got = light.specular(vector(d), mi.Float(r.astype(np.float32))).numpy().T
-    expected = [reference.specular(levels, every, x, y) for x, y in zip(d, r, strict=True)]
-    np.testing.assert_allclose(got, expected, atol=1e-4)
-    expected = [reference.bilinear(levels[-1], x) for x in d]
+    np.testing.assert_allclose(got, exact.look_up(*reference.specular(exact, d, r)), atol=1e-4)
+    expected = exact.look_up(*reference.irradiance(exact, d))
     np.testing.assert_allclose(light.irradiance(vector(d)).numpy().T, expected, atol=1e-4)
 
 
@@ -295,7 +294,7 @@ def test_lookup_derivatives(rng: np.random.Generator) -> None:
     """Direction and roughness against differences of the float64 reference; the levels by linearity."""
     n, h = 60, 16
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 3, (h, 2 * h, 3))).prefilter()
-    levels = [level.astype(np.float64) for level in level_maps(light)]
+    exact = exact_light(light)
     d, r, weight = unit(rng.normal(size=(n, 3))), rng.uniform(0.02, 0.99, n), rng.normal(size=(n, 3))
     direction, roughness, texels = vector(d), mi.Float(r.astype(np.float32)), mi.Float(light.levels)
     dr.enable_grad(direction, roughness, texels)
@@ -303,7 +302,8 @@ def test_lookup_derivatives(rng: np.random.Generator) -> None:
     dr.backward(dr.dot(mi.Vector3f(tracked.specular(direction, roughness)), vector(weight)))
 
     def value(x: np.ndarray, y: float, k: int) -> float:
-        return float(weight[k] @ reference.specular(levels, lobe_matrices.LEVEL_ROUGHNESS, unit(x), y))
+        found = exact.look_up(*reference.specular(exact, unit(x)[None], np.array([y])))
+        return float(found[0] @ weight[k])
 
     got, ε, checked = dr.grad(direction).numpy().T, 1e-6, 0
     for k in range(n):

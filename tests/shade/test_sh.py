@@ -9,7 +9,7 @@ import pytest
 import scipy.special
 
 from mi_refgs.errors import InputError
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference import models as reference
 from mi_refgs.shade.sh import clamp_positive, eval_sh, sh_basis
 from tests.helpers import unit
 

@@ -16,16 +16,16 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import lobe as exact
-from mi_refgs.reference import shade as reference
+from mi_refgs.reference.light import radiance_of, specular
+from mi_refgs.reference.models import sh_basis
 from mi_refgs.shade import reflection
 from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
-from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.split_sum import shade
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import level_maps, unit, vector
+from tests.helpers import unit, vector
 from tests.scenes.corner import (
     EYE,
     FLOOR,
@@ -45,7 +45,7 @@ from tests.scenes.corner import (
     wall_surfels,
     with_materials,
 )
-from tests.scenes.shading_points import exact_shade
+from tests.scenes.shading_points import exact_light, exact_terms
 
 # ---------------- materials on the mesh ----------------
 
@@ -144,10 +144,10 @@ def true_reflection(
     map_, x, y = gradient_sky(), np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
 
     def sky(d: np.ndarray) -> np.ndarray:
-        return np.where(d[:, 1:2] < 0, 0, reference.bilinear(map_, d))  # the floor is long
+        return np.where(d[:, 1:2] < 0, 0, radiance_of(map_, d))  # the floor is long
 
     def incoming(d: np.ndarray) -> np.ndarray:
-        out = reference.bilinear(map_, d)
+        out = radiance_of(map_, d)
         for k in np.flatnonzero(wall_blocks(place, d)[0]):
             out[k] = exact.reflected(sky, x, -d[k], wall_roughness, np.array(WALL_COLOUR), 12)
         return out
@@ -199,15 +199,17 @@ def test_a_traced_mirror_ray_is_shaded_as_a_pixel_is(diffuse: Any) -> None:
     found = seen(points, place, ShadingOptions(traced_bounces=1), surfels, light, diffuse)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
     assert 0 < visibility.mean() < 0.8 and (indirect[visibility == 1] == 0).all()
-    levels = level_maps(light)
+    exact_levels = exact_light(light)
     logits: dict[str, Any] = {"albedo": np.array([1.0, 0, -1]), "metallic": 1.5, "roughness": 0.2}
     materials = {name: 1 / (1 + np.exp(-logit)) for name, logit in logits.items()}
-    wall = {"normal": np.array([1.0, 0, 0]), "visibility": None, "indirect": None, **materials}
-    for k in np.flatnonzero(visibility == 0):
-        direction = mirrored(place)[k, 0]
-        own = np.maximum(0.5 + reference.sh_basis(direction, 1) @ harmonics.reshape(4, 3), 0)
-        terms = exact_shade(levels, view=-direction, radiance=own, diffuse=diffuse, **wall)
-        np.testing.assert_allclose(indirect[k], terms.sum(0), rtol=1e-3)
+    hit = visibility == 0
+    direction = mirrored(place)[hit, 0]
+    own = np.maximum(0.5 + sh_basis(direction, 1) @ harmonics.reshape(4, 3), 0)
+    wall = {name: np.tile(x, (len(own), 1)) for name, x in (materials | {"normal": [1.0, 0, 0]}).items()}
+    terms = exact_terms(
+        {**wall, "view": -direction, "radiance": own}, exact_levels, ShadingOptions(diffuse=diffuse)
+    )
+    np.testing.assert_allclose(indirect[hit], terms.sum(1), rtol=1e-3)
 
 
 def test_a_hit_in_the_dark_is_dark() -> None:
@@ -230,18 +232,19 @@ def test_a_hit_in_the_dark_is_dark() -> None:
 # ---------------- further bounces ----------------
 
 
-def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: str) -> exact.Outgoing:
+def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: Any) -> exact.Outgoing:
     """What leaves the walls of a channel, by the float64 `shade`."""
-    levels = level_maps(light)
+    exact_levels = exact_light(light)
     raw = {name: x.numpy().astype(np.float64)[[0, -1]] for name, x in surfels.raw.items()}
     logits = raw["albedo"], raw["metallic"][:, 0], raw["roughness"][:, 0]
     albedo, metallic, roughness = (1 / (1 + np.exp(-logit)) for logit in logits)
 
     def outgoing(wall: int, normal: np.ndarray, view: np.ndarray, free: float, beyond: np.ndarray) -> Any:
-        own = reference.sh_basis(-view, 1) @ raw["radiance_sh"][wall].reshape(4, 3) + 0.5
+        own = sh_basis(-view, 1) @ raw["radiance_sh"][wall].reshape(4, 3) + 0.5
         here = {"albedo": albedo[wall], "metallic": metallic[wall], "roughness": roughness[wall]}
         here |= {"radiance": np.maximum(own, 0), "visibility": free, "indirect": beyond}
-        return exact_shade(levels, normal=normal, view=view, diffuse=diffuse, **here).sum(0)
+        values = {n: np.asarray(x)[None] for n, x in (here | {"normal": normal, "view": view}).items()}
+        return exact_terms(values, exact_levels, ShadingOptions(diffuse=diffuse)).sum((0, 1))
 
     return outgoing
 
@@ -300,12 +303,12 @@ def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
     samples = [lobe.sample(mi.UInt32(i), mi.UInt32(rays)) for i in range(rays)]
     direction = np.stack([d.numpy().T for d, _ in samples], 1).astype(np.float64)
     weight = np.stack([np.array(w) for _, w in samples], 1).astype(np.float64)
-    outgoing, levels, held = oracle_of_walls(light, surfels, "irradiance"), level_maps(light), 0
+    outgoing, levels, held = oracle_of_walls(light, surfels, "irradiance"), exact_light(light), 0
     for k, mirror in enumerate(mirrored(place, LOW_EYE)[:, 0]):
         arriving = [exact.chain(wall_hit, outgoing, place[k], d, 2) for d in direction[k]]
         blocked = np.array([x is not None for x in arriving]) & (weight[k] > 0)
         radiance = np.array([np.zeros(3) if x is None else x for x in arriving])
-        free = reference.specular(levels, LEVEL_ROUGHNESS, mirror, 0.4)
+        [free] = levels.look_up(*specular(levels, mirror[None], np.array([0.4])))
         np.testing.assert_allclose(visibility[k], weight[k][~blocked].sum() / weight[k].sum(), atol=1e-4)
         if blocked.any():
             expected = exact.blocked_mean(radiance, weight[k], blocked, free, 1 - 3 * 0.4**2)
