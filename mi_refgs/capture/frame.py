@@ -11,15 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mi_refgs.capture.colmap import Solved
-from mi_refgs.data.region import Region, region_radius
+from mi_refgs.data.hull import axis_projectors
+from mi_refgs.data.region import Region, region_radius, weighted_quantile
 from mi_refgs.errors import InputError
 
 ROUNDS = 50  # iterations of reweighted least squares, which converge to the least sum of absolute values
 LEVEL_SPREAD = 0.02
 """Variance of the cameras' right-hand directions off their main line, relative, below which they determine no
 plane: ± 8°."""
-AXES_SPREAD = 1e-3
-"""Smallest singular value of the mean of I − a aᵀ over view axes a that meet; 0 for parallel ones."""
 SEEN_SHARE = 0.5  # fraction of the cameras whose images must show a point; other points are background
 REGION_POINTS = 50  # number of points that determine the region's radius; with fewer, the cameras alone do
 REGION_QUANTILE = 0.9  # fraction of the points around the focus that the region contains
@@ -66,8 +65,8 @@ def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
 
 def focus_of(solved: Solved) -> np.ndarray:
     """The point (3,) with the least sum of distances to the view axes; the median point for parallel axes."""
-    projectors = np.eye(3) - solved.axis[:, :, None] * solved.axis[:, None, :]
-    if np.linalg.svd(projectors.mean(axis=0), compute_uv=False)[-1] < AXES_SPREAD:
+    projectors = axis_projectors(solved.axis)
+    if projectors is None:
         return np.median(solved.points, axis=0)
     weight = np.ones(len(projectors))
     for _ in range(ROUNDS):
@@ -102,16 +101,10 @@ def region_of_interest(solved: Solved) -> Region:
     near = offset < radius
     near[near] = seen_share(solved, solved.points[near]) >= SEEN_SHARE
     if np.count_nonzero(near) >= REGION_POINTS:
-        reach = _weighted_quantile(offset[near], solved.length[near], REGION_QUANTILE)
+        reach = weighted_quantile(offset[near], solved.length[near], REGION_QUANTILE)
         radius = max(reach, LEAST_SHARE * radius)
     x, y, z = (float(c) for c in focus)
     return Region((x, y, z), radius)
-
-
-def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, share * total[-1])])
 
 
 def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:

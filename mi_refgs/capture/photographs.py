@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.dataset import MAX_SIZES
+from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
 from mi_refgs.io.images import ENDINGS, exif_tags, open_image, read_mask, to_8_bits
@@ -140,13 +140,8 @@ def find_photographs(folder: Path) -> list[Photograph]:
     kept = [replace(_photograph(path), number=i) for i, path in enumerate(paths)]
     most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]
     kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in kept]
-    sizes = {p.kept_size: p.name for p in kept}
-    if len(sizes) > MAX_SIZES:
-        some = ", ".join(f"{width} × {height} ({name})" for (width, height), name in [*sizes.items()][:3])
-        raise InputError(
-            f"{folder}: photographs: {len(sizes)} different sizes, such as {some}, and a fit takes "
-            f"{MAX_SIZES} at most; leave out those that were cropped"
-        )
+    remedy = f"a fit takes {MAX_SIZES} at most: leave out those that were cropped"
+    require_few_sizes(f"{folder}: photographs", {p.kept_size: p.name for p in kept}, remedy)
     return kept
 
 

@@ -83,12 +83,12 @@ def capture(
     camera: str | None = None,
     region: Region | None = None,
     tell: Callable[[str], None] = lambda _: None,
-) -> Report:
+) -> dict[str, Any]:
     """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`.
 
     `masks`: a folder as in `find_masks`. `camera`: COLMAP's name of the lens model, or None for the
     simplest of three that fits. `region`: of interest, in the data set's world, instead of the estimated one.
-    `tell` is called with messages.
+    `tell` is called with messages. Returns the content of capture.json.
 
     Raises InputError for unusable input, with the remedy, and without pycolmap.
     """
@@ -149,7 +149,7 @@ def capture(
         "seconds": round(time.perf_counter() - began, 1),
     }
     write_json(folder / REPORT, report)
-    return Report(report)
+    return report
 
 
 def _digests(files: Iterable[Path]) -> list[str]:
@@ -227,27 +227,21 @@ def _beside_gap(job: CaptureJob, placed: Sequence[str]) -> str:
     return edges[0] if edges else names[-1]
 
 
-@dataclass(frozen=True)
-class Report:
-    """The content of capture.json."""
-
-    content: dict[str, Any]
-
-    def text(self, folder: Path) -> str:
-        """The report as text."""
-        c = self.content
-        lines = [
-            f"{folder}: {c['placed']} of {c['photographs']} photographs placed, {c['points']} points, "
-            f"each seen by {c['mean_track_length']:.1f} images on average; mean reprojection error "
-            f"{c['mean_reprojection_error']:.2f} pixels; lens {c['lens']['model']}"
-        ]
-        if c["not_placed"]:
-            names = abbreviated_names(c["not_placed"])
-            lines.append(f"not placed: {names}; take more between them and the others")
-        if c["mean_reprojection_error"] > GOOD_ERROR:
-            lines.append("the error is high: something moved, or the lens needs another --camera-model")
-        lines.append(f"look at {folder / 'capture.png'}; next: refgs train {folder} -o runs/{folder.name}")
-        return "\n".join(lines)
+def report_text(c: dict[str, Any], folder: Path) -> str:
+    """The content of capture.json as text."""
+    lines = [
+        f"{folder}: {c['placed']} of {c['photographs']} photographs placed, {c['points']} points, "
+        f"each seen by {c['mean_track_length']:.1f} images on average; mean reprojection error "
+        f"{c['mean_reprojection_error']:.2f} pixels; lens {c['lens']['model']}"
+    ]
+    if missing := c["not_placed"]:
+        more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+        names = ", ".join(missing[:NAMED]) + more
+        lines.append(f"not placed: {names}; take more between them and the others")
+    if c["mean_reprojection_error"] > GOOD_ERROR:
+        lines.append("the error is high: something moved, or the lens needs another --camera-model")
+    lines.append(f"look at {folder / PLOT}; next: refgs train {folder} -o runs/{folder.name}")
+    return "\n".join(lines)
 
 
 def draw(path: Path, world: Solved, region: Region) -> None:
@@ -315,9 +309,3 @@ def require_placed(folder: Path, count: int, groups: Sequence[Sequence[str]], lo
         f"{folder}: photographs: of {count}, only {apart} could be placed; take images that lead from one "
         f"group to the next in small steps, as around {longest_gap}"
     )
-
-
-def abbreviated_names(names: Sequence[str]) -> str:
-    """Abbreviate a list of names for a message."""
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more

@@ -34,7 +34,7 @@ class Capture:
 
     def run(self) -> Result:
         """Estimate the cameras."""
-        from mi_refgs.capture.pipeline import capture
+        from mi_refgs.capture.pipeline import capture, report_text
         from mi_refgs.data.region import Region
 
         region = None
@@ -43,4 +43,4 @@ class Capture:
         report = capture(
             self.photographs, self.output, masks=self.masks, camera=self.camera_model, region=region, tell=say
         )
-        return Result({"dataset": str(self.output), **report.content}, report.text(self.output))
+        return Result({"dataset": str(self.output), **report}, report_text(report, self.output))

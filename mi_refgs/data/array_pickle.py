@@ -57,9 +57,6 @@ class _Unpickler(pickle.Unpickler):
             raise pickle.UnpicklingError(f"it contains {module[:40]}.{name[:40]}, which is no array")
         return Record(kind)
 
-    def persistent_load(self, _: Any) -> Any:
-        raise pickle.UnpicklingError("it refers to something outside of the file")
-
 
 def read_arrays(path: Path) -> list[np.ndarray]:
     """Read a pickled list of arrays as float64.

@@ -81,11 +81,10 @@ class Reconstruction:
             lines = test_list.read_bytes().decode("utf-8", "replace").splitlines()
             tests = {line.strip() for line in lines}
             chosen = [image for image in images if (image.name in tests) == (split == "test")]
-            remedy = "name some of the images in test.txt, not all"
+            if not chosen:
+                raise InputError(f"{test_list}: zero {split} views; name some of the images, not all")
         else:
-            chosen, remedy = held_out(images, split), "add images"
-        if not chosen:
-            raise InputError(f"{self.source}: zero {split} views; {remedy}")
+            chosen = held_out(images, split, self.source)
         return [(image, *self.files[image.name]) for image in chosen]
 
     def view(self, image: Image, file: Path, downscale: int) -> View:

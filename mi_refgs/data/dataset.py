@@ -111,9 +111,22 @@ def reader_of(folder: Path) -> Reader:
     raise InputError(f"{folder}: data set: no layout is recognised; complete it ({known})")
 
 
-def held_out(ordered: Sequence[Item], split: str) -> list[Item]:
-    """The items of a split if one list contains both: every eighth, from the first, is a test view."""
-    return [item for i, item in enumerate(ordered) if (i % HOLDOUT == 0) == (split == "test")]
+def held_out(ordered: Sequence[Item], split: str, source: Path | None = None) -> list[Item]:
+    """The items of a split if one list contains both: every eighth, from the first, is a test view.
+
+    Raises InputError that names the `source`, if it is given, where there are none.
+    """
+    items = [item for i, item in enumerate(ordered) if (i % HOLDOUT == 0) == (split == "test")]
+    if source is not None and not items:
+        raise InputError(f"{source}: zero {split} views; add images")
+    return items
+
+
+def require_few_sizes(where: str, sizes: dict[tuple[int, int], str], remedy: str) -> None:
+    """Raise InputError for more than MAX_SIZES image sizes; `sizes`: the name of an image of each."""
+    if len(sizes) > MAX_SIZES:
+        some = ", ".join(f"{width} × {height} ('{name}')" for (width, height), name in [*sizes.items()][:3])
+        raise InputError(f"{where}: {len(sizes)} different sizes, such as {some}; {remedy}")
 
 
 def make_view(
@@ -224,12 +237,8 @@ def read_dataset(
     found = reader_of(path).read(path, split, options)
     views, notes, points = found.views, found.notes, found.points
     sizes = {(view.width, view.height): view.name for view in views}
-    if len(sizes) > MAX_SIZES:
-        some = ", ".join(f"{width} × {height} ('{name}')" for (width, height), name in [*sizes.items()][:3])
-        raise InputError(
-            f"{found.source or path}: images: {len(sizes)} different sizes, such as {some}; "
-            f"bring all images to one size, or to {MAX_SIZES} at most"
-        )
+    remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
+    require_few_sizes(f"{found.source or path}: images", sizes, remedy)
 
     # What depends on cameras depends on the training cameras in every split, so that a fit and its
     # evaluation use the same region and the same offset.

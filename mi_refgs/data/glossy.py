@@ -53,10 +53,7 @@ class GlossyReader:
 
 def _numbers(folder: Path, split: str) -> list[int]:
     found = (CAMERA.fullmatch(path.name) for path in folder.glob("*-camera.pkl"))
-    numbers = held_out(sorted({int(match[1]) for match in found if match}), split)
-    if not numbers:
-        raise InputError(f"{folder}: zero {split} views; add images with their cameras")
-    return numbers
+    return held_out(sorted({int(match[1]) for match in found if match}), split, folder)
 
 
 def _view(folder: Path, number: int, options: ReadOptions) -> View:

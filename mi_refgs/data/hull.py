@@ -28,6 +28,13 @@ FOCUS_CONDITION = 1e-3
 """Smallest singular value of the mean of (I - d dᵀ) over view axes that meet; 0 for parallel ones."""
 
 
+def axis_projectors(axes: np.ndarray) -> np.ndarray | None:
+    """I - d dᵀ (V, 3, 3) of view axes d (V, 3); None if they have no common point, as parallel ones."""
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    met = len(axes) and np.linalg.svd(projectors.mean(axis=0), compute_uv=False)[-1] >= FOCUS_CONDITION
+    return projectors if met else None
+
+
 def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """The point nearest to the axes of all cameras (3,), and the distance of each camera from it (V,).
 
@@ -35,14 +42,14 @@ def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """
     origins = np.array([view.to_world[:3, 3] for view in views], dtype=np.float64).reshape(-1, 3)
     axes = np.array([view.to_world[:3, 2] for view in views], dtype=np.float64).reshape(-1, 3)
-    # Σ (I - d dᵀ)(p - o) = 0.
-    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    system = projectors.mean(axis=0) if len(views) else np.zeros((3, 3))
-    if np.linalg.svd(system, compute_uv=False)[-1] < FOCUS_CONDITION:
+    projectors = axis_projectors(axes)
+    if projectors is None:
         raise InputError(
             "views: cameras: they do not look at one point from several sides; give the bounds of the scene"
         )
-    focus = np.linalg.solve(system, np.einsum("nij,nj->i", projectors, origins) / len(views))
+    # Σ (I - d dᵀ)(p - o) = 0.
+    right = np.einsum("nij,nj->i", projectors, origins) / len(views)
+    focus = np.linalg.solve(projectors.mean(axis=0), right)
     return focus, np.linalg.norm(origins - focus, axis=1)
 
 
@@ -55,12 +62,6 @@ def camera_bounds(views: Sequence[View]) -> np.ndarray:
     reach = [max(v.width / v.fx, v.height / v.fy) / 2 for v in views]
     half = min(float(np.max(distance * reach)), float(distance.max()))
     return np.stack([focus - half, focus + half])
-
-
-def random_points(count: int, bounds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Uniform random points (count, 3) in a box, for data without alpha."""
-    low, high = np.asarray(bounds, dtype=np.float64)
-    return rng.uniform(low, high, (count, 3))
 
 
 @dataclass(frozen=True)

@@ -56,11 +56,9 @@ def _images(folder: Path, split: str, options: ReadOptions) -> list[tuple[str, n
             "restore the images"
         )
     images = []
-    for name, row in held_out(list(zip(names, rows, strict=True)), split):
+    for name, row in held_out(list(zip(names, rows, strict=True)), split, folder / POSES):
         file, left = folders.find(name, options.downscale) or (folders.folders[1] / name, options.downscale)
         images.append((name, row, ImageFile.of(file, left, folders.mask(name))))
-    if not images:
-        raise InputError(f"{folder / POSES}: zero {split} views; add images")
     return images
 
 

@@ -100,6 +100,13 @@ def region_radius(distance: np.ndarray, half_angle: np.ndarray) -> float:
     return min(REGION_SHARE * entire, CAMERA_SHARE * float(distance.min()))
 
 
+def weighted_quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:
+    """The value below which `share` of the weight lies."""
+    order = np.argsort(values)
+    summed = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(summed, share * summed[-1])])
+
+
 def region_pixels(view: View, region: Region) -> np.ndarray:
     """Mask (H, W) of pixels whose ray through the centre hits the region's sphere in front of the camera."""
     across = (view.cx - 0.5 - np.arange(view.width)) / view.fx

@@ -217,7 +217,8 @@ def initial_surfels(
         elif data.points is not None and len(data.points.position):
             points, colours = at_points(data.points, options.count, data, rng)
         else:
-            points = hull.random_points(options.count, hull.camera_bounds(views), rng)
+            low, high = hull.camera_bounds(views)
+            points = rng.uniform(low, high, (options.count, 3))
             colours = hull.median_colours(points, views, behind)
         normals = init.random_normals(options.count, rng)
     order = morton_order(points)

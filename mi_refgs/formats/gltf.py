@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.formats.baking import bake
 from mi_refgs.formats.format import Shot
 from mi_refgs.formats.gaussians import gaussians
@@ -80,7 +81,7 @@ def _add_camera(tree: dict[str, Any], camera: Camera) -> None:
     lens = {"aspectRatio": width / height, "yfov": 2 * float(np.arctan(height / 2)), "znear": 1e-3}
     tree["cameras"] = [{"type": "perspective", "perspective": lens}]
     pose = np.eye(4)
-    pose[:3] = np.array(Y_UP) @ camera.pose()[:3] @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    pose[:3] = np.array(Y_UP) @ camera.pose()[:3] @ MITSUBA_FROM_OPENGL
     tree["nodes"].append({"name": "camera", "camera": 0, "matrix": pose.T.ravel().tolist()})
     tree["scenes"][0]["nodes"].append(len(tree["nodes"]) - 1)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.poses import poses_around
-from mi_refgs.data.region import Region
+from mi_refgs.data.region import Region, weighted_quantile
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -25,8 +25,8 @@ INSIDE = 0.98
 def shots_around(surfels: Surfels) -> list[Shot]:
     """Return cameras on a sphere around the surfels, from 10° below to 70° above its equator, z up."""
     position, weight = _weighted(surfels)
-    middle = np.array([_quantile(axis, weight, 0.5) for axis in position.T])
-    reach = _quantile(np.linalg.norm(position - middle, axis=1), weight, INSIDE)
+    middle = np.array([weighted_quantile(axis, weight, 0.5) for axis in position.T])
+    reach = weighted_quantile(np.linalg.norm(position - middle, axis=1), weight, INSIDE)
     radius = max(reach, 1e-6) * 1.1
     distance = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     focal = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
@@ -68,8 +68,8 @@ def _middle(scene: TrainedScene) -> np.ndarray:
         position, weight = _weighted(scene.surfels)
     else:
         position, weight = scene.mesh.vertices.astype(np.float64), np.ones(len(scene.mesh.vertices))
-    low, high = ([_quantile(axis, weight, share) for axis in position.T] for share in (1 - INSIDE, INSIDE))
-    return (np.array(low) + np.array(high)) / 2
+    ends = [[weighted_quantile(axis, weight, share) for axis in position.T] for share in (1 - INSIDE, INSIDE)]
+    return np.mean(ends, axis=0)
 
 
 def _weighted(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
@@ -78,10 +78,3 @@ def _weighted(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
     if not len(raw["position"]):
         raise InputError("surfels: there are none; cameras have nothing to look at")
     return raw["position"].astype(np.float64), 1 / (1 + np.exp(-raw["opacity"][:, 0].astype(np.float64)))
-
-
-def _quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:
-    """Return the value below which `share` of the weight lies."""
-    order = np.argsort(values)
-    summed = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(summed, share * summed[-1])])

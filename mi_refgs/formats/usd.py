@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.errors import InputError
 from mi_refgs.formats.baking import TexturedMesh, bake
 from mi_refgs.formats.format import Shot, import_extra
@@ -111,5 +112,5 @@ def _add_camera(prim: Any, camera: Camera, gf: Any) -> None:
     prim.CreateVerticalApertureOffsetAttr(-APERTURE * fx / camera.width * down / fy)
     prim.CreateClippingRangeAttr(gf.Vec2f(1e-3, 1e6))
     # USD's matrices multiply rows.
-    pose = (camera.pose() @ np.diag([-1.0, 1.0, -1.0, 1.0])).T
+    pose = (camera.pose() @ MITSUBA_FROM_OPENGL).T
     prim.AddTransformOp().Set(gf.Matrix4d(*pose.ravel().tolist()))

@@ -379,7 +379,7 @@ def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
     refused(["capture", photographs, "-o", photographs], "choose another")
     for width in range(9, 13):
         scene.save(photographs / f"{width}.jpg", np.zeros((8, width, 3), dtype=np.uint8))
-    refused(["capture", photographs, "-o", tmp_path], "5 different sizes, such as 10 × 8 (10.jpg)")
+    refused(["capture", photographs, "-o", tmp_path], "5 different sizes, such as 10 × 8 ('10.jpg')")
     for width in range(9, 13):
         (photographs / f"{width}.jpg").unlink()
     (_made(tmp_path / "other") / "file").touch()

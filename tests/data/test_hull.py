@@ -110,6 +110,4 @@ def test_empty_hull_and_parallel_cameras_are_refused(rng: np.random.Generator) -
     refused(lambda: hull.visual_hull(nothing, hull.camera_bounds(views), resolution=8), "inside every mask")
     for few in ([], views[:1]):
         refused(partial(hull.camera_bounds, few), "do not look at one point")
-    points = hull.random_points(100, np.array([[-1, 0, 2], [1, 1, 2.5]]), rng)
-    assert points.shape == (100, 3) and np.all((points >= [-1, 0, 2]) & (points <= [1, 1, 2.5]))
-    assert np.all(hull.median_colours(points, nothing, BLACK) == 0.5)
+    assert np.all(hull.median_colours(rng.normal(size=(100, 3)), nothing, BLACK) == 0.5)
