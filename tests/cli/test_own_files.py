@@ -34,46 +34,36 @@ BALL = """<scene version="3.0.0">
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a command runs: a folder of its own with copies of what it reads."""
-
-    folder: Path
-
-    def __truediv__(self, name: str) -> Path:
-        return self.folder / name
-
-
-@dataclass(frozen=True)
 class Case:
     """A command line, and the files that it writes: those of a clean run, or `names` if that takes long."""
 
     command: str
-    arguments: Callable[[Place], list[str]]
+    arguments: Callable[[Path], list[str]]  # on the folder where it runs
     needs: tuple[str, ...] = ("run",)  # of what is copied into the place
     names: tuple[str, ...] = ()
     replaces: tuple[str, ...] = ()  # what the user names, which is replaced
     every: bool = True  # whether each name is tried, or the last alone, because a refusal takes seconds
 
 
-def _train(place: Place) -> list[str]:
+def _train(place: Path) -> list[str]:
     return train_command(place / "data", place / "out", place / "tiny.toml")
 
 
-def _dataset(place: Place, *more: str) -> list[str]:
+def _dataset(place: Path, *more: str) -> list[str]:
     size = ["--views", "1", "--test-views", "1", "--size", "4", "--samples", "1"]
     return ["dataset", str(place / "ball.xml"), "-o", str(place / "out"), *size, *more]
 
 
-def _on(command: str, *more: str) -> Callable[[Place], list[str]]:
+def _on(command: str, *more: str) -> Callable[[Path], list[str]]:
     """A command on the run; @ in an argument is the place."""
     return lambda place: [
         command,
         str(place / "run"),
-        *(text.replace("@", str(place.folder)) for text in more),
+        *(text.replace("@", str(place)) for text in more),
     ]
 
 
-def _compare(place: Place) -> list[str]:
+def _compare(place: Path) -> list[str]:
     method = ["--methods", str(place / "tiny.toml"), "--preset", "quick"]
     return ["compare", str(place / "data"), "-o", str(place / "out"), *method]
 
@@ -174,20 +164,20 @@ def small_demo(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(demo, name, value)
 
 
-def place_of(case: Case, sources: Path, folder: Path) -> Place:
+def place_of(case: Case, sources: Path, folder: Path) -> Path:
     """A place for a case; "run@out" is the run in the folder "out"."""
     folder.mkdir()
     for need in case.needs:
         source, _, target = need.partition("@")
         copy: Any = shutil.copytree if (sources / source).is_dir() else shutil.copy
         copy(sources / source, folder / (target or source))
-    return Place(folder)
+    return folder
 
 
-def contents(place: Place) -> dict[str, bytes]:
+def contents(place: Path) -> dict[str, bytes]:
     """Every file of a place but the records, by its path."""
-    files = (path for path in sorted(place.folder.rglob("*")) if path.is_file() and path.name != RECORD)
-    return {path.relative_to(place.folder).as_posix(): path.read_bytes() for path in files}
+    files = (path for path in sorted(place.rglob("*")) if path.is_file() and path.name != RECORD)
+    return {path.relative_to(place).as_posix(): path.read_bytes() for path in files}
 
 
 def tried(case: Case, names: tuple[str, ...]) -> list[str]:
@@ -196,7 +186,7 @@ def tried(case: Case, names: tuple[str, ...]) -> list[str]:
     return [*kinds.values()] if case.every else [names[-1]]
 
 
-def run(case: Case, place: Place) -> int:
+def run(case: Case, place: Path) -> int:
     """Run the command; `refgs view` saves a view, as its page would."""
     if case.command != "view":
         return main(case.arguments(place))
@@ -257,10 +247,10 @@ def test_export_replaces_only_exports_of_the_same_run(sources: Path, tmp_path: P
     assert main(export) == 0
     (out / "surfels.ply").write_bytes(b"spoilt")
     assert main(export) == 0 and (out / "surfels.ply").read_bytes() == (first / "surfels.ply").read_bytes()
-    before = contents(Place(out))
+    before = contents(out)
     other = ["export", str(second), "-o", str(out)]
     refused(other, "--overwrite")
-    assert contents(Place(out)) == before
+    assert contents(out) == before
     (out / "background.exr").write_bytes(FOREIGN)
     refused(export, "background.exr: output: exists")
     assert main([*other, "--overwrite"]) == 0 and not (out / "background.exr").exists()
@@ -271,7 +261,7 @@ def test_run_is_never_overwritten(sources: Path, tmp_path: Path) -> None:
     """Not even with --overwrite; nor its files one by one, also in a run without checkpoints."""
     shutil.copytree(sources / "run", tmp_path / "run")
     bare = shutil.copytree(sources / "bare", tmp_path / "bare")
-    before = contents(Place(bare))
+    before = contents(bare)
     for more in ([], ["--overwrite"]):
         command = ["export", str(tmp_path / "run"), "-o", str(bare), *more]
         refused(command, "contains a run, which is never overwritten")
@@ -280,7 +270,7 @@ def test_run_is_never_overwritten(sources: Path, tmp_path: Path) -> None:
         (tmp_path / "config.toml").rename(bare / "config.toml")
     with pytest.raises(InputError, match="contains a run already"):
         mi_refgs.load(tmp_path / "run").save(bare)
-    assert contents(Place(bare)) == before
+    assert contents(bare) == before
 
 
 def test_save_refuses_foreign_files(sources: Path, tmp_path: Path) -> None:
@@ -288,7 +278,7 @@ def test_save_refuses_foreign_files(sources: Path, tmp_path: Path) -> None:
     (tmp_path / "out/mesh.ply").write_bytes(FOREIGN)
     with pytest.raises(InputError, match=r"mesh\.ply: output: exists"):
         mi_refgs.load(sources / "run").save(tmp_path / "out")
-    assert contents(Place(tmp_path / "out")) == {"mesh.ply": FOREIGN}
+    assert contents(tmp_path / "out") == {"mesh.ply": FOREIGN}
 
 
 def test_format_replaces_only_files_of_the_same_run(sources: Path, tmp_path: Path) -> None:

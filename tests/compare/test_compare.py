@@ -20,7 +20,7 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs, page
 from mi_refgs.compare.jobs import Job, Shared
-from mi_refgs.compare.table import Statistic, heading, table_of
+from mi_refgs.compare.table import heading, table_of
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import read_png
@@ -254,7 +254,6 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Pat
         (["{data}", "-o", "{out}"], ["--methods", "ref_gaussian"]),
         (["{data}", "--methods", "{tiny}"], ["-o PATH, --output"]),
         (["-o", "{out}"], ["has no comparison"]),
-        (["-o", "{out}", "--preset", "quick"], ["DATA"]),
     ],
 )
 def test_bad_input_is_refused(
@@ -382,12 +381,6 @@ def test_page_is_valid_and_self_contained(compared: tuple[Path, int]) -> None:
 
 
 # ---------- Arithmetic ----------
-
-
-def test_statistics() -> None:
-    assert Statistic.of([3.0]) == Statistic(3.0, None, (3.0,))
-    number = Statistic.of([1.0, 2.0, 6.0])
-    assert number.mean == 3.0 and number.sd == pytest.approx(7**0.5)
 
 
 def test_crop_is_where_images_differ_most(rng: np.random.Generator) -> None:

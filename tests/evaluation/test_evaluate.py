@@ -71,8 +71,11 @@ def trainer(run: Run, folder: Path) -> Trainer:
     return Trainer(run.method(), read_dataset(folder / "ball", "train"), run)
 
 
-def test_metrics_json_has_every_key(run: Run) -> None:
+def test_evaluate_writes_every_metric_sheet_and_render(run: Run) -> None:
     result = evaluate(run)
+    sheet = read_png(run.path / "contact_sheet.png")
+    assert sheet.shape[0] > 2 * images.CELL_MIN and sheet.shape[1] > 6 * images.CELL_MIN
+    assert sorted(path.name for path in (run.path / "eval").iterdir()) == ["test_r_0.png", "test_r_1.png"]
     assert result.keys() >= set(KEYS)
     written = json.loads((run.path / "metrics.json").read_text())
     assert written == json.loads(json.dumps(result, allow_nan=False))
@@ -85,8 +88,8 @@ def test_metrics_json_has_every_key(run: Run) -> None:
         assert missing == bool(result[f"{key}_reason"]), key
 
 
-def test_metrics_equal_those_of_the_trainer(run: Run, trainer: Trainer, views: Dataset) -> None:
-    """Exported, read back and measured: the state of the trainer, view by view."""
+def test_metrics_and_scene_file_equal_the_trainer(run: Run, trainer: Trainer, views: Dataset) -> None:
+    """Exported, read back and measured, or rendered by Mitsuba: the state of the trainer, view by view."""
     result, scores = evaluate(run), []
     for view in (view.load() for view in views.views):
         planes = displayed(trainer.view(view.camera()), views.background, views.is_linear_radiance)
@@ -94,11 +97,6 @@ def test_metrics_equal_those_of_the_trainer(run: Run, trainer: Trainer, views: D
     assert math.isclose(result["psnr"], np.mean(scores), abs_tol=1e-4)
     assert [view["psnr"] for view in result["views"]] == pytest.approx(scores, abs=1e-4)
 
-
-def test_mitsuba_renders_the_exported_scene_like_the_trainer(
-    run: Run, trainer: Trainer, views: Dataset
-) -> None:
-    evaluate(run)
     image = np.array(mi.render(mi.load_file(str(run.path / "scene.xml"))))
     frame = trainer.view(views.views[0].camera())
     expected = images.image_array([*frame.radiance, frame.alpha], SIZE, SIZE)
@@ -140,13 +138,6 @@ def test_export_removes_stale_mesh(run: Run, views: Dataset) -> None:
     export(TrainedScene.from_state(run.method(), bare), run.path, views.views[0].camera())
     assert not (run.path / "mesh.ply").exists()
     assert not TrainedScene.read(run.path).shading.occlusion
-
-
-def test_evaluate_writes_sheet_and_renders(run: Run) -> None:
-    evaluate(run)
-    sheet = read_png(run.path / "contact_sheet.png")
-    assert sheet.shape[0] > 2 * images.CELL_MIN and sheet.shape[1] > 6 * images.CELL_MIN
-    assert sorted(path.name for path in (run.path / "eval").iterdir()) == ["test_r_0.png", "test_r_1.png"]
 
 
 def test_panels_show_every_map(trainer: Trainer, views: Dataset) -> None:

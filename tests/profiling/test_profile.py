@@ -37,6 +37,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, Composited, Footprints
+from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS, SIZE
 
 PAUSE = 0.25
@@ -207,7 +208,7 @@ def files(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-def test_of_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_profile_of_run_has_every_number(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files(finished)
     capsys.readouterr()
     assert main(["profile", str(finished), "--steps", "2", "--size", "16", "--json"]) == 0
@@ -229,7 +230,7 @@ def test_of_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {*frame["aovs_ms"]} == {*materials, *traced, "normal", "depth", "diffuse", "specular", "indirect"}
 
 
-def test_what_image_and_each_aov_take(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_and_each_aov_are_timed_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """In turns; kernels that are compiled count for nothing, and an AOV by its difference in a round."""
     asked: list[tuple[str, ...]] = []
     clock = [0.0]
@@ -256,7 +257,9 @@ def test_aovs_of_frame_are_those_that_it_has(finished: Path) -> None:
     assert aovs_of(frame) == ["albedo", "metallic", "roughness", "normal", "depth", "diffuse"]
 
 
-def test_of_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_profile_of_data_set_has_every_stage(
+    data: Path, method: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = ["--method", str(method), "--preset", "quick", "--steps", "1", "--set", *SETTINGS]
     assert main(["profile", str(data), *options]) == 0
     said = capsys.readouterr().out
@@ -267,37 +270,23 @@ def test_of_data_set(data: Path, method: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize(
-    ("more", "parts"),
+    ("arguments", "words"),
     [
-        (["--steps", "0"], ["--steps", "give 1 to"]),
-        (["--size", "0"], ["--size", "give 1 to"]),
-        (["--preset", "quick"], ["--preset", "drop"]),
-        (["--set", "loss.ssim=0"], ["--set", "drop"]),
-        (["--data", "nowhere"], ["nowhere", "no such folder"]),
+        ("{run} --steps 0", ["--steps", "give 1 to"]),
+        ("{run} --size 0", ["--size", "give 1 to"]),
+        ("{run} --preset quick", ["--preset", "drop"]),
+        ("{run} --set loss.ssim=0", ["--set", "drop"]),
+        ("{run} --data nowhere", ["nowhere", "no such folder"]),
+        ("{data} --data {data}", ["drop --data"]),
+        ("{data} --size 16", ["drop --size"]),
+        ("{empty}", ["transforms_train.json"]),
+        ("{empty}/none", ["no such folder"]),
     ],
 )
-def test_bad_requests(
-    more: list[str], parts: list[str], finished: Path, capsys: pytest.CaptureFixture[str]
+def test_bad_requests_are_refused(
+    arguments: str, words: list[str], finished: Path, data: Path, tmp_path: Path
 ) -> None:
-    capsys.readouterr()
-    assert main(["profile", str(finished), *more]) == 2
-    out, err = capsys.readouterr()
-    assert not out and "Traceback" not in err and "; " in err
-    assert all(part in err for part in parts), err
-
-
-def test_what_is_neither_run_nor_data(
-    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for argv, part in (
-        ([str(tmp_path / "none")], "no such folder"),
-        ([str(tmp_path)], "transforms_train.json"),
-        ([str(data), "--data", str(data)], "drop --data"),
-    ):
-        assert main(["profile", *argv]) == 2
-        assert part in capsys.readouterr().err
-    assert main(["profile", str(data), "--size", "16"]) == 2
-    assert "drop --size" in capsys.readouterr().err
+    refused(["profile", *arguments.format(run=finished, data=data, empty=tmp_path).split()], *words)
 
 
 def test_run_without_checkpoints_has_images(
@@ -311,8 +300,7 @@ def test_run_without_checkpoints_has_images(
     assert head.split()[-2:] == ["12x12", "16x16"] and "training" not in head
     assert rows[0].split()[:3] == ["radiance", "and", "alpha"] and any("+ depth" in row for row in rows)
     (run / "model.json").unlink()
-    assert main(["profile", str(run)]) == 2
-    assert "checkpoints: none yet" in capsys.readouterr().err
+    refused(["profile", run], "checkpoints: none yet")
 
 
 # ---------- Counts and advice ----------
@@ -331,14 +319,10 @@ def test_work_is_counted_over_views(trainer: Trainer) -> None:
 
 
 def quiet_profile() -> Profile:
-    """One that nothing can be said about."""
+    """Return a profile without advice."""
     stage = StageProfile("deferred", 10.0, 60, 0, dict.fromkeys(phases.PHASES, 1.0))
     work = Work(8, 1000, 4e4, 16, 2e4, 5e4, 8e5, 4e5, 0.1, 0.1, 0.1, 2.0, 40.0)
     return Profile((stage,), work, 2**20, 2**34)
-
-
-def test_nothing_stands_out() -> None:
-    assert advice(quiet_profile(), a_method()) == []
 
 
 def a_method() -> Method:
@@ -367,8 +351,9 @@ def test_each_rule_follows_from_its_number(work: dict[str, Any], ms: dict[str, f
     assert len(said) == 1 and part in said[0]
 
 
-def test_compiling_and_crowding_are_said() -> None:
+def test_advice_on_compiling_and_crowding() -> None:
     base = quiet_profile()
+    assert advice(base, a_method()) == []
     found = replace(base, stages=(replace(base.stages[0], misses=3),), allocated=2**34)
     compiled, crowded = advice(found, a_method())
     assert "3 kernels were compiled" in compiled and "16.0 of the machine's 16.0 GiB" in crowded

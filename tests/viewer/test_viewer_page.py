@@ -339,14 +339,27 @@ def test_an_aov_is_displayed_and_saved(tab: Tab, server: tuple[Server, Path]) ->
     tab.returns(before, "the image")
 
 
+DROP = """(content) => {
+    const data = new DataTransfer();
+    data.items.add(new File([new Uint8Array(content)], 'dusk.exr'));
+    const how = {dataTransfer: data, bubbles: true, cancelable: true};
+    window.dispatchEvent(new DragEvent('drop', how));
+}"""
+"""Drops a file onto the page."""
+
+
 @pytest.mark.slow
-def test_a_light_is_uploaded(
-    tab: Tab, scene: TrainedScene, server: tuple[Server, Path], tmp_path: Path
+@pytest.mark.parametrize("dropped", [False, True])
+def test_an_uploaded_or_dropped_image_becomes_the_light(
+    dropped: bool, tab: Tab, scene: TrainedScene, server: tuple[Server, Path], tmp_path: Path
 ) -> None:
-    before = tab.still()
-    write_exr(tmp_path / "dusk.exr", other_sky())
+    before, file = tab.still(), tmp_path / "dusk.exr"
+    write_exr(file, other_sky())
     tab.row("Map has world directions").check(force=True)
-    tab.page.locator("input[type=file]").set_input_files(tmp_path / "dusk.exr")
+    if dropped:
+        tab.page.evaluate(DROP, list(file.read_bytes()))
+    else:
+        tab.page.locator("input[type=file]").set_input_files(file)
     tab.differs(before, 1, "another light")
     known = set(server[1].iterdir())
     tab.press("EXR")
@@ -354,24 +367,6 @@ def test_a_light_is_uploaded(
     dusk = replace(scene, light=EnvironmentLight.from_radiance(other_sky()))
     found, wanted = read_exr_image(path), rendered(dusk, camera_of(path))
     assert np.abs(found - wanted).max() < 0.02 * wanted.max()
-    tab.press("Estimated environment map")
-
-
-@pytest.mark.slow
-def test_a_file_dropped_onto_the_page_becomes_the_light(tab: Tab, tmp_path: Path) -> None:
-    before = tab.still()
-    write_exr(tmp_path / "dusk.exr", other_sky())
-    content = list((tmp_path / "dusk.exr").read_bytes())
-    tab.page.evaluate(
-        """(content) => {
-            const data = new DataTransfer();
-            data.items.add(new File([new Uint8Array(content)], 'dusk.exr'));
-            const how = {dataTransfer: data, bubbles: true, cancelable: true};
-            window.dispatchEvent(new DragEvent('drop', how));
-        }""",
-        content,
-    )
-    tab.differs(before, 1, "another light")
     tab.press("Estimated environment map")
 
 
