@@ -17,6 +17,7 @@ from mi_refgs.cli import main
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.runs import checkpoint
 from mi_refgs.runs.run import Run
+from tests.helpers import refused
 
 State = dict[str, np.ndarray]
 
@@ -148,14 +149,13 @@ def test_resume_goes_on_from_checkpoint_before_and_says_so(
 
 
 def test_fit_is_not_begun_anew_when_every_checkpoint_is_damaged(
-    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, data: Path, tmp_path: Path
 ) -> None:
     run = Run(copytree(finished, tmp_path / "run"))
     for path in run.checkpoints():
         damage(path, "half")
-    assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 2
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert all(part in said for part in ("0000006.npz: damaged", "begin anew", str(run.path / "checkpoints")))
+    words = "0000006.npz: damaged", "begin anew", run.path / "checkpoints"
+    refused(["train", data, "-o", run.path, "--resume"], *words)
     assert len(run.checkpoints()) == 2
     # The artefacts are of iteration 6 and need no checkpoint.
     assert main(["eval", str(run.path)]) == 0
@@ -178,9 +178,7 @@ def test_resume_clears_what_killed_process_left(finished: Path, data: Path, tmp_
     assert lines[:1] == whole.splitlines()[:1] and len(lines) == 3
 
 
-def test_method_that_changed_since_is_refused(
-    finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_method_that_changed_since_is_refused(finished: Path, data: Path, tmp_path: Path) -> None:
     run = Run(copytree(finished, tmp_path / "run"))
     config = run.path / "config.toml"
     for old, new, name in (
@@ -190,7 +188,5 @@ def test_method_that_changed_since_is_refused(
         text = config.read_text()
         assert old in text
         config.write_text(text.replace(old, new))
-        assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 2
-        said = capsys.readouterr().err.splitlines()[-1]
-        assert "config.toml" in said and name in said and "undo" in said
+        refused(["train", data, "-o", run.path, "--resume"], "config.toml", name, "undo")
         config.write_text(text)
