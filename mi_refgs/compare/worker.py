@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.compare.jobs import FAILED, Job
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.interrupt import TerminatedError
@@ -91,9 +92,7 @@ class Curve:
 
         self.run = job.run
         self.data = read_views(method, Path(job.data), "test", truth=False)
-        last = len(self.data.views) - 1
-        count = min(CURVE_VIEWS, last + 1)
-        self.views = [self.data.views[i * last // max(count - 1, 1)] for i in range(count)]
+        self.views = [self.data.views[i] for i in evenly_spread(len(self.data.views), CURVE_VIEWS)]
         points = [round(method.iterations * (k + 1) / CURVE_POINTS) for k in range(CURVE_POINTS)]
         self.due = [point for point in points if point > begin]
 

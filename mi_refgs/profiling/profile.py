@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.profiling.phases import phase_times
@@ -226,7 +227,7 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
 def count_work(trainer: Trainer) -> Work:
     """Count the mean work of up to VIEWS training views."""
     surfels = trainer.surfels.detach()
-    chosen = np.linspace(0, len(trainer.targets) - 1, min(VIEWS, len(trainer.targets))).astype(int)
+    chosen = evenly_spread(len(trainer.targets), VIEWS)
     counts: list[Counts] = []
     pixels = []
     for index in chosen:

@@ -191,16 +191,6 @@ def test_interrupted_fit_resumes_bit_for_bit(
     assert [json.loads(line)["iteration"] for line in lines] == [2, 4, 6]
 
 
-def test_export_writes_newest_checkpoint(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["export", str(finished), "-o", str(tmp_path / "out"), "--json"]) == 0
-    files = json.loads(capsys.readouterr().out)["files"]
-    for file in files:
-        assert Path(file).read_bytes() == (finished / Path(file).name).read_bytes()
-    assert {Path(file).name for file in files} >= {"surfels.ply", "envmap.exr", "mesh.ply", "scene.xml"}
-
-
 def test_render_writes_exr_with_aovs_and_png(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -283,6 +273,9 @@ def test_demo_writes_contact_sheet_once(
 # ---------- Bad input: one sentence with file, field and remedy, and exit code 2 ----------
 
 
+TRAIN = "transforms_train.json"
+
+
 def edit(path: Path, change: Callable[[dict], object]) -> None:
     content = json.loads(path.read_text())
     change(content)
@@ -295,7 +288,7 @@ def five_sizes(data: Path) -> None:
         for key in "wh":
             content.pop(key)
 
-    edit(data / "transforms_train.json", change)
+    edit(data / TRAIN, change)
     for i in range(5):
         write_png(data / "train" / f"r_{i}.png", np.ones((SIZE, SIZE + 2 * i, 4)))
 
@@ -304,18 +297,12 @@ def five_sizes(data: Path) -> None:
     ("spoil", "words"),
     [
         (lambda data: (data / "train/r_1.png").unlink(), ["r_1.png", "missing", "restore it"]),
+        (lambda data: (data / "train/r_1.png").write_bytes(b"\x89PNG\r\n no"), ["r_1.png", "not a readable"]),
+        (lambda data: (data / TRAIN).write_text('{"frames": ['), [TRAIN, "JSON"]),
+        (five_sizes, [TRAIN, "5 different sizes"]),
         (
-            lambda data: (data / "train/r_1.png").write_bytes(b"\x89PNG\r\n no"),
-            ["r_1.png", "not a readable image"],
-        ),
-        (
-            lambda data: (data / "transforms_train.json").write_text('{"frames": ['),
-            ["transforms_train.json", "JSON"],
-        ),
-        (five_sizes, ["transforms_train.json", "5 different sizes"]),
-        (
-            lambda data: edit(data / "transforms_train.json", lambda content: content.update(frames=[])),
-            ["transforms_train.json", "zero training views"],
+            lambda data: edit(data / TRAIN, lambda content: content.update(frames=[])),
+            [TRAIN, "zero train"],
         ),
         (shutil.rmtree, ["ball", "no such folder"]),
     ],
@@ -401,39 +388,36 @@ def test_unwritable_output(finished: Path, data: Path, method: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("argv", "parts"),
+    ("command", "words"),
     [
-        (["trian"], ["trian", "train, demo"]),
-        (["train"], ["DATA"]),
-        (["train", "here", "-o", "there", "--preset", "fast"], ["--preset", "quick, standard, paper"]),
-        (["train", "here", "-o", "there", "--method", "nothing"], ["--method", "nothing"]),
-        (["train", "here", "-o", "there", "--for", "nothing"], ["--for", "nothing", "relighting"]),
+        ("trian", ["trian", "train, demo"]),
+        ("train", ["DATA"]),
+        ("train here -o there --preset fast", ["--preset", "quick, standard, paper"]),
+        ("train here -o there --method nothing", ["--method", "nothing"]),
+        ("train here -o there --for nothing", ["--for", "nothing", "relighting"]),
         (
-            ["train", "here", "-o", "there", "--for", "relighting", "--method", "no_pbr"],
-            ["--for", "--method no_pbr", "one of the two"],
+            "train here -o there --for relighting --method no_pbr",
+            ["--for", "no_pbr", "one of the two"],
         ),
-        (["train", "here", "-o", "there", "--threads", "0"], ["--threads"]),
-        (
-            ["train", "here", "-o", "there", "--mitsuba-variant", "scalar_rgb"],
-            ["--mitsuba-variant", "llvm_ad_rgb"],
-        ),
-        (["dataset", "no.xml", "-o", "there"], ["no.xml", "missing"]),
-        (["render", "no.xml", "-o", "x.bmp"], ["x.bmp", ".exr or .png"]),
-        (["render", "no.xml", "-o", "x.png", "--samples", "-1"], ["--samples"]),
-        (["render", "no.xml", "-o", "x.png", "--samples", "x"], ["--samples: 'x'"]),
-        (["render", "no.xml", "-o", "x.png", "--smaples", "4"], ["--smaples"]),
-        (["edit", "run", "-o", "x", "--split", "all"], ["--split", "test"]),
-        (["export", "run", "--limit", "40"], ["--limit", "--prune"]),
+        ("train here -o there --threads 0", ["--threads"]),
+        ("train here -o there --mitsuba-variant scalar_rgb", ["--mitsuba-variant", "llvm_ad_rgb"]),
+        ("dataset no.xml -o there", ["no.xml", "missing"]),
+        ("render no.xml -o x.bmp", ["x.bmp", ".exr or .png"]),
+        ("render no.xml -o x.png --samples -1", ["--samples"]),
+        ("render no.xml -o x.png --samples x", ["--samples: 'x'"]),
+        ("render no.xml -o x.png --smaples 4", ["--smaples"]),
+        ("edit run -o x --split all", ["--split", "test"]),
+        ("export run --limit 40", ["--limit", "--prune"]),
     ],
 )
-def test_bad_arguments(
-    argv: list[str], parts: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_bad_arguments_are_refused(
+    command: str, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    refused(argv, *parts)
+    refused(command.split(), *words)
 
 
-def test_bad_requests_of_render(finished: Path, tmp_path: Path) -> None:
+def test_render_refuses_bad_requests(finished: Path, tmp_path: Path) -> None:
     out = str(tmp_path / "x.exr")
     refused(["render", str(finished), "-o", out, "--sensor", "1"], "--sensor", "give 0 to 0")
     refused(["render", str(finished), "-o", out, "--aov", "colour"], "aovs", "colour", "albedo")

@@ -32,21 +32,17 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
-def test_bash_completes_commands_and_options(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bash_completes_commands_options_and_files(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = script("bash", capsys)
     assert completed(source, "refgs", "") >= {*command_names()}
     assert completed(source, "refgs", "tr") == {"train"}
     assert "--preset" in completed(source, "refgs", "train", "--p")
     assert "--turntable" in completed(source, "refgs", "relight", "run", "--turn")
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
-def test_bash_completes_files(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     (tmp_path / "vase").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert "vase" in completed(script("bash", capsys), "refgs", "train", "va")
+    assert "vase" in completed(source, "refgs", "train", "va")
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh", "fish"])
@@ -54,12 +50,8 @@ def test_every_shell_has_a_script(shell: str, capsys: pytest.CaptureFixture[str]
     text = script(shell, capsys)
     assert "refgs" in text and "relight" in text
     assert "--turntable" in text or shell == "tcsh"
-
-
-def test_json_has_the_script(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", "zsh", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["shell"] == "zsh" and found["script"].startswith("#compdef refgs")
+    assert main(["completion", shell, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"shell": shell, "script": text.removesuffix("\n")}
 
 
 def test_unknown_shell_is_refused() -> None:

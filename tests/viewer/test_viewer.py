@@ -47,15 +47,8 @@ from mi_refgs.viewer.tonemap import DisplayOptions, displayed_planes, to_bytes
 from mi_refgs.viewer.training import CURVES, Training, TrainingPage
 from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 from tests.helpers import ROOT, refused
-from tests.scenes.known import known_scene, with_background
+from tests.scenes.known import with_background
 from tests.scenes.tiny import SETTINGS
-
-
-@pytest.fixture(scope="module")
-def scene() -> TrainedScene:
-    """Two balls of known materials."""
-    mi.set_variant("llvm_ad_rgb")
-    return known_scene()
 
 
 @pytest.fixture

@@ -16,7 +16,6 @@ from typing import Any
 import mi_refgs  # noqa: F401  (first: it chooses the libLLVM that Dr.Jit loads)
 
 # isort: split
-import mitsuba as mi
 import msgspec
 import pytest
 import viser
@@ -26,13 +25,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from mi_refgs.data.dataset import read_dataset
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.viewer import guard as guard_module
 from mi_refgs.viewer.guard import SIDE, TEXT, UPLOAD, VALUES, Guard, guard_controls, guarded
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.serve import add_panels
 from tests.helpers import refused
-from tests.scenes.known import known_scene
 from tests.scenes.tiny import write_data
 
 WAIT = 20.0
@@ -40,17 +39,9 @@ WAIT = 20.0
 
 
 @pytest.fixture(scope="module")
-def displayed() -> ReconstructionView:
-    """The scene of the pages."""
-    mi.set_variant("llvm_ad_rgb")
-    return ReconstructionView(known_scene())
-
-
-@pytest.fixture(scope="module")
-def pages(
-    displayed: ReconstructionView, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[dict[str, Page]]:
+def pages(scene: TrainedScene, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Page]]:
     """Pages with every panel, for this machine only and for others, too; nothing is drawn."""
+    displayed = ReconstructionView(scene)
     with contextlib.ExitStack() as stack:
         found = {}
         for host in ("127.0.0.1", "0.0.0.0"):
@@ -58,7 +49,7 @@ def pages(
             data = {"test": read_dataset(write_data(folder / "data"), "test")}
             found[host] = Page(displayed, data, "a page", (host, 0), folder / "views")
             stack.callback(found[host].close)
-            add_panels(found[host], displayed, displayed.scene)
+            add_panels(found[host], displayed, scene)
         yield found
 
 
@@ -389,11 +380,11 @@ class Server:
 
 
 def test_a_viser_that_bypasses_the_guard_is_stopped(
-    displayed: ReconstructionView, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(viser, "ViserServer", Server)
     before, words = Server.stopped, "does not let the page be protected; pip install viser=="
-    refused(lambda: Page(displayed, {}, "a page", ("127.0.0.1", 0), tmp_path), words)
+    refused(lambda: Page(ReconstructionView(scene), {}, "a page", ("127.0.0.1", 0), tmp_path), words)
     assert Server.stopped == before + 1
 
 

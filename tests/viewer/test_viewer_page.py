@@ -20,7 +20,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
@@ -39,7 +38,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
 from mi_refgs.viewer.pose import Pose
 from tests.helpers import ROOT
-from tests.scenes.known import known_scene, other_sky, with_background
+from tests.scenes.known import other_sky, with_background
 from tests.scenes.tiny import train_command, write_data, write_method
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -177,13 +176,6 @@ class Tab:
     def press(self, label: str) -> None:
         """Press a button."""
         self.page.get_by_role("button", name=label, exact=True).click()
-
-
-@pytest.fixture(scope="module")
-def scene() -> TrainedScene:
-    """A ball of metal and one of glaze under a sky."""
-    mi.set_variant("llvm_ad_rgb")
-    return known_scene()
 
 
 @pytest.fixture(scope="module")
