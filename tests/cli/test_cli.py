@@ -322,7 +322,7 @@ def test_unknown_key_in_a_method(data: Path, method: Path, tmp_path: Path) -> No
     wrong.write_text(method.read_text().replace("degree", "degrees"))
     refused(train_command(data, tmp_path / "run", wrong), "wrong.toml", "surfels", "degrees")
     command = [*train_command(data, tmp_path / "run", method), "loss.sim=1"]
-    refused(command, "--set", "loss", "sim")
+    refused(command, "loss.sim: ", "is unknown")
     refused([*command[:-1], "loss.ssim"], "--set", "key=value")
 
 
