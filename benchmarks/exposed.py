@@ -8,13 +8,13 @@ the sRGB curve and 8 bits; alpha stays. gains.json contains the gains, uniform i
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.common.report import plain_parser
 from mi_refgs.io.files import read_json, write_json
 from mi_refgs.io.images import linear_from_srgb, read_png, srgb_from_linear, write_png
 
@@ -35,11 +35,9 @@ def put_on(data: Path, copy: Path, low: float, high: float, seed: int) -> dict[s
             pixels[..., :3] = srgb_from_linear(linear_from_srgb(pixels[..., :3]) * np.float32(gain))
             write_png(target, pixels)
             gains[frame["file_path"]] = gain.tolist()
-            for key in [
-                key for key in frame if key.endswith("_path") and key not in ("file_path", "exr_path")
-            ]:
-                shutil.copyfile(data / frame[key], copy / frame[key])
             frame.pop("exr_path", None)
+            for key in (key for key in frame if key.endswith("_path") and key != "file_path"):
+                shutil.copyfile(data / frame[key], copy / frame[key])
         write_json(copy / transforms.name, content)
     for name in ("environment.exr", "surface.ply", "region.json"):
         if (data / name).is_file():
@@ -50,9 +48,7 @@ def put_on(data: Path, copy: Path, low: float, high: float, seed: int) -> dict[s
 
 def main() -> None:
     """Read the command line and write the copy."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.exposed", description="gains put on a data set"
-    )
+    parser = plain_parser("exposed", __doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("copy", type=Path)
     parser.add_argument("--low", type=float, default=0.6)

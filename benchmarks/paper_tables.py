@@ -10,18 +10,16 @@ the paper by the name of its folder.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.common.report import plain_parser
 from mi_refgs.compare.table import NOTHING, Row, Scene, Table, aligned, table_of
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json
 
-FILE = Path(__file__).with_suffix(".json")
 OTHER_WORDS = {"blender", "synthetic", "ref", "scene", "data", "dataset"}
 """Words that may be part of a folder's name beside the scene, its data set and numbers."""
 UNNAMED = ("Shiny Blender", "Glossy Synthetic")
@@ -40,22 +38,16 @@ TITLES = {
 """Metric → title and format."""
 
 
-@dataclass(frozen=True)
-class Place:
-    """A scene of the paper."""
+class Place(NamedTuple):
+    """A scene of the paper. Without a scene, the average over a data set; without both, over UNNAMED."""
 
     data_set: str
     scene: str
-    size: tuple[int, int] | None = None  # of the paper's images: width, height
 
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper: metrics → systems → a figure for each column, a (data set, scene) pair.
-
-    A column without a scene is an average over its data set, or, without a data set, over some that the
-    paper does not name.
-    """
+    """A table of the paper: metrics → systems → a figure for each column."""
 
     number: int
     caption: str
@@ -68,34 +60,26 @@ class Figures:
     """All tables, and the data sets that they are about."""
 
     source: str
-    data_sets: dict[str, dict[str, Any]]  # name → of, folder, words, size, scenes → folder names
+    data_sets: dict[str, dict[str, Any]]  # name → of, folder, words, scenes → folder names
     tables: dict[int, PaperTable]
 
     @staticmethod
     def read() -> Figures:
         """Read paper_tables.json."""
-        content = read_json(FILE)
-        tables = {
-            table["table"]: PaperTable(
-                table["table"],
-                table["caption"],
-                tuple(Place(*column) for column in table["columns"]),
-                table["metrics"],
-            )
-            for table in content["tables"]
-        }
+        content = read_json(Path(__file__).with_suffix(".json"))
+        tables = {}
+        for table in content["tables"]:
+            columns = tuple(Place(*column) for column in table["columns"])
+            number = table["table"]
+            tables[number] = PaperTable(number, table["caption"], columns, table["metrics"])
         return Figures(content["source"], content["data_sets"], tables)
 
-    def of(self, place: Place, system: str) -> dict[str, float]:
-        """Return metric → figure of a system on a scene, from every table that has it."""
-        found: dict[str, float] = {}
-        for table in self.tables.values():
-            for i, column in enumerate(table.columns):
-                if (column.data_set, column.scene) == (place.data_set, place.scene):
-                    for metric, systems in table.metrics.items():
-                        if system in systems:
-                            found.setdefault(metric, systems[system][i])
-        return found
+    def places(self, column: Place) -> list[Place]:
+        """Return the scenes that a column is about."""
+        if column.scene:
+            return [column]
+        names = [column.data_set] if column.data_set else UNNAMED
+        return [Place(name, scene) for name in names for scene in self.data_sets[name]["scenes"]]
 
 
 def place_of(folder: Path, figures: Figures) -> Place | None:
@@ -108,29 +92,23 @@ def place_of(folder: Path, figures: Figures) -> Place | None:
     tokens = {token for token in re.split(r"[^a-z0-9]+", folder.name.lower()) if token}
     found = []
     for name, about in figures.data_sets.items():
+        permitted = OTHER_WORDS.union(about["words"])
         for scene, aliases in about["scenes"].items():
             rest = tokens - set(aliases)
-            if rest != tokens and all(
-                token.isdecimal() or token in OTHER_WORDS or token in about["words"] for token in rest
-            ):
-                found.append(Place(name, scene, tuple(about["size"]) if about["size"] else None))
+            if rest != tokens and all(token.isdecimal() or token in permitted for token in rest):
+                found.append(Place(name, scene))
     if len(found) > 1:
         above = f"{folder.parent.name} {folder.name}".lower()
-        found = [
-            place
-            for place in found
-            if any(word in above for word in figures.data_sets[place.data_set]["words"])
-        ]
+        found = [p for p in found if any(word in above for word in figures.data_sets[p.data_set]["words"])]
     return found[0] if len(found) == 1 else None
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """A row: a system's published figures, ours, or their difference; None where there is none."""
 
     title: str
     values: tuple[float | None, ...]
-    signed: bool = False
+    sign: str = ""
 
 
 @dataclass
@@ -150,23 +128,24 @@ def compared(number: int, ours: Table | None, figures: Figures) -> Comparison:
         raise InputError(f"table {number}: not in the paper; give one of {known}")
     table = figures.tables[number]
     result = Comparison(table)
-    scenes = {
-        (found.data_set, found.scene): scene
+    scenes: dict[Place, Scene] = {
+        found: scene
         for scene in (ours.scenes if ours else [])
         if (found := place_of(Path(scene.path), figures)) and any(row.seeds for row in scene.rows)
     }
-    for column in table.columns:
-        for place in _places(column, figures):
-            named = result.missing.setdefault(place[0], [])
-            if place not in scenes and place[1] not in named:
-                named.append(place[1])
+    # Scenes without a finished run.
+    for place in (place for column in table.columns for place in figures.places(column)):
+        named = result.missing.setdefault(place.data_set, [])
+        if place not in scenes and place.scene not in named:
+            named.append(place.scene)
+    # Below each published line, ours of every variant that names its row, and the difference.
     variants = dict.fromkeys((r.variant, r.paper_row) for s in scenes.values() for r in s.rows if r.paper_row)
     for metric, systems in table.metrics.items():
         lines = result.lines.setdefault(metric, [])
         for system, values in systems.items():
             lines.append(Line(f"{system} (published)", tuple(values)))
             for variant in (name for name, row in variants if row == system):
-                mine = [_ours(metric, variant, _places(c, figures), scenes) for c in table.columns]
+                mine = [_ours(metric, variant, figures.places(c), scenes) for c in table.columns]
                 if all(value is None for value, _ in mine):
                     continue
                 lines.append(Line(f"  ours: {variant}", tuple(value for value, _ in mine)))
@@ -175,46 +154,12 @@ def compared(number: int, ours: Table | None, figures: Figures) -> Comparison:
                     value - theirs if value is not None and whole else None
                     for (value, whole), theirs in zip(mine, values, strict=True)
                 ]
-                lines.append(Line("  ours − paper", tuple(differences), signed=True))
+                lines.append(Line("  ours − paper", tuple(differences), "+"))
     return result
 
 
-def text(found: Comparison, figures: Figures) -> str:
-    """Return the comparison as Markdown."""
-    table = found.table
-    lines = [f"### Table {table.number}: {table.caption}", "", f"Published figures: {figures.source}."]
-    heads = [_head(column, table.columns) for column in table.columns]
-    for metric, rows in found.lines.items():
-        title, form = TITLES[metric]
-        body = [[row.title, *(_number(value, form, row.signed) for value in row.values)] for row in rows]
-        lines += ["", *aligned([title, *heads], body)]
-    if found.partial:
-        lines += ["", "Averages of ours over a part of the scenes have no difference."]
-    if not any(row.title.startswith("  ") for rows in found.lines.values() for row in rows):
-        lines += ["", "No finished run is of a scene of this table."]
-    for name, scenes in found.missing.items():
-        if scenes:
-            lines += ["", missing(name, scenes, figures)]
-    return "\n".join(lines)
-
-
-def missing(name: str, scenes: Iterable[str], figures: Figures) -> str:
-    """Return a sentence on missing data: scenes, and names of their folders."""
-    about = figures.data_sets[name]
-    folders = ", ".join(f"{about['folder']}/{about['scenes'][scene][0]}" for scene in scenes)
-    return f"Missing: {name} ({about['of']}): {', '.join(scenes)}. Its folders: {folders}; name them as DATA."
-
-
-def _places(column: Place, figures: Figures) -> list[tuple[str, str]]:
-    """Return the (data set, scene) pairs of a column."""
-    if column.scene:
-        return [(column.data_set, column.scene)]
-    names = [column.data_set] if column.data_set else UNNAMED
-    return [(name, scene) for name in names for scene in figures.data_sets[name]["scenes"]]
-
-
 def _ours(
-    metric: str, variant: str, places: list[tuple[str, str]], scenes: dict[tuple[str, str], Scene]
+    metric: str, variant: str, places: list[Place], scenes: dict[Place, Scene]
 ) -> tuple[float | None, bool]:
     """Return our mean over the scenes that have it, and whether all have."""
     rows = [row for p in places if p in scenes for row in scenes[p].rows if row.variant == variant]
@@ -225,10 +170,37 @@ def _ours(
 def _figure(metric: str, row: Row) -> float | None:
     """Return the mean of a row in the paper's unit."""
     key = {"train_hours": "train_seconds", "fps": "ms_per_frame"}.get(metric, metric)
-    number = row.numbers.get(key)
-    if number is None:
+    if (number := row.numbers.get(key)) is None:
         return None
     return {"train_hours": number.mean / 3600, "fps": 1000 / number.mean}.get(metric, number.mean)
+
+
+def text(found: Comparison, figures: Figures) -> str:
+    """Return the comparison as Markdown."""
+    table = found.table
+    lines = [f"### Table {table.number}: {table.caption}", "", f"Published figures: {figures.source}."]
+    heads = [_head(column, table.columns) for column in table.columns]
+    for metric, rows in found.lines.items():
+        title, form = TITLES[metric]
+        body = [
+            [
+                row.title,
+                *(NOTHING if value is None else format(value, row.sign + form) for value in row.values),
+            ]
+            for row in rows
+        ]
+        lines += ["", *aligned([title, *heads], body)]
+    if found.partial:
+        lines += ["", "Averages of ours over a part of the scenes have no difference."]
+    if not any(row.title.startswith("  ") for rows in found.lines.values() for row in rows):
+        lines += ["", "No finished run is of a scene of this table."]
+    for name, scenes in found.missing.items():
+        if scenes:
+            about = figures.data_sets[name]
+            folders = ", ".join(f"{about['folder']}/{about['scenes'][scene][0]}" for scene in scenes)
+            absent = f"Missing: {name} ({about['of']}): {', '.join(scenes)}."
+            lines += ["", f"{absent} Its folders: {folders}; name them as DATA."]
+    return "\n".join(lines)
 
 
 def _head(column: Place, columns: tuple[Place, ...]) -> str:
@@ -237,10 +209,6 @@ def _head(column: Place, columns: tuple[Place, ...]) -> str:
         return f"mean, {column.data_set}" if column.data_set else "mean"
     twice = sum(other.scene == column.scene for other in columns) > 1
     return f"{column.scene} ({column.data_set.split()[0]})" if twice else column.scene
-
-
-def _number(value: float | None, form: str, signed: bool) -> str:
-    return NOTHING if value is None else format(value, f"+{form}" if signed else form)
 
 
 def main() -> None:

@@ -32,8 +32,15 @@ import mitsuba as mi  # isort: skip
 
 from benchmarks.common.fits import sphere_data
 from benchmarks.common.report import plain_parser
+from benchmarks.common.view import ROOT
+from mi_refgs import methods
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.files import TEMPORARY, write_json
+from mi_refgs.io.images import write_png
+from mi_refgs.runs import checkpoint
+from mi_refgs.runs.run import Run
 
-ROOT = Path(__file__).parents[1]
 SIZE, VIEWS = 32, 5
 CHECKPOINT_EVERY = 4
 """Iterations between the checkpoints of the fits that are killed: most kills fall near one."""
@@ -70,18 +77,15 @@ def settings(**windows: int) -> list[str]:
 
 def write_data(folder: Path) -> Path:
     """The images as a data set on disk."""
-    from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-    from mi_refgs.io.images import write_png
-
     folder.mkdir(parents=True)
     views: Any = sphere_data(SIZE, VIEWS, np.random.default_rng(0)).views
     frames = []
-    for i, view in enumerate(views):
-        write_png(folder / f"{i}.png", np.concatenate([view.image, view.alpha[..., None]], axis=-1))
+    for view in views:
+        write_png(folder / f"{view.name}.png", np.dstack([view.image, view.alpha]))
         pose = view.to_world @ MITSUBA_FROM_OPENGL
-        frames.append({"file_path": f"./{i}.png", "transform_matrix": pose.tolist()})
+        frames.append({"file_path": f"./{view.name}.png", "transform_matrix": pose.tolist()})
     content = {"fl_x": views[0].fx, "fl_y": views[0].fy, "w": SIZE, "h": SIZE, "frames": frames}
-    (folder / "transforms_train.json").write_text(json.dumps(content))
+    write_json(folder / "transforms_train.json", content)
     return folder
 
 
@@ -93,40 +97,33 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
 
     Every second kill waits, after its random moment, for the next checkpoint that is being written.
     """
-    from mi_refgs.io.files import TEMPORARY
-    from mi_refgs.runs import checkpoint
-    from mi_refgs.runs.run import Run
-
     draw, run = random.Random(seed), Run(folder / "run")
     data = write_data(folder / "data")
-    command = [sys.executable, "-m", "mi_refgs", "train", str(data), "-o", str(run.path), "--resume"]
+    again = [sys.executable, "-m", "mi_refgs", "train", str(data), "-o", str(run.path), "--resume"]
+    again += ["--threads", "1"]
     windows = settings(densify=7, extract=9, reset=50)
-    first = [*command, "--threads", "1", "--preset", "quick", "--set", *windows]
-    first += [f"checkpoint_every={CHECKPOINT_EVERY}", "preview_every=6"]
+    windows += [f"checkpoint_every={CHECKPOINT_EVERY}", "preview_every=6"]
+    first = [*again, "--preset", "quick", "--set", *windows]
     outcomes: list[dict[str, Any]] = []
     for number in range(times + 1):
-        begun = (run.path / "config.toml").exists()
-        before = _logged(run)
-        process = subprocess.Popen(
-            [*command, "--threads", "1"] if begun else first,
-            cwd=ROOT,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
-        )
+        # Start, or resume, and wait until it goes on.
+        command = again if (run.path / "config.toml").exists() else first
+        before, resumed, last = _logged(run), _checkpoint(run), number == times
+        environment, pipe = os.environ | {"PYTHONPATH": str(ROOT)}, subprocess.PIPE
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=pipe, env=environment)
         deadline = time.monotonic() + START_LIMIT
-        resumed = _checkpoint(run)
         while process.poll() is None and time.monotonic() < deadline and not _goes_on(run, before, resumed):
             time.sleep(0.01)
-        wait, last = draw.uniform(0, WAIT), number == times
+        # Kill it.
         if process.poll() is None:
-            time.sleep(wait)
+            time.sleep(draw.uniform(0, WAIT))
         aimed = number % 2 == 1 and not last
         while aimed and process.poll() is None and time.monotonic() < deadline and not _writing(run):
             pass
         process.send_signal(signal.SIGTERM if last else signal.SIGKILL)
         _, said = process.communicate()
         killed = process.returncode == (143 if last else -signal.SIGKILL)
+        # What it left.
         reached, damaged = _logged(run), []
         for path in run.checkpoints():
             try:
@@ -137,7 +134,6 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
             {
                 "kill": number,
                 "signal": "SIGTERM" if last else "SIGKILL",
-                "seconds": round(wait, 3),
                 "while_writing": aimed,
                 "resumed_at": resumed,
                 "reached": reached,
@@ -149,8 +145,7 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
             }
         )
         print(json.dumps(outcomes[-1]), file=sys.stderr, flush=True)
-    lost = max(outcome["lost"] for outcome in outcomes)
-    left = outcomes[-1]["temporary"]
+    lost, left = max(outcome["lost"] for outcome in outcomes), outcomes[-1]["temporary"]
     return {
         "seed": seed,
         "kills": times,
@@ -158,13 +153,12 @@ def kill(times: int, seed: int, folder: Path) -> dict[str, Any]:
         "most_iterations_lost": lost,
         "checkpoint_every": CHECKPOINT_EVERY,
         "damaged_checkpoints": sum(len(outcome["damaged"]) for outcome in outcomes),
-        "temporary_files_left_by_kills": sum(outcome["temporary"] for outcome in outcomes[:-1]),
         "temporary_files_at_the_end": left,
         "ok": all(outcome["ok"] for outcome in outcomes) and lost <= CHECKPOINT_EVERY and not left,
     }
 
 
-def _logged(run: Any) -> int:
+def _logged(run: Run) -> int:
     """Iteration of the last whole line of the log; 0 without one."""
     try:
         lines = (run.path / "metrics.jsonl").read_bytes().split(b"\n")[:-1]
@@ -173,17 +167,17 @@ def _logged(run: Any) -> int:
         return 0
 
 
-def _checkpoint(run: Any) -> int:
+def _checkpoint(run: Run) -> int:
     """Iteration of the newest checkpoint; 0 without one."""
     return max((int(path.stem) for path in run.checkpoints()), default=0)
 
 
-def _writing(run: Any) -> bool:
+def _writing(run: Run) -> bool:
     """Whether a checkpoint is being written."""
     return any(entry.name.startswith(".") for entry in os.scandir(run.path / "checkpoints"))
 
 
-def _goes_on(run: Any, before: int, resumed: int) -> bool:
+def _goes_on(run: Run, before: int, resumed: int) -> bool:
     """Whether a fit has made a step since it was started: the log was cut back to `resumed`, then grew."""
     now = _logged(run)
     return resumed < now != before or (now > resumed == before)
@@ -194,10 +188,6 @@ def _goes_on(run: Any, before: int, resumed: int) -> bool:
 
 def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     """One fit of so many steps; a record every INTERVAL steps is printed and, at the end, all are written."""
-    from mi_refgs import methods
-    from mi_refgs.fitting.train import Trainer
-    from mi_refgs.runs.run import Run
-
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
     assignments = settings(densify=100, extract=500, reset=2_000)
@@ -205,22 +195,20 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     method = methods.load("ref_gaussian", "quick", assignments)
     run = Run(folder / "run")
     run.create(method, "none")
-    notices: list[str] = []
-    trainer = Trainer(method, sphere_data(SIZE, VIEWS, np.random.default_rng(0)), run, warn=notices.append)
+    trainer = Trainer(method, sphere_data(SIZE, VIEWS, np.random.default_rng(0)), run)
     records: list[dict[str, Any]] = []
 
     def record(state: Trainer) -> None:
         if state.iteration % INTERVAL:
             return
         state.view(state.targets[0].camera)  # as a preview does
-        bad = sum(int((~np.isfinite(x)).sum()) for x in state.state().values())
         records.append(
             {
                 "step": state.iteration,
                 "rss_mb": round(psutil.Process().memory_info().rss / 2**20, 3),
                 "surfels": state.surfels.count,
                 "skipped": state.health.skipped,
-                "not_finite": bad,
+                "not_finite": sum(int((~np.isfinite(x)).sum()) for x in state.state().values()),
                 "loss": round(float(state.loss[0]), 5),
             }
         )
@@ -230,21 +218,17 @@ def soak(steps: int, folder: Path, output: Path | None) -> dict[str, Any]:
     kept = records[int(WARM_UP * len(records)) :]
     step, memory = np.array([(r["step"], r["rss_mb"]) for r in kept], np.float64).T
     growth = 1e4 * float(np.polyfit(step, memory, 1)[0]) if len(kept) > 1 else 0.0  # by least squares
+    skipped, bad = trainer.health.skipped, sum(r["not_finite"] for r in records)
     result = {
         "steps": trainer.iteration,
         "rss_mb": [kept[0]["rss_mb"], kept[-1]["rss_mb"]],
         "rss_mb_per_10000_steps": round(growth, 3),
-        "skipped_steps": trainer.health.skipped,
-        "not_finite": sum(r["not_finite"] for r in records),
-        "notices": notices[:10],
+        "skipped_steps": skipped,
+        "not_finite": bad,
+        "ok": growth <= GROWTH_LIMIT and not skipped and not bad,
     }
-    result["ok"] = (
-        result["rss_mb_per_10000_steps"] <= GROWTH_LIMIT
-        and not trainer.health.skipped
-        and not result["not_finite"]
-    )
     if output is not None:
-        output.write_text(json.dumps({"result": result, "records": records}, indent=1) + "\n")
+        write_json(output, {"result": result, "records": records})
     return result
 
 

@@ -87,11 +87,6 @@ def measure(size: int, views: int, seeds: int) -> list[dict[str, Any]]:
     return rows
 
 
-def means(rows: list[dict[str, Any]], key: str) -> dict[str, float]:
-    """The mean of each unit over the seeds."""
-    return {unit: float(np.mean([row[key] for row in rows if row["unit"] == unit])) for unit in UNITS}
-
-
 def main() -> int:
     parser = plain_parser("units", __doc__)
     parser.add_argument("--size", type=int, default=64, help="pixels a side (default %(default)s)")
@@ -103,15 +98,19 @@ def main() -> int:
     rows = measure(options.size, options.views, options.seeds)
     if options.json:
         write_json(options.json, rows)
-    psnr, normals = (means(rows, key) for key in ("psnr", "normal_mae_deg"))
+    keys = ("psnr", "normal_mae_deg")
+    mean = {
+        unit: np.mean([[row[key] for key in keys] for row in rows if row["unit"] == unit], axis=0)
+        for unit in UNITS
+    }
     first = next(iter(UNITS))
     spread = np.std([row["psnr"] for row in rows if row["unit"] == first], ddof=min(options.seeds - 1, 1))
-    print(f"{first}: {psnr[first]:.3f} dB (standard deviation {spread:.3f}), {normals[first]:.3f}°")
+    print(f"{first}: {mean[first][0]:.3f} dB (standard deviation {spread:.3f}), {mean[first][1]:.3f}°")
     failed = False
     for unit in UNITS:
-        by = psnr[unit] - psnr[first], normals[unit] - normals[first]
-        failed |= abs(by[0]) > PSNR_BOUND or abs(by[1]) > NORMAL_BOUND
-        print(f"{unit:14} {by[0]:+.3f} dB  {by[1]:+.3f}°")
+        psnr, normals = mean[unit] - mean[first]
+        failed |= bool(abs(psnr) > PSNR_BOUND or abs(normals) > NORMAL_BOUND)
+        print(f"{unit:14} {psnr:+.3f} dB  {normals:+.3f}°")
     print(f"bounds: {PSNR_BOUND} dB, {NORMAL_BOUND}°: {'missed' if failed else 'kept'}")
     return int(failed)
 
