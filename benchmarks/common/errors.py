@@ -10,8 +10,6 @@ import numpy as np
 
 from benchmarks.common.montecarlo import Estimate
 from benchmarks.common.report import Row, number, table
-from mi_refgs.evaluation import metrics
-from mi_refgs.io.images import srgb_from_linear
 
 DARK = 0.01
 """Share of the mean radiance below which a relative error counts as one of this radiance."""
@@ -44,13 +42,6 @@ def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = 
         "relmse_floor": floor,
         "below_floor": relmse < CLEAR * floor,
     }
-
-
-def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
-    """(Mean LDR FLIP, "") of linear images, exposed so that the true mean is ½; or (None, why)."""
-    lit = truth[truth > 0]
-    exposure = 0.5 / float(lit.mean())
-    return metrics.flip(srgb_from_linear(image * exposure), srgb_from_linear(truth * exposure))
 
 
 def mean_score(values: np.ndarray, reference: Estimate) -> float:

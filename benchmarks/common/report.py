@@ -135,7 +135,8 @@ def write_reports(
     """Measure, or read `options.json`; write JSON, CSV (of "rows") and page. The exit code: 2 for bad input.
 
     `plot` writes its images of the result to a folder; `page` returns what the template page.md of the
-    benchmark leaves open: tables and numbers by name. The machine and the run's minutes are added.
+    benchmark leaves open: tables and numbers by name. The machine, the
+    settings and the run's minutes are added.
     """
     folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
     try:
@@ -143,7 +144,8 @@ def write_reports(
         write_text(data / f"{name}.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
         write_csv(data / f"{name}.csv", result["rows"])
         plot(result, folder / "images")
-        values = result["machine"] | {"minutes": f"{result['seconds'] / 60:.1f}"} | page(result)
+        values = result["machine"] | result.get("settings", {}) | page(result)
+        values["minutes"] = f"{result['seconds'] / 60:.1f}"
         template = (ROOT / "benchmarks" / name / "page.md").read_text(encoding="utf-8")
         text = re.sub(r"\{\{(\w+)\}\}", lambda found: str(values[found[1]]), template)
         write_text(folder / f"{name}.md", text)

@@ -197,12 +197,6 @@ class Points:
         """P."""
         return int(dr.width(self.pixel))
 
-    def image(self, values: np.ndarray) -> np.ndarray:
-        """(P, C) values as an image (size, size, C), 0 elsewhere."""
-        image = np.zeros((self.size * self.size, values.shape[-1]), np.float32)
-        image[self.pixel.numpy()] = values
-        return image.reshape(self.size, self.size, -1)
-
     def of_image(self, image: Any) -> np.ndarray:
         """The P values (P, 3) of an image, float64."""
         return np.asarray(image, np.float64).reshape(-1, 3)[self.pixel.numpy()]

@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import pickle
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,9 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import mitsuba as mi  # isort: skip
 import trimesh
 
+from benchmarks.common.colmap_files import ColmapCamera, ColmapImage, colmap_binary, colmap_text
 from mi_refgs import methods
 from mi_refgs.data.array_pickle import read_arrays
-from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.llff import read_poses
 from mi_refgs.data.transforms import read_points
@@ -47,35 +46,19 @@ VIEWS = 3
 SIZE = (8, 6)
 NAMES = {"cam": "cameras", "ima": "images", "poi": "points3D"}
 """What the first three bytes of a mutated file say it is; the fourth says text or binary."""
-CAMERAS = [
-    ("PINHOLE", (9.0, 9.5, 4.2, 3.1)),
-    ("OPENCV", (9.0, 9.5, 4.2, 3.1, 0.03, -0.01, 1e-3, -1e-3)),
-    ("SIMPLE_RADIAL_FISHEYE", (9.0, 4.0, 3.0, 0.1)),
-]
+CAMERAS = {
+    0: ColmapCamera("PINHOLE", SIZE, (9.0, 9.5, 4.2, 3.1)),
+    1: ColmapCamera("OPENCV", SIZE, (9.0, 9.5, 4.2, 3.1, 0.03, -0.01, 1e-3, -1e-3)),
+    2: ColmapCamera("SIMPLE_RADIAL_FISHEYE", SIZE, (9.0, 4.0, 3.0, 0.1)),
+}
+POSES = [ColmapImage(f"{i}.png", i, (1, 0.1 * i, 0, 0), (0, 0, 3)) for i in range(VIEWS)]
+WRITERS = {b"b": colmap_binary, b"t": colmap_text}
 
 
-def _binary() -> dict[str, bytes]:
-    cameras = b"".join(
-        struct.pack("<iiQQ", i, MODELS[name][0], *SIZE) + struct.pack(f"<{len(values)}d", *values)
-        for i, (name, values) in enumerate(CAMERAS)
-    )
-    images, points = b"", b""
-    for i in range(VIEWS):
-        images += struct.pack("<i8d", i, 1, 0.1 * i, 0, 0, 0, 0, 3, 0)[:-8] + struct.pack("<i", i)
-        images += f"{i}.png".encode() + b"\0" + struct.pack("<Qddq", 1, 1.5, 2.5, 0)
-        points += struct.pack("<Q3d3BdQ2i", i, 0.1 * i, 0, 0, 1, 2, 3, 0.5, 1, 0, 0)
-    count = struct.pack("<Q", VIEWS)
-    return {"cameras": count + cameras, "images": count + images, "points3D": count + points}
-
-
-def _text() -> dict[str, bytes]:
-    cameras = "\n".join(
-        f"{i} {name} {SIZE[0]} {SIZE[1]} {' '.join(map(str, values))}"
-        for i, (name, values) in enumerate(CAMERAS)
-    )
-    images = "\n".join(f"{i} 1 {0.1 * i} 0 0 0 0 3 {i} {i}.png\n1.5 2.5 0" for i in range(VIEWS))
-    points = "# points\n" + "\n".join(f"{i} {0.1 * i} 0 0 1 2 3 0.5 0 0 1 1" for i in range(VIEWS))
-    return {"cameras": cameras.encode(), "images": images.encode(), "points3D": points.encode()}
+def _model(kind: bytes) -> dict[str, bytes]:
+    """Files of a model by name, text for b"t"."""
+    points = 0.1 * np.arange(VIEWS)[:, None] * np.eye(3)[0]
+    return WRITERS[kind]((CAMERAS, POSES, points, np.tile([1, 2, 3], (VIEWS, 1))))
 
 
 def colmap_files(folder: Path) -> list[bytes]:
@@ -83,22 +66,19 @@ def colmap_files(folder: Path) -> list[bytes]:
     (folder / "images").mkdir(exist_ok=True)
     for i in range(VIEWS):
         write_png(folder / f"images/{i}.png", np.random.default_rng(i).random((SIZE[1], SIZE[0], 3)))
-    return [
-        short.encode() + ending + files[name]
-        for ending, files in ((b"b", _binary()), (b"t", _text()))
-        for short, name in NAMES.items()
-    ]
+    files = [(kind, name, data) for kind in WRITERS for name, data in _model(kind).items()]
+    return [name[:3].encode() + kind + data for kind, name, data in files]
 
 
 def read_colmap(folder: Path, data: bytes) -> None:
     """A model of whole files with the mutated one among them."""
-    kind, ending = NAMES.get(data[:3].decode("latin-1"), "images"), "txt" if data[3:4] == b"t" else "bin"
+    kind, text = NAMES.get(data[:3].decode("latin-1"), "images"), data[3:4] == b"t"
     model = folder / "sparse"
     model.mkdir(exist_ok=True)
     for old in model.iterdir():
         old.unlink()
-    for name, whole in (_text() if ending == "txt" else _binary()).items():
-        (model / f"{name}.{ending}").write_bytes(data[4:] if name == kind else whole)
+    for name, whole in _model(b"t" if text else b"b").items():
+        (model / f"{name}.{'txt' if text else 'bin'}").write_bytes(data[4:] if name == kind else whole)
     found = read_dataset(folder, "train")
     values = [
         x for view in found.views for x in (view.load().image, view.to_world, np.array([view.fx, view.cy]))
@@ -316,10 +296,6 @@ def _light_files(folder: Path) -> list[bytes]:
     return files + _image_files(folder)[:2]
 
 
-def _read_light(path: Path) -> list[Any]:
-    return [EnvironmentLight.from_file(path).radiance().numpy()]
-
-
 # ---------------- data sets and runs ----------------
 
 
@@ -497,7 +473,13 @@ READERS = {
         _file("method", "toml", _methods, _read_method, "x.toml", inside=False),
         _file("exr", "", _exr_files, lambda path: [read_exr_image(path)], "x.exr"),
         _file("image", "", _image_files, _read_image, "x.png"),
-        _file("light", "", _light_files, _read_light, "x.hdr"),
+        _file(
+            "light",
+            "",
+            _light_files,
+            lambda path: [EnvironmentLight.from_file(path).radiance().numpy()],
+            "x.hdr",
+        ),
         _file("checkpoint", "", _checkpoints, _read_checkpoint, "x.npz", finish=_sign),
         _file("model", "json", _models, _read_model, "model.json"),
         _file("run-data", "json", _data_places, _read_data_place, "dataset.json", inside=False),

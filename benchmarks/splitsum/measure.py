@@ -109,7 +109,6 @@ class Run:
     times: Times = field(default_factory=dict)
     prefilter_ms: list[dict[str, Any]] = field(default_factory=list)
     scores: list[dict[str, Any]] = field(default_factory=list)
-    flip_reason: str = ""
 
     def time(self, setup: Exact, calls: Calls) -> None:
         """Book the times of calls."""
@@ -125,14 +124,12 @@ class Run:
         """Book the errors of an image (P, 3), for the split sum also by view angle."""
         reference = setup.integrals(roughness).radiance(metallic)
         points = setup.points
-        flip, self.flip_reason = errors.flip(points.image(values), points.image(reference.mean))
         case = setup.case(roughness, metallic) | {"method": method, "setting": setting}
         masks: dict[str, Any] = {"all": None}
         if method.startswith("split_sum"):
             masks |= view_bins(points.n_dot_v())
         for name, mask in masks.items():
-            found = errors.compare(values, reference, mask)
-            self.rows.append(case | {"n_dot_v": name} | found | {"flip": flip if mask is None else None})
+            self.rows.append(case | {"n_dot_v": name} | errors.compare(values, reference, mask))
 
 
 def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
@@ -171,7 +168,6 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
         "speed_ups": speed_ups(run.rows, run.times),
         "budgets": budgets,
         "surfel_budgets": surfel_budgets,
-        "flip_reason": run.flip_reason,
     }
 
 

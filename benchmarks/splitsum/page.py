@@ -103,13 +103,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
             "light", [(f"`{row['light']}`", row) for row in result["surfel_budgets"]]
         ),
         "height": height,
-        "truth_height": s["truth_height"],
-        "batches": s["batches"],
-        "lattice": s["lattice"],
-        "size": s["size"],
-        "timing_size": s["timing_size"],
         "sun": f"{SUN_ELEVATION:g}",
-        "flip": f" (FLIP: {result['flip_reason']})" if result["flip_reason"] else "",
         "median_speed": number(float(np.median(ratios)), 2),
         "low_speed": number(float(np.quantile(ratios, 0.1)), 2),
         "score_spread": f"{scores.std():.2f}",

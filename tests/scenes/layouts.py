@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.data.colmap_model import MODELS
+from benchmarks.common.colmap_files import ColmapCamera, ColmapImage, Model, colmap_binary, colmap_text
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from tests.scenes.dots import COLOURS, POINTS, Shot
 
@@ -24,9 +23,14 @@ SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
 MODEL, VALUES = "PINHOLE", (110.0, 104.0, 50.3, 34.6)
 
 
-def quaternion(rotation: np.ndarray) -> list[float]:
-    """w, x, y, z of a rotation matrix."""
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1).tolist()
+def model_of(shots: list[Shot], camera: str, values: tuple[float, ...]) -> Model:
+    """The dots and these cameras as a COLMAP model."""
+    cameras = {7: ColmapCamera(camera, (shots[0].width, shots[0].height), values)}
+    poses = []
+    for shot in shots:
+        x, y, z, w = Rotation.from_matrix(shot.rotation).as_quat()
+        poses.append(ColmapImage(shot.name, 7, (w, x, y, z), shot.translation.tolist()))
+    return cameras, poses, POINTS, COLOURS
 
 
 def write_text(
@@ -34,19 +38,8 @@ def write_text(
 ) -> None:
     """Cameras, images and points as COLMAP writes them as text."""
     model.mkdir(parents=True, exist_ok=True)
-    size = f"{shots[0].width} {shots[0].height}"
-    (model / "cameras.txt").write_text(f"# comment\n7 {camera} {size} {' '.join(map(repr, values))}\n")
-    lines = ["# Image list with two lines of data per image:"]
-    for i, shot in enumerate(shots):
-        pose = " ".join(map(repr, [*quaternion(shot.rotation), *shot.translation.tolist()]))
-        seen = "1.5 2.5 3 10.0 20.0 -1" if i % 2 else ""
-        lines += [f"{i + 1} {pose} 7 {shot.name}", seen]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    lines = [
-        f"{i} {' '.join(map(repr, p.tolist()))} {' '.join(map(str, c))} 0.5 1 0 2 0 3 {i}"
-        for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
-    ]
-    (model / "points3D.txt").write_text("# points\n\n" + "\n".join(lines) + "\n")
+    for name, content in colmap_text(model_of(shots, camera, values)).items():
+        (model / f"{name}.txt").write_bytes(content)
 
 
 def write_binary(
@@ -54,21 +47,8 @@ def write_binary(
 ) -> None:
     """The same in COLMAP's binary records."""
     model.mkdir(parents=True, exist_ok=True)
-    size = (shots[0].width, shots[0].height)
-    record = struct.pack("<iiQQ", 7, MODELS[camera][0] if camera in MODELS else 7, *size)
-    (model / "cameras.bin").write_bytes(
-        struct.pack("<Q", 1) + record + struct.pack(f"<{len(values)}d", *values)
-    )
-    data = struct.pack("<Q", len(shots))
-    for i, shot in enumerate(shots):
-        data += struct.pack("<i7di", i + 1, *quaternion(shot.rotation), *shot.translation, 7)
-        data += shot.name.encode() + b"\0"
-        data += struct.pack("<Qddqddq", 2, 1.5, 2.5, 3, 10, 20, -1) if i % 2 else struct.pack("<Q", 0)
-    (model / "images.bin").write_bytes(data)
-    data = struct.pack("<Q", len(POINTS))
-    for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
-        data += struct.pack("<Q3d3BdQ6i", i, *point, *colour.tolist(), 0.5, 3, 1, 0, 2, 0, 3, i)
-    (model / "points3D.bin").write_bytes(data)
+    for name, content in colmap_binary(model_of(shots, camera, values)).items():
+        (model / f"{name}.bin").write_bytes(content)
 
 
 WRITERS = {"txt": write_text, "bin": write_binary}
