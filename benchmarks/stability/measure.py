@@ -85,6 +85,14 @@ class Row:
             return "FAILS: " + ", ".join(failed)
         return "ill-conditioned: " + ", ".join(ill) if ill else "within limits"
 
+    def record(self) -> dict[str, Any]:
+        """For CSV and JSON: one level."""
+        gradient = max(self.gradient_floor.values(), default=0.0)
+        flat = {"case": self.name, "image": self.image, "maps": self.maps, "ulp_image": self.image_floor}
+        flat |= {"ulp_gradient": gradient, "non_finite": self.non_finite, "kept": self.kept}
+        flat |= {"order": self.order, "negligible": " ".join(self.negligible), "verdict": self.verdict}
+        return flat | {f"gradient_{name}": self.gradients.get(name) for name in GRADIENTS}
+
 
 # ---------------- the product ----------------
 

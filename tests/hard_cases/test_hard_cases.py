@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.stability import __main__ as run
 from benchmarks.stability import measure as module
-from benchmarks.stability import response, run
-from benchmarks.stability.__main__ import main
+from benchmarks.stability import response
 from benchmarks.stability.cases import Case, catalogue, plain
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row, measure
 from mi_refgs.reference import image as oracle
@@ -109,7 +109,7 @@ def test_wrong_footprint_gradients_fail(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_page(tmp_path: Path) -> None:
-    assert main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
+    assert run.main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
     page = (tmp_path / "stability.md").read_text()
     assert "| one surfel |" in page
     assert (
