@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -64,22 +65,15 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
 
 
 TIMES = (
-    "forward",
-    "f. + backward",
-    "colour, f. + b.",
-    "volprim, f.",
-    "volprim, f. + b.",
-    "volprim / ours",
+    "forward", "f. + backward", "colour, f. + b.", "volprim, f.", "volprim, f. + b.", "volprim / ours",
     "× bound",
-)
+)  # fmt: skip
 
 
 def _times(row: Row) -> list[float | None]:
-    volprim = row["volprim_both_ms"]
-    ours = [
-        row[f"{name}_ms"] for name in ("forward", "both", "colour_both", "volprim_forward", "volprim_both")
-    ]
-    return [*ours, volprim / row["both_ms"] if volprim else None, row["both_ms"] / row["bound_both_ms"]]
+    volprim, both = row["volprim_both_ms"], row["both_ms"]
+    shown = (row["forward_ms"], both, row["colour_both_ms"], row["volprim_forward_ms"], volprim)
+    return [*shown, volprim / both if volprim else None, both / row["bound_both_ms"]]
 
 
 def _phases(row: Row) -> list[float]:
@@ -153,11 +147,11 @@ MOST_BARS = 12
 
 def plot(result: dict[str, Any], folder: Path) -> None:
     """Write splatting_time.png and splatting_phases.png."""
-    _plot_times(result, folder)
-    _plot_phases(result, folder)
+    figures.save(_plot_times(result), folder / "splatting_time.png")
+    figures.save(_plot_phases(result), folder / "splatting_phases.png")
 
 
-def _plot_times(result: dict[str, Any], folder: Path) -> None:
+def _plot_times(result: dict[str, Any]) -> Any:
     from matplotlib import ticker
 
     figure, axes = figures.new(1, 2, 4.6, 4.2)
@@ -170,9 +164,8 @@ def _plot_times(result: dict[str, Any], folder: Path) -> None:
             if points:
                 ax.plot(*zip(*points, strict=True), style, color=colour, ms=4, label=text)
 
-        for i, count in enumerate(counts):
+        for count, style, colour in zip(counts, cycle(MARKERS), cycle(SHADES), strict=False):
             found = [row for row in rows if row["surfels"] == count and row["spread"] is not None]
-            style, colour = MARKERS[i % len(MARKERS)], SHADES[i % len(SHADES)]
             marks(found, f"{kind}_ms", style, colour, f"ours, {count:,} surfels")
         marks(rows, f"volprim_{kind}_ms", "x", "#c0392b", "volprim_rf_basic")
         pairs = [float(row["contributing"]) for row in rows]
@@ -184,20 +177,20 @@ def _plot_times(result: dict[str, Any], folder: Path) -> None:
         ax.xaxis.set_minor_formatter(ticker.NullFormatter())
     axes[0, 0].set_ylabel("milliseconds")
     axes[0, 1].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
-    figures.save(figure, folder / "splatting_time.png")
+    return figure
 
 
-def _plot_phases(result: dict[str, Any], folder: Path) -> None:
+def _plot_phases(result: dict[str, Any]) -> Any:
     rows = [row for row in result["rows"] if row["size"] in (256, 512)] or result["rows"]
     rows = rows[-MOST_BARS:]
     figure, axes = figures.new(1, 1, 9.2, 0.6 + 0.3 * len(rows))
     ax, left = axes[0, 0], np.zeros(len(rows))
     for phase in PHASES:
-        widths = np.array([row[f"{phase.replace(' ', '_')}_ms"] for row in rows])
+        widths = np.array([_phases(row)[PHASES.index(phase)] for row in rows])
         ax.barh(range(len(rows)), widths, left=left, color=BARS[phase], label=phase)
         left += widths
     ax.set_yticks(range(len(rows)), [label(row) for row in rows], fontsize=7)
     ax.invert_yaxis()
     ax.set_xlabel("milliseconds between barriers, forward and backward")
     ax.legend(fontsize=7, facecolor="#dddddd", edgecolor="none", loc="center left", bbox_to_anchor=(1, 0.5))
-    figures.save(figure, folder / "splatting_phases.png")
+    return figure

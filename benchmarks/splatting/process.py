@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-import time
 from typing import Any
 
 import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
@@ -16,7 +15,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-from benchmarks.common.timing import forget_peak, in_fresh_process, peak_bytes
+from benchmarks.common.timing import forget_peak, in_fresh_process, once, peak_bytes
 
 SPREAD = 1.5
 STEPS = 3
@@ -68,13 +67,8 @@ def _step(count: int, size: int) -> dict[str, Any]:
     trainer, method = make_trainer(count, sphere_data(size, 2, rng))
     trainer.extract_mesh()
     before = _start()
-    times = []
     trainer.fit.iteration = method.stages()[-1][1].until - STEPS - 1
-    for _ in range(STEPS + 1):
-        begin = time.perf_counter()
-        trainer.step()
-        dr.sync_thread()
-        times.append(1e3 * (time.perf_counter() - begin))
+    times = [1e3 * once(trainer.step) for _ in range(STEPS + 1)]
     whole = peak_bytes()
     found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}
     return found | _peaks(before) | {"whole_process": whole}
@@ -85,15 +79,8 @@ def _compile(count: int, size: int) -> dict[str, Any]:
     from benchmarks.splatting.renderers import Ours
 
     ours = Ours.of(sphere(count, size, SPREAD), FEATURES)
-    found: dict[str, Any] = {}
-    for turn in ("first", "second"):
-        found[turn] = {}
-        for kind in ("forward", "both"):
-            begin = time.perf_counter()
-            dr.eval(getattr(ours, kind)())
-            dr.sync_thread()
-            found[turn][kind] = 1e3 * (time.perf_counter() - begin)
-    return found
+    calls = {"forward": ours.forward, "both": ours.both}
+    return {turn: {kind: 1e3 * once(call) for kind, call in calls.items()} for turn in ("first", "second")}
 
 
 def _start() -> int:

@@ -114,19 +114,15 @@ class Volprim:
         scale = np.exp(raw["scale"])
         thickness = FLATNESS * scale.min(axis=1, keepdims=True)
         rotation = raw["rotation"] / np.linalg.norm(raw["rotation"], axis=1, keepdims=True)
-        self.scene = mi.load_dict(
-            {
-                "type": "scene",
-                "primitives": {
-                    "type": "ellipsoids",
-                    "centers": _tensor(raw["position"]),
-                    "scales": _tensor(np.concatenate([scale, thickness], axis=1)),
-                    "quaternions": _tensor(rotation),
-                    "opacities": _tensor(1 / (1 + np.exp(-raw["opacity"]))),
-                    "sh_coeffs": _tensor((workload.features[:, :COLOUR] - 0.5) / SH_0),
-                },
-            }
-        )
+        ellipsoids = {
+            "type": "ellipsoids",
+            "centers": _tensor(raw["position"]),
+            "scales": _tensor(np.concatenate([scale, thickness], axis=1)),
+            "quaternions": _tensor(rotation),
+            "opacities": _tensor(1 / (1 + np.exp(-raw["opacity"]))),
+            "sh_coeffs": _tensor((workload.features[:, :COLOUR] - 0.5) / SH_0),
+        }
+        self.scene = mi.load_dict({"type": "scene", "primitives": ellipsoids})
         self.sensor = mi.load_dict(_sensor(workload.pinhole))
         self.integrator = mi.load_dict({"type": "volprim_rf_basic", "srgb_primitives": False})
         self.params = mi.traverse(self.scene)
@@ -155,18 +151,12 @@ def _tensor(values: np.ndarray) -> Any:
 
 def _sensor(p: PinholeCamera) -> dict[str, Any]:
     """Mitsuba's camera of the float64 reference's; square pixels, the principal point in the middle."""
+    film = {"type": "hdrfilm", "width": p.width, "height": p.height, "pixel_format": "rgb"}
     return {
         "type": "perspective",
         "fov": float(np.degrees(2 * np.arctan(0.5 * p.width / abs(p.fx)))),
         "fov_axis": "x",
         "to_world": mi.ScalarTransform4f(p.to_world.tolist()),
-        "film": {
-            "type": "hdrfilm",
-            "width": p.width,
-            "height": p.height,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
+        "film": film | {"component_format": "float32", "rfilter": {"type": "box"}},
         "sampler": {"type": "independent", "sample_count": 1},
     }
