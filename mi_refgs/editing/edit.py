@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
@@ -66,29 +66,20 @@ def edit(
         changed, more = join(into, changed)
         notes += more
     counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}
-    return Edited(changed, tuple(notes), {**_recorded(options, change), **counts, "notes": notes})
+    return Edited(changed, tuple(notes), {**_recorded(selection, change), **counts, "notes": notes})
 
 
-def _recorded(options: EditOptions, change: Change) -> dict[str, Any]:
-    """Return the options that differ from their defaults, as JSON values."""
-    found: dict[str, Any] = {}
-    for name, value in options.items():
-        if name == "set" and change.set:
-            found[name] = [*change.set]
-        elif name == "mask" and isinstance(value, str | Path):
-            found[name] = str(value)
-        elif name not in ("set", "mask") and not (
-            value is None or value is False or (name == "scale" and value == 1)
-        ):
-            found[name] = _plain(value)
+def _recorded(*parts: Selection | Change) -> dict[str, Any]:
+    """Return the options that differ from their defaults, as JSON values; a mask only if it is a file."""
+    found = {}
+    for part in parts:
+        for field in fields(part):
+            value = getattr(part, field.name)
+            if not (field.name == "mask" and isinstance(value, np.ndarray)):
+                plain = json.loads(json.dumps(value, default=lambda x: getattr(x, "tolist", x.__str__)()))
+                if plain and plain != field.default:
+                    found[field.name] = plain
     return found
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON has it."""
-    if isinstance(value, str | bool):
-        return value
-    return [_plain(part) for part in value] if isinstance(value, Iterable) else float(value)
 
 
 def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[str]:

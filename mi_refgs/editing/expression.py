@@ -11,7 +11,7 @@ import ast
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache, partial, reduce
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -203,42 +203,30 @@ class SurfelValues(Mapping[str, np.ndarray]):
     """
 
     def __init__(self, scene: TrainedScene) -> None:
-        self.raw = scene.surfels.to_numpy()
+        self.scene, self.raw = scene, scene.surfels.to_numpy()
         self.columns: dict[str, tuple[str, list[int]]] = {}  # attribute, or COLOUR, and its columns by name
         for name, table in self.raw.items():
             declared, width = ATTRIBUTES[name], table.shape[1]
             if not declared.harmonics and declared.activation not in ("quaternion", "exp"):
-                letters = declared.aov.lower() if len(declared.aov) == width else AXES
-                self._add(name, name, width, letters)
+                self._add(name, width, declared.aov.lower() if len(declared.aov) == width else AXES)
         self.columns |= {axis: ("position", [i]) for i, axis in enumerate(AXES)}
-        has_colour = "radiance_sh" in self.raw
-        if has_colour:
-            self._add(COLOUR, COLOUR, 3, "rgb")
-
-        @cache
-        def normals() -> np.ndarray:
-            return outward(scene.surfels, scene.mesh)[0].astype(np.float64)
-
-        self._compute: dict[str, Callable[[], np.ndarray]] = {
-            name: partial(lambda of, column: self.activated(of)[:, column], of, columns[0])
-            for name, (of, columns) in self.columns.items()
-            if len(columns) == 1
-        }
-        self._compute["size"] = lambda: scene.surfels.primitive.extent(self.raw)[1].max(axis=1).astype(float)
-        for i, axis in enumerate(AXES):
-            self._compute[f"normal.{axis}"] = partial(lambda i: normals()[:, i], i)
+        if "radiance_sh" in self.raw:
+            self._add(COLOUR, 3, "rgb")
         bright = [name for name in ("albedo", COLOUR) if name in self.columns]
-        for name in bright:
-            self._compute[f"{name}.luminance"] = partial(lambda name: self.activated(name) @ LUMINANCE, name)
-        if bright:
-            fitted = "radiance_sh" in scene.shading.required_attributes
-            shaded = COLOUR if fitted and has_colour else "albedo"
-            self._compute["luminance"] = lambda: self[f"{shaded}.luminance"]
+        self.names = [
+            *(name for name, (_, columns) in self.columns.items() if len(columns) == 1),
+            *("size", *(f"normal.{axis}" for axis in AXES)),
+            *(*(f"{name}.luminance" for name in bright), *(["luminance"] if bright else [])),
+        ]
 
-    def _add(self, name: str, of: str, width: int, letters: str) -> None:
-        self.columns[name] = of, list(range(width))
+    def _add(self, of: str, width: int, letters: str) -> None:
+        self.columns[of] = of, list(range(width))
         if width > 1:
-            self.columns |= {f"{name}.{letter}": (of, [i]) for i, letter in enumerate(letters)}
+            self.columns |= {f"{of}.{letter}": (of, [i]) for i, letter in enumerate(letters)}
+
+    @cached_property
+    def _normals(self) -> np.ndarray:
+        return outward(self.scene.surfels, self.scene.mesh)[0].astype(np.float64)
 
     @property
     def settable(self) -> list[str]:
@@ -262,10 +250,23 @@ class SurfelValues(Mapping[str, np.ndarray]):
             )
 
     def __getitem__(self, name: str) -> np.ndarray:
-        return self._compute[name]()
+        if name not in self.names:
+            raise KeyError(name)
+        of, _, part = name.partition(".")
+        if name in self.columns:
+            of, columns = self.columns[name]
+            return self.activated(of)[:, columns[0]]
+        if name == "size":
+            return self.scene.surfels.primitive.extent(self.raw)[1].max(axis=1).astype(float)
+        if of == "normal":
+            return self._normals[:, AXES.index(part)]
+        if name == "luminance":
+            fitted = "radiance_sh" in self.scene.shading.required_attributes and COLOUR in self.columns
+            of = COLOUR if fitted else "albedo"
+        return self.activated(of) @ LUMINANCE
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._compute)
+        return iter(self.names)
 
     def __len__(self) -> int:
-        return len(self._compute)
+        return len(self.names)

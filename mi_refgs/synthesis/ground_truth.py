@@ -113,20 +113,16 @@ class _Parameters:
         """A parameter as mi.Float; `default` without one."""
         import mitsuba as mi
 
-        if name not in self.children:
-            return mi.Float(default)
-        texture = self.children[name]
-        if isinstance(texture, mi.Texture):
+        if isinstance(texture := self.children.get(name), mi.Texture):
             return mi.Float(texture.eval_1(self.si, self.active))
-        return mi.Float(self.values[name])
+        return mi.Float(self.values[name] if name in self.children else default)
 
     def colour(self, name: str, default: float = 1.0) -> Color3f:
         """A parameter as mi.Color3f; `default` without one."""
         import mitsuba as mi
 
-        if name not in self.children:
-            return mi.Color3f(default)
-        return mi.Color3f(self.children[name].eval(self.si, self.active))
+        texture = self.children.get(name)
+        return mi.Color3f(default if texture is None else texture.eval(self.si, self.active))
 
     def nested(self, name: str, si: Any = None) -> Materials:
         """The materials of a nested BSDF."""
@@ -225,35 +221,29 @@ def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(
             f"shape '{shape.id()}': a {name} cannot be tessellated; use a mesh, sphere, disk or cylinder"
         )
-    points, triangles = UNIT_SHAPES[name]()
+    unit = UNIT_SHAPES[name]()
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-    return points @ matrix[:3, :3].T + matrix[:3, 3], triangles
+    return np.asarray(unit.vertices) @ matrix[:3, :3].T + matrix[:3, 3], np.asarray(unit.faces)
 
 
-def _sphere() -> tuple[np.ndarray, np.ndarray]:
-    ball = trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS)
-    return np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int64)
+def _sphere() -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS)
 
 
-def _circle() -> np.ndarray:
-    angle = 2 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros(ROUND_SIDES)], axis=1)
-
-
-def _disk() -> tuple[np.ndarray, np.ndarray]:
+def _disk() -> trimesh.Trimesh:
     """The unit disk around the origin, across z."""
-    rim = np.arange(ROUND_SIDES)
-    fan = np.stack([np.full(ROUND_SIDES, ROUND_SIDES), rim, (rim + 1) % ROUND_SIDES], axis=1)
-    return np.concatenate([_circle(), np.zeros((1, 3))]), fan
+    disk = _cylinder(wall=False)
+    disk.vertices *= (1, 1, 0)
+    return disk
 
 
-def _cylinder() -> tuple[np.ndarray, np.ndarray]:
-    """The open cylinder of radius 1 from z = 0 to z = 1."""
-    low, after = np.arange(ROUND_SIDES), (np.arange(ROUND_SIDES) + 1) % ROUND_SIDES
-    first = np.stack([low, after, after + ROUND_SIDES], axis=1)
-    second = np.stack([low, after + ROUND_SIDES, low + ROUND_SIDES], axis=1)
-    upper = _circle() + np.array([0, 0, 1])
-    return np.concatenate([_circle(), upper]), np.concatenate([first, second])
+def _cylinder(wall: bool = True) -> trimesh.Trimesh:
+    """The open cylinder of radius 1 from z = 0 to z = 1; without the wall, its upper cap."""
+    closed = trimesh.creation.cylinder(radius=1, segment=[(0, 0, 0), (0, 0, 1)], sections=ROUND_SIDES)
+    up = closed.face_normals[:, 2]
+    closed.update_faces(np.abs(up) < 0.5 if wall else up > 0.5)
+    closed.remove_unreferenced_vertices()
+    return closed
 
 
 UNIT_SHAPES = {"Sphere": _sphere, "Disk": _disk, "Cylinder": _cylinder}

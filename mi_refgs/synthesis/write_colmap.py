@@ -8,7 +8,7 @@ them, as structure from motion finds them: mirrors have few.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ def colmap_output(folder: Path, data: Path, cameras: Cameras) -> OutputFolder:
     """Claim the COLMAP files of the data set in `data`; raises InputError if a foreign file is in the way."""
     output = OutputFolder(folder, f"colmap of {data.resolve()}")
     sparse = (f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D", "test"))
-    output.claim(*sparse, REGION_FILE, *(f"images/{file}" for file in _files(_order(cameras)[0])))
+    output.claim(*sparse, REGION_FILE, *(f"images/{i:04d}.png" for i in range(len(_order(cameras)[0]))))
     return output
 
 
@@ -43,9 +43,12 @@ def write_colmap(output: OutputFolder, data: Path, tracer: Tracer) -> None:
     folder = output.path
     names, poses, tests = _order(tracer.cameras)
     sparse, images = folder / "sparse" / "0", folder / "images"
-    files = _files(names)
-    for name, file in zip(names, files, strict=True):
-        _copy(data / f"{name}.png", images / file)
+    files = [f"{i:04d}.png" for i in range(len(names))]
+    copies = {data / f"{name}.png": images / file for name, file in zip(names, files, strict=True)}
+    if (data / REGION_FILE).is_file():
+        copies[data / REGION_FILE] = folder / REGION_FILE
+    for source, target in copies.items():
+        replace_file(target, partial(shutil.copyfile, source))
     options = tracer.cameras.options
     (width, height), focal = options.resolution, options.focal
     shown = np.stack([read_png(images / file)[..., :3] for file in files])
@@ -64,28 +67,22 @@ def write_colmap(output: OutputFolder, data: Path, tracer: Tracer) -> None:
     write_points(sparse, rows)
     write_images(sparse, files, poses, [1] * len(files), [" ".join(places) for places in seen])
     write_test_list(sparse, [files[i] for i in tests])
-    if (data / REGION_FILE).is_file():
-        _copy(data / REGION_FILE, folder / REGION_FILE)
-
-
-def _files(names: Sequence[str]) -> list[str]:
-    return [f"{i:04d}.png" for i in range(len(names))]
 
 
 def _order(cameras: Cameras) -> tuple[list[str], np.ndarray, list[int]]:
     """Names without ending and poses (N, 4, 4) of all views, and the indices of the test views among them."""
-    views = {s: [(f"{s}/r_{i:03d}", p) for i, (p, _) in enumerate(cameras.of(s))] for s in ("train", "test")}
-    total = sum(map(len, views.values()))
-    left, ordered, tests = {s: iter(v) for s, v in views.items()}, [], []
-    for i in range(total):
-        first = ("test", "train") if i % HOLDOUT == 0 else ("train", "test")
-        for split in first:
-            view = next(left[split], None)
-            if view is not None:
-                tests += [i] if split == "test" else []
-                ordered.append(view)
-                break
-    return [name for name, _ in ordered], np.stack([pose for _, pose in ordered]), tests
+    left = {s: [(f"{s}/r_{i:03d}", p) for i, (p, _) in enumerate(cameras.of(s))] for s in ("train", "test")}
+    names: list[str] = []
+    poses: list[np.ndarray] = []
+    tests: list[int] = []
+    while any(left.values()):
+        split = "train" if len(names) % HOLDOUT else "test"
+        split = split if left[split] else {"train": "test", "test": "train"}[split]
+        tests += [len(names)] if split == "test" else []
+        name, pose = left[split].pop(0)
+        names.append(name)
+        poses.append(pose)
+    return names, np.stack(poses), tests
 
 
 def _points(
@@ -121,7 +118,3 @@ def _points(
     kept = [i for i, c in enumerate(colours) if len(c) > 1 and np.std(c, axis=0).max() < SAME_COLOUR]
     mean = np.array([np.mean(colours[i], axis=0) for i in kept]).reshape(-1, 3)
     return points[kept], mean, [np.array(views[i]) for i in kept], [np.array(places[i]) for i in kept]
-
-
-def _copy(source: Path, target: Path) -> None:
-    replace_file(target, lambda temporary: shutil.copyfile(source, temporary))

@@ -175,18 +175,6 @@ def test_relight_accepts_every_kind_of_light(known: Path, balls: Reconstruction,
     assert relit.folder is None
 
 
-def test_edit_changes_selected_surfels(balls: Reconstruction) -> None:
-    before = balls.aovs(0, ["roughness", "metallic"])
-    changed = balls.edit(where="metallic > 0.5", set={"roughness": 0.8})
-    after = changed.aovs(0, ["roughness", "metallic"])
-    np.testing.assert_allclose(after["roughness"][before["metallic"] > 0.99], 0.8, atol=1e-3)
-    clay = (before["metallic"] < 0.01) & (before["roughness"] > 0)
-    np.testing.assert_array_equal(after["roughness"][clay], before["roughness"][clay])
-    assert changed.folder is None and balls.trained.surfels.count == changed.trained.surfels.count
-    two = changed.edit(move=(0, 3, 0), join=balls)
-    assert two.trained.surfels.count == 2 * balls.trained.surfels.count
-
-
 def test_export_writes_a_format(balls: Reconstruction, tmp_path: Path) -> None:
     assert tmp_path / "cameras/transforms.json" in balls.export("cameras", tmp_path / "cameras")
 
