@@ -247,8 +247,8 @@ def test_arrays_and_lists_give_the_same_edit(scene: TrainedScene) -> None:
     given |= {"move": [0.5, 0, 0], "duplicate": [0, 0, 1], "rotate": ([0.0, 0.0, 1.0], 90)}
     lists = edit(scene, **given)
     axis, degrees = given.pop("rotate")
-    given = {name: np.array(value) for name, value in given.items()}
-    arrays = edit(scene, rotate=(np.array(axis), degrees), **given)
+    given = {name: np.array(value) for name, value in given.items()} | {"rotate": (np.array(axis), degrees)}
+    arrays = edit(scene, **given)
     assert lists.record == json.loads(json.dumps(arrays.record))
     for name, table in lists.scene.surfels.to_numpy().items():
         np.testing.assert_array_equal(arrays.scene.surfels.to_numpy()[name], table)
