@@ -10,7 +10,8 @@ import numpy as np
 from benchmarks.stability.cases import Array, Case
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.reference import image as oracle
-from mi_refgs.reference import occlusion as trace
+from mi_refgs.reference.light import Light, dense_filter, filtered
+from mi_refgs.reference.occlusion import mirror_visibility
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.splat import Camera, list_by_tile, project
@@ -26,32 +27,23 @@ def fast_camera(case: Case) -> Camera:
 
 
 @functools.lru_cache(maxsize=8)
-def _operator(height: int) -> list[Array]:
-    """Dense prefilter matrices (h_out · 2h_out, h · 2h) of the product's levels, float64."""
-    matrices = []
-    φ = lobe_matrices.column_angles(2 * height)
-    for level in lobe_matrices.build_levels(height):
-        m = np.arange(level.weights.shape[2])
-        across = np.cos(m[:, None, None] * (lobe_matrices.column_angles(2 * level.height)[:, None] - φ))
-        dense = np.einsum("ikm,mab->iakb", level.weights, across, optimize=True)
-        matrices.append(dense.reshape(2 * level.height**2, 2 * height**2))
-    return matrices
+def filters(height: int, levels: lobe_matrices.Levels = lobe_matrices.LEVELS) -> list[Array]:
+    """Dense matrices (2 h_out², 2 height²) of the product's prefilter, float64."""
+    return [dense_filter(level.weights) for level in lobe_matrices.build_levels(height, levels)]
 
 
-def light_of(raw: Array) -> oracle.Light:
+def light_of(raw: Array) -> Light:
     """The float64 reference's light."""
     radiance = np.logaddexp(0, np.asarray(raw, np.float64))  # softplus
-    flat = radiance.reshape(-1, 3)
-    levels = [(m @ flat) for m in _operator(len(raw))]
-    shaped = [x.reshape(h := int(np.sqrt(len(x) / 2)), 2 * h, 3) for x in levels]
-    return oracle.Light([radiance, *shaped], lobe_matrices.LEVEL_ROUGHNESS, brdf.table().astype(np.float64))
+    levels = filtered(radiance, filters(len(raw)))
+    return Light(levels, lobe_matrices.LEVEL_ROUGHNESS, brdf.table().astype(np.float64))
 
 
-def light_gradient(raw: Array, light: oracle.Light, δflat: Array) -> Array:
+def light_gradient(raw: Array, light: Light, δflat: Array) -> Array:
     """δraw of δ of the flat levels."""
     first, *rest = light.split(δflat)
     δradiance = first.reshape(-1, 3)
-    for matrix, δ in zip(_operator(len(raw)), rest, strict=True):
+    for matrix, δ in zip(filters(len(raw)), rest, strict=True):
         δradiance = δradiance + matrix.T @ δ.reshape(-1, 3)
     return δradiance.reshape(raw.shape) / (1 + np.exp(-np.asarray(raw, np.float64)))
 
@@ -76,7 +68,7 @@ def product_order(case: Case, pixels: Array) -> Array:
     return order
 
 
-def scene_of(case: Case, pixels: Array, order: Array, light: oracle.Light | None = None) -> oracle.Scene:
+def scene_of(case: Case, pixels: Array, order: Array, light: Light | None = None) -> oracle.Scene:
     """The float64 reference's scene of a case."""
     visibility = None
     if case.surface is not None:
@@ -88,13 +80,7 @@ def scene_of(case: Case, pixels: Array, order: Array, light: oracle.Light | None
 
 
 def visibility_of(case: Case, normal: Array, ray: Array, further: float = 0.0) -> Array:
+    """Visibility (P,) of the mirror direction, with `further` added to the offset of its rays."""
     vertices, faces, offset = case.surface
-    offset += further
-    if not len(faces):
-        return np.ones(len(normal))
-    origin = np.broadcast_to(case.camera.to_world[:3, 3], ray.shape)
-    t = trace.mesh_distance(vertices, faces, origin, ray)
-    hit = np.isfinite(t)
-    point = origin + np.where(hit, t, 0)[:, None] * ray + offset * normal
-    mirror = ray - 2 * np.sum(normal * ray, 1, keepdims=True) * normal
-    return np.where(hit & np.isfinite(trace.mesh_distance(vertices, faces, point, mirror)), 0.0, 1.0)
+    eye = case.camera.to_world[:3, 3]
+    return mirror_visibility(vertices, faces, eye, normal, ray, offset + further)

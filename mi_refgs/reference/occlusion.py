@@ -182,6 +182,28 @@ def mesh_distance(
     return np.array([mesh_hit(vertices, faces, o, d)[0] for o, d in zip(origin, direction, strict=True)])
 
 
+def mirror_visibility(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    eye: np.ndarray,
+    normal: np.ndarray,
+    ray: np.ndarray,
+    offset: float,
+) -> np.ndarray:
+    """1 (P,), or 0 where the mirror rays of unit rays (P, 3) from the eye are blocked.
+
+    They start where those meet the mesh, `offset` along the unit normals (P, 3).
+    """
+    if not len(faces):
+        return np.ones(len(normal))
+    origin = np.broadcast_to(eye, ray.shape)
+    t = mesh_distance(vertices, faces, origin, ray)
+    hit = np.isfinite(t)
+    start = origin + np.where(hit, t, 0)[:, None] * ray + offset * normal
+    mirror = ray - 2 * np.sum(normal * ray, 1, keepdims=True) * normal
+    return np.where(hit & np.isfinite(mesh_distance(vertices, faces, start, mirror)), 0.0, 1.0)
+
+
 Radiance = Callable[[np.ndarray], np.ndarray]
 
 

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import Any
+from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 
+from benchmarks.stability.exact import filters
 from mi_refgs import constants as c
-from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
+from mi_refgs.occlusion.visibility import OFFSET_VOXELS
 from mi_refgs.reference import image, losses, occlusion
 from mi_refgs.reference.camera import PinholeCamera, look_at, rotation_axes
 from mi_refgs.reference.footprint import GEOMETRY
-from mi_refgs.reference.models import Light, Options, hemisphere, unit
+from mi_refgs.reference.light import Light, filtered
+from mi_refgs.reference.models import Options, hemisphere, unit
 from mi_refgs.reference.splat import primitive_of, sorted_rows
-from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade import brdf
-from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light import lobe_matrices
-from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.light.light import ConstantLight, RotatedLight
-from mi_refgs.splat.camera import Camera
 from tests.laws.covering import Case
 from tests.laws.option_cases import CROPS, HEIGHT, WIDTH
 from tests.laws.option_scenes import (
@@ -46,10 +39,6 @@ XYZ = np.array(
     [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
 """From linear sRGB. [Mitsuba's srgb_to_xyz]"""
-BAND = 1e-4
-MATERIALS = {"albedo": 3, "metallic": 1, "roughness": 1, "tint": 3}
-TRACED = ("visibility rays", "traced bounces", "ambient rays")
-"""Occlusion by many rays, which the reference does not have: its maps are those of `render`."""
 
 
 def camera_of(case: Case) -> tuple[PinholeCamera, tuple[int, int], int]:
@@ -65,112 +54,80 @@ def camera_of(case: Case) -> tuple[PinholeCamera, tuple[int, int], int]:
     return PinholeCamera(width * k, height * k, focal, focal, *centre, pose, NEAR, film), corner, k
 
 
-@dataclass
 class Oracle:
     """Images of a case for values near the first ones; what has no derivative stays as it is for those."""
 
-    case: Case
-    first: Values
-    _kept: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        shown, self.window = self.case, (slice(None), slice(None))
-        if self.case["accuracy"] == "antialias":  # roughness depends on pixels beside the crop window
-            x, y, width, height = CROPS[self.case["crop"]]
-            shown, self.window = self.case | {"crop": "none"}, (slice(y, y + height), slice(x, x + width))
+    def __init__(self, case: Case, first: Values) -> None:
+        self.case, self.window, shown = case, (slice(None), slice(None)), case
+        if case["accuracy"] == "antialias":  # roughness depends on pixels beside the crop window
+            x, y, width, height = CROPS[case["crop"]]
+            shown, self.window = case | {"crop": "none"}, (slice(y, y + height), slice(x, x + width))
         self.camera, self.corner, self.per_axis = camera_of(shown)
         self.pixels = np.arange(self.camera.width * self.camera.height)
-        self.band = np.zeros(len(self.pixels), bool)
-        self.exact = self.case["occlusion"] not in TRACED
+        self.own = [*surfels_of(first).raw]
+        self.visible: Array | None = None
+        self.variance: Array | None = None
+
+        first = {name: np.asarray(x, np.float64) for name, x in first.items()}
+        own, around = self._tables(first)
+        both = {n: np.concatenate([own[n], around[n]]) for n in GEOMETRY}
+        self.order = sorted_rows(both, self.camera, self.pixels, self.corner)
+        chosen = shading(case)
+        self.options = Options(
+            dominant=chosen.dominant, multiscatter=chosen.multiscatter, directions=chosen.directions
+        )
+        if chosen.reflectance == "monte_carlo":
+            normal = _facing(own, self.camera)
+            free = _free(own["position"], normal, chosen.directions) if chosen.occlusion else None
+            self.options = replace(self.options, detached_normal=normal, free=free)
+
+        maps, band = self._maps(first)
+        for alpha in (maps["alpha"], maps["object_alpha"]):
+            band |= np.abs(alpha - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
+        self.band = band
+        if chosen.antialias:
+            shape = self.camera.height, self.camera.width
+            normal, share = maps["object_normal"].reshape(*shape, 3), maps["object_alpha"].reshape(shape)
+            self.variance = losses.widened_roughness(np.zeros(shape), normal, share).ravel() ** 4
 
     def image(self, values: Values) -> Array:
         """(H, W, channels), as `mi.render` gives it."""
         values = {name: np.asarray(x, np.float64) for name, x in values.items()}
-        maps = self._reference(values) if self.exact else self._rendered(values)
-        return self._developed(maps, values)[self.window]
+        return self._developed(self._maps(values)[0])[self.window]
 
     def undecided(self) -> Array:
-        """Pixels (H, W) of which a sample is near a discontinuity; after the first `image`."""
+        """Pixels (H, W) of which a sample is near a discontinuity."""
         return self._blocks(self.band.astype(float)[:, None])[self.window][..., 0] > 0
 
     # ---------------- maps of the samples ----------------
 
-    def _keep(self, name: str, value: Any) -> Any:
-        return self._kept.setdefault(name, value() if name not in self._kept else None)
+    def _tables(self, values: Values) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Raw channels of the object, and of the surroundings, which may have no rows."""
+        own = {n: values[n] for n in self.own}
+        empty = {n: np.zeros((0, own[n].shape[1])) for n in (*GEOMETRY, "radiance_sh")}
+        return own, {n: values.get(AROUND + n, rows) for n, rows in empty.items()}
 
-    def _reference(self, values: Values) -> dict[str, Array]:
-        case, camera = self.case, self.camera
-        own = {n: x for n, x in values.items() if n in surfels_of(self.first).raw}
-        around = {n.removeprefix(AROUND): x for n, x in values.items() if n.startswith(AROUND)}
-        if not around:
-            around = {n: np.zeros((0, own[n].shape[1])) for n in (*GEOMETRY, "radiance_sh")}
-        both = {n: np.concatenate([own[n], around[n]]) for n in GEOMETRY}
-        order = self._keep("order", lambda: sorted_rows(both, camera, self.pixels, self.corner))
-        chosen = shading(case)
-        options = Options(
-            dominant=chosen.dominant, multiscatter=chosen.multiscatter, directions=chosen.directions
-        )
-        if chosen.reflectance == "monte_carlo":
-            normal = self._keep("normal", lambda: _facing(own, camera))
-            options = replace(options, detached_normal=normal)
-            if chosen.occlusion:
-                free = self._keep("free", lambda: _free(own["position"], normal, chosen.directions))
-                options = replace(options, free=free)
+    def _maps(self, values: Values) -> tuple[dict[str, Array], Array]:
+        """Maps of the samples, and which of these are near a declared discontinuity."""
+        chosen, (own, around) = shading(self.case), self._tables(values)
         scene = image.Scene(
-            own, camera, self.pixels, order, chosen.at, chosen.reflectance, chosen.diffuse,
-            light_of(case, values), options=options, terms=True,
+            own, self.camera, self.pixels, self.order, chosen.at, chosen.reflectance, chosen.diffuse,
+            light_of(self.case, values), options=self.options, terms=True, variance=self.variance,
         )  # fmt: skip
         if chosen.occlusion and chosen.model.visibility == "mirror":
-            scene = replace(
-                scene, visibility=lambda n, r: self._keep("visible", lambda: _visible(camera, n, r))
-            )
+            scene = replace(scene, visibility=self._visibility)
         background = values.get("background", np.full((8, 16, 3), -np.inf))
-        if chosen.antialias and "variance" not in self._kept:
-            maps, _ = image.render_open(image.OpenScene(scene, around, background))
-            shape = camera.height, camera.width
-            normal, share = maps["object_normal"].reshape(*shape, 3), maps["object_alpha"].reshape(shape)
-            self._kept["variance"] = losses.widened_roughness(np.zeros(shape), normal, share).ravel() ** 4
-        scene = replace(scene, variance=self._kept.get("variance"))
         maps, band = image.render_open(image.OpenScene(scene, around, background))
-        if chosen.occlusion and chosen.model.visibility == "mirror":
-            maps["visibility"] = self._kept["visible"][:, None]
-        floor = np.abs(maps["object_alpha"] - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
-        floor |= np.abs(maps["alpha"] - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
-        self._keep("band", lambda: np.logical_or(self.band, band | floor, out=self.band))
-        return maps
+        visible = np.ones(len(self.pixels)) if self.visible is None else self.visible
+        return maps | {"visibility": visible[:, None]}, band
 
-    def _rendered(self, values: Values) -> dict[str, Array]:
-        """Maps of `render`, of all AOVs."""
-        case, chosen, camera = self.case, shading(self.case), self.camera
-        held = {name: x.astype(np.float32) for name, x in values.items()}
-        surfels = surfels_of(held)
-        around = surfels_of(held, AROUND) if case["surroundings"] else nothing_around(surfels)
-        behind = EnvironmentLight(mi.TensorXf(held["background"])) if "background" in held else None
-        open_ = Surroundings(around, behind) if case["surroundings"] or behind else None
-        light: Any = ConstantLight(mi.Color3f(held["radiance"].tolist())) if "radiance" in held else None
-        if light is None:
-            light = chosen.light_of(EnvironmentLight.from_radiance(map_of(case, values)))
-            light = RotatedLight(light, mi.Matrix3f(rotation(case).T.astype(np.float32)))
-        occluder = Occluder(mesh())
-        update_occluder_caches(occluder, surfels, light, chosen)
-        view = Camera.from_pose(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.to_world, NEAR
-        )
-        (left, right), (top, bottom) = (map(int, ends) for ends in camera.borders)
-        view = replace(view, offset=(-left, -top), film=(right - left, bottom - top))
-        drawn = SurfelScene(surfels, chosen, light, occluder, open_)
-        frame = render(drawn, view, Request(drawn.all_aovs))
-        assert frame.terms is not None
-        found = {
-            "radiance": frame.radiance, "alpha": frame.alpha, "depth": frame.depth, "normal": frame.normal,
-            "diffuse": frame.terms.diffuse, "specular": frame.terms.specular,
-            "indirect": frame.terms.indirect, **frame.maps,
-        } | ({} if frame.object_alpha is frame.alpha else {"object_alpha": frame.object_alpha}) \
-          | ({} if behind is None else {"background": frame.background})  # fmt: skip
-        count = len(self.pixels)
-        maps = {name: np.atleast_2d(np.array(x, np.float64)).T for name, x in found.items()}
-        maps = {name: np.broadcast_to(x, (count, x.shape[1])) for name, x in maps.items()}
-        return {"object_alpha": maps["alpha"]} | maps
+    def _visibility(self, normal: Array, ray: Array) -> Array:
+        """Visibility (P,) of the mirror direction, that of the first image."""
+        if self.visible is None:
+            found, eye = mesh(), self.camera.to_world[:3, 3]
+            offset = OFFSET_VOXELS * found.voxel
+            self.visible = occlusion.mirror_visibility(found.vertices, found.faces, eye, normal, ray, offset)
+        return self.visible
 
     # ---------------- the film ----------------
 
@@ -180,7 +137,7 @@ class Oracle:
         height, width = self.camera.height // k, self.camera.width // k
         return np.asarray(values).reshape(height, k, width, k, -1).mean(axis=(1, 3))
 
-    def _developed(self, maps: dict[str, Array], values: Values) -> Array:
+    def _developed(self, maps: dict[str, Array]) -> Array:
         case = self.case
         rgb, alpha = maps["radiance"], maps["alpha"]
         if case["terms"] != "all":
@@ -213,8 +170,7 @@ class Oracle:
             distance = self._blocks(along * maps["alpha"]) / np.where(alpha > 0, alpha, 1)
             return np.where(alpha > c.COVERAGE_FLOOR, distance, 0)
         by = maps["object_alpha"]
-        value = maps.get("visibility", np.ones_like(by)) if kind == "visibility" else maps[kind]
-        mean = self._blocks(value * by) / np.where(share > 0, share, 1)
+        mean = self._blocks(maps[kind] * by) / np.where(share > 0, share, 1)
         return np.where(share > c.COVERAGE_FLOOR, mean, 0)
 
     def _ray_lengths(self) -> Array:
@@ -240,48 +196,14 @@ def map_of(case: Case, values: Values) -> Array:
 
 
 def light_of(case: Case, values: Values) -> Light:
-    radiance = map_of(case, values)
-    wanted = shading(case).levels
-    flat = radiance.reshape(-1, 3)
-    levels = [(m @ flat) for m in _matrices(len(radiance), wanted)]
+    radiance, wanted = map_of(case, values), shading(case).levels
+    levels = filtered(radiance, filters(len(radiance), wanted))
     if case["map"] == "constant" and case["emitter"] != "tensor":
-        levels = [np.broadcast_to(flat[0], level.shape) for level in levels]
-    shaped = [x.reshape(h := math.isqrt(len(x) // 2), 2 * h, 3) for x in levels]
-    table = brdf.table().astype(np.float64)
-    return Light([radiance, *shaped], wanted.roughness, table, rotation(case).T)
-
-
-@cache
-def _matrices(height: int, wanted: lobe_matrices.Levels) -> list[Array]:
-    """Dense prefilter matrices (2 h_out², 2 h²) of the levels, float64."""
-    matrices = []
-    φ = lobe_matrices.column_angles(2 * height)
-    for level in lobe_matrices.build_levels(height, wanted):
-        m = np.arange(level.weights.shape[2])
-        across = np.cos(m[:, None, None] * (lobe_matrices.column_angles(2 * level.height)[:, None] - φ))
-        dense = np.einsum("ikm,mab->iakb", level.weights, across, optimize=True)
-        matrices.append(dense.reshape(2 * level.height**2, 2 * height**2))
-    return matrices
+        levels = [np.broadcast_to(radiance[0, 0], level.shape) for level in levels]
+    return Light(levels, wanted.roughness, brdf.table().astype(np.float64), rotation(case).T)
 
 
 # ---------------- rays ----------------
-
-
-def _blocked(origin: Array, direction: Array) -> Array:
-    """Whether rays (n, 3) meet the mesh."""
-    found = mesh()
-    return np.isfinite(occlusion.mesh_distance(found.vertices, found.faces, origin, direction))
-
-
-def _visible(camera: PinholeCamera, normal: Array, ray: Array) -> Array:
-    """Visibility (P,) of the mirror direction from where the pixels' rays meet the mesh."""
-    found = mesh()
-    origin = np.broadcast_to(camera.to_world[:3, 3], ray.shape)
-    t = occlusion.mesh_distance(found.vertices, found.faces, origin, ray)
-    hit = np.isfinite(t)
-    start = origin + np.where(hit, t, 0)[:, None] * ray + OFFSET_VOXELS * found.voxel * normal
-    mirror = ray - 2 * np.sum(normal * ray, 1, keepdims=True) * normal
-    return np.where(hit & _blocked(start, mirror), 0.0, 1.0)
 
 
 def _facing(raw: dict[str, Array], camera: PinholeCamera) -> Array:
@@ -295,8 +217,9 @@ def _facing(raw: dict[str, Array], camera: PinholeCamera) -> Array:
 
 def _free(position: Array, normal: Array, count: int) -> Array:
     """Whether light arrives at surfels from their directions, (N, count)."""
-    start = position + OFFSET_VOXELS * mesh().voxel * normal
-    free = [
-        ~_blocked(np.tile(o, (count, 1)), hemisphere(count, n)) for o, n in zip(start, normal, strict=True)
-    ]
+    found, free = mesh(), []
+    for origin, about in zip(position + OFFSET_VOXELS * found.voxel * normal, normal, strict=True):
+        rays = hemisphere(count, about)
+        distance = occlusion.mesh_distance(found.vertices, found.faces, np.tile(origin, (count, 1)), rays)
+        free.append(~np.isfinite(distance))
     return np.stack(free)

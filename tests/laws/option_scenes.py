@@ -29,7 +29,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.laws.covering import Case
-from tests.laws.option_cases import ACCURACY, CROPS, FORMATS, HEIGHT, OCCLUSION, WIDTH
+from tests.laws.option_cases import ACCURACY, CROPS, FORMATS, HEIGHT, WIDTH
 from tests.scenes.integrator import raw_channels, sky
 
 Values = dict[str, np.ndarray]
@@ -124,14 +124,12 @@ def values(case: Case, seed: int = 1) -> Values:
 
 
 def accuracy(case: Case) -> dict[str, Any]:
-    chosen = {} if case["accuracy"] == "none" else {case["accuracy"]: ACCURACY[case["accuracy"]]}
-    return chosen | OCCLUSION[case["occlusion"]]
+    return {} if case["accuracy"] == "none" else {case["accuracy"]: ACCURACY[case["accuracy"]]}
 
 
 def shading(case: Case) -> Shading:
     name, at, diffuse = case["shading"].split("/")
-    occluded = case["occlusion"] != "none"
-    return Shading(at, name, diffuse, occluded, **accuracy(case))
+    return Shading(at, name, diffuse, case["occlusion"], **accuracy(case))
 
 
 def sensor(case: Case) -> dict[str, Any]:
@@ -163,7 +161,7 @@ def build(case: Case, found: Values, folder: Path) -> Built:
     name, at, diffuse = case["shading"].split("/")
     integrator: dict[str, Any] = {"type": "refgs", "reflectance": name, "shade_at": at, "diffuse": diffuse}
     integrator |= accuracy(case)
-    if case["occlusion"] != "none":
+    if case["occlusion"]:
         write_mesh(folder / "mesh.ply", mesh())
         integrator |= {"mesh": str(folder / "mesh.ply"), "occlusion": True}
     if case["terms"] != "all":
@@ -210,7 +208,7 @@ def _run(case: Case, found: Values, folder: Path) -> Built:
         behind = EnvironmentLight(mi.TensorXf(found["background"])) if "background" in found else None
         around = Surroundings(surfels_of(found, AROUND), behind)
     light = EnvironmentLight(mi.TensorXf(found["light"]))
-    occluder = mesh() if case["occlusion"] != "none" else None
+    occluder = mesh() if case["occlusion"] else None
     trained = TrainedScene(surfels_of(found), light, occluder, shading(case), 1, 1.0, surroundings=around)
     view = mi.load_dict(sensor(case))
     export(trained, folder, Camera.look_at((2, 2, 2), size=8))

@@ -1,5 +1,7 @@
 """Every two values of any two options in some image: the float64 reference's, with its derivatives.
 
+Rays beyond the mirror ray are no option here, because the reference does not trace them.
+
 A case that fails is one line; `pytest tests/laws/test_option_pairs.py -k "[17]"` runs case 17 alone. With
 `--hypothesis-profile thorough`, every three values of any three options.
 """
@@ -31,8 +33,6 @@ IMAGE = 3e-4
 """Largest error of a pixel, relative to its channel's largest value, and 1 at least."""
 DERIVATIVE = 5e-3
 """Largest error of a derivative, relative to a channel's largest; of a sum, to the root of its squares."""
-ADJOINT = 1e-4
-"""|⟨δ, Jv⟩ - ⟨Jᵀδ, v⟩| over |δ Jv|."""
 STEP = 1e-6  # of central differences of the reference, in units of normal numbers
 KEPT = 0.75
 """Share of the pixels outside the reference's declared discontinuities, at least."""
@@ -82,52 +82,38 @@ def test_images_and_derivatives_of_all_pairs_of_options(case: Case, tmp_path: Pa
 def check(case: Case, folder: Path) -> None:
     first = values(case)
     built, oracle = build(case, first, folder), Oracle(case, first)
-    expected = oracle.image(first)
-    kept = ~oracle.undecided()
+    expected, kept = oracle.image(first), ~oracle.undecided()
     assert kept.mean() > KEPT
     samples = 0 if case["input"] == "xml" else case["samples"]
-    if case["derivative"] == "none":
-        found = mi.render(built.scene, sensor=built.sensor, spp=samples).numpy()
-        compare(found, expected, kept)
-        film = built.sensor.film().bitmap()
-        if case["component_format"] != "uint32":
-            written = np.array(film, np.float64).reshape(found.shape)
-            np.testing.assert_allclose(written, found, rtol=1e-3, atol=1e-3)
-        return
-
     moving = [name for name in built.parameters if differentiable(case, name)]
+    leaves = {} if case["derivative"] == "none" else attached(built, moving)
+    with_prior = case["derivative"] == "reverse with a prior"
+    prior = sum((total(leaf) for leaf in leaves.values()), mi.Float(0)) if with_prior else mi.Float(0)
+    image = mi.render(built.scene, mi.traverse(built.scene), sensor=built.sensor, spp=samples)
+    compare(image.numpy(), expected, kept)
     rng = np.random.default_rng(5)
     tangent = {name: rng.normal(size=np.shape(first[name])) for name in moving}
-    weight = rng.normal(size=expected.shape) * kept[..., None] / np.maximum(1, abs(expected).max((0, 1)))
-    reverse: dict[str, float] = {}
-    if case["derivative"] != "forward" or not oracle.exact:
-        leaves = attached(built, moving)
-        with_prior = case["derivative"] == "reverse with a prior"
-        prior = sum((total(leaf) for leaf in leaves.values()), mi.Float(0)) if with_prior else mi.Float(0)
-        image = mi.render(built.scene, mi.traverse(built.scene), sensor=built.sensor, spp=samples)
-        compare(image.numpy(), expected, kept)
+
+    if case["derivative"] == "none":
+        if case["component_format"] != "uint32":
+            written = np.array(built.sensor.film().bitmap(), np.float64).reshape(image.shape)
+            np.testing.assert_allclose(written, image.numpy(), rtol=1e-3, atol=1e-3)
+    elif case["derivative"] == "forward":
+        for name, leaf in leaves.items():
+            dr.set_grad(leaf, type(leaf)(like(leaf, tangent[name])))
+        moved = moved_by(oracle, first, tangent)
+        compare(dr.forward_to(image).numpy(), moved, kept, DERIVATIVE, 0.05)
+    else:
+        weight = rng.normal(size=expected.shape) * kept[..., None] / np.maximum(1, abs(expected).max((0, 1)))
         dr.backward(dr.sum(image * mi.TensorXf(weight.astype(np.float32)), axis=None).array + prior)
+        slopes: dict[str, float] = {}
         for name, leaf in leaves.items():
             gradient = dr.grad(leaf).numpy().ravel() - with_prior
             slope = float(np.sum(gradient * like(leaf, tangent[name]).ravel()))
-            reverse[group(name)] = reverse.get(group(name), 0.0) + slope
-    if case["derivative"] != "forward" and oracle.exact:
-        for kind, slope in reverse.items():
+            slopes[group(name)] = slopes.get(group(name), 0.0) + slope
+        for kind, slope in slopes.items():
             moved = weight * moved_by(oracle, first, {n: x for n, x in tangent.items() if group(n) == kind})
             assert abs(np.sum(moved) - slope) < DERIVATIVE * np.linalg.norm(moved) + 1e-6, kind
-        return
-    leaves = attached(built, moving)
-    image = mi.render(built.scene, mi.traverse(built.scene), sensor=built.sensor, spp=samples)
-    compare(image.numpy(), expected, kept)
-    for name, leaf in leaves.items():
-        dr.set_grad(leaf, type(leaf)(like(leaf, tangent[name])))
-    forward = dr.forward_to(image).numpy()
-    if oracle.exact:
-        compare(forward, moved_by(oracle, first, tangent), kept, DERIVATIVE, 0.05)
-    else:
-        assert np.isfinite(forward).all()
-        difference = abs(np.sum(forward * weight) - sum(reverse.values()))
-        assert difference < ADJOINT * np.linalg.norm(forward * weight) + 1e-5
 
 
 def attached(built: Built, moving: list[str]) -> dict[str, Any]:
@@ -190,7 +176,6 @@ def test_every_pair_is_there() -> None:
         allowed = completed(dict(combination), DIMENSIONS, RULES) is not None
         assert allowed == (combination in found), combination
     assert not any(rule.broken(case) for case in cases() for rule in RULES)
-    print(f"{len(cases())} cases")
 
 
 def test_every_registered_thing_is_an_option() -> None:
