@@ -36,7 +36,7 @@ from benchmarks.stability.measure import (
 )
 from benchmarks.stability.measure import measure as measure_case
 from mi_refgs.data.images import Pixels
-from mi_refgs.fitting.state import FitSetup
+from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import LIGHT
 

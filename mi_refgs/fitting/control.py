@@ -19,7 +19,8 @@ from mi_refgs.data.region import Region
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.initial import converted, first_light
 from mi_refgs.fitting.refine import SizeLimits, TableEdit
-from mi_refgs.fitting.state import FitSetup, FitState
+from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
@@ -90,11 +91,11 @@ class AdaptiveControl:
 
     def refine(self, iteration: int) -> None:
         """Apply the edits that are due after this iteration."""
-        options, state, schedule = self.options, self.state, self.setup.schedule
+        options, state = self.options, self.state
         if options.densify is not None and options.densify.due(iteration):
             self._densify(iteration)
         if options.relocate is not None and options.relocate.when.due(iteration):
-            draws = schedule.rng(iteration, "relocate")
+            draws = self.setup.rng(iteration, "relocate")
             for table in state.tables:
                 table.apply(refine.relocate(table.surfels, options.relocate, table.max_count, draws))
             state.occluder.vertex_surfels = None
@@ -106,7 +107,7 @@ class AdaptiveControl:
             edited = refine.reset_opacity(state.surfels, options, floors)
             state.tables[0].replace(edited, cleared=("opacity", *floors))
         elif options.propagate is not None and options.propagate.when.due(iteration):
-            draws = schedule.rng(iteration, "propagate")
+            draws = self.setup.rng(iteration, "propagate")
             edited = refine.propagate_normals(state.surfels, options.propagate, draws)
             colour = ("radiance_sh",) if options.propagate.noise else ()
             state.tables[0].replace(edited, cleared=("opacity", *edited.primitive.sizes, *colour))
@@ -117,7 +118,7 @@ class AdaptiveControl:
 
     def _densify(self, iteration: int) -> None:
         options, data, method, state = self.options, self.setup.data, self.setup.method, self.state
-        draws = self.setup.schedule.rng(iteration, "densify")
+        draws = self.setup.rng(iteration, "densify")
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
@@ -158,7 +159,7 @@ class AdaptiveControl:
         """Set attributes, and the light if it is named, back to their initial values, without history."""
         state, method = self.state, self.setup.method
         starts = {name: method.surfels.start(name) for name in names if name != LIGHT}
-        draws = self.setup.schedule.rng(iteration, "restart")
+        draws = self.setup.rng(iteration, "restart")
         state.tables[0].replace(refine.restart(state.surfels, starts, draws), cleared=tuple(starts))
         if LIGHT in names and method.light is not None:
             state.params[LIGHT] = first_light(method.light).raw

@@ -21,7 +21,8 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import MAX_GAIN, fitted_gain
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.state import FitSetup, FitState
+from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.fitting.state import FitState
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import GAIN

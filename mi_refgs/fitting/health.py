@@ -12,7 +12,8 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.optim import Skipped
-from mi_refgs.fitting.state import FitSetup, FitState
+from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import BACKGROUND, LIGHT
 from mi_refgs.runs.checkpoint import channels_of
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -49,7 +50,7 @@ class Health:
         rows = {table.prefix + name: at for table, names in found for name, at in names.items()}
         if not rows and not skipped.count:
             return None
-        view = setup.data.views[setup.schedule.view(skipped.iteration + 1)].name if skipped.count else ""
+        view = setup.data.views[setup.view(skipped.iteration + 1)].name if skipped.count else ""
         said = sentence(rows, skipped, view)
         if self.failed >= PATIENCE * setup.method.log_every:
             raise InputError(

@@ -43,7 +43,7 @@ COVERED = 0.35  # fraction of the synthetic images that the object covers; publi
 WARM, TIMED, REPEATS = 4, 4, 3
 """Steps before the timed ones, which compile kernels; steps timed together; repetitions, of which the fastest
 counts."""
-WHOLE = 256 * 256  # pixels of an image up to which it is not downscaled, unless the method says so
+SMALL_IMAGE = 256 * 256  # pixels of an image up to which it is not downscaled, unless the method says so
 LEAST = 96  # pixels of the shorter side below which no image is downscaled: smaller images show no surface
 SAFETY = 0.8  # fraction of the time limit that the estimate may reach: data sets differ by as much
 GROWTH, OPEN_GROWTH = 1.0, 0.6
@@ -74,8 +74,8 @@ def measured(method: Method, has_alpha: bool) -> Speed:
 
 def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, float], tuple[float, float]]:
     """Seconds per step by stage; per mesh, and per view of a mesh."""
-    data_options = replace(method.data, coarse=())
-    still = replace(method, refine=Refine(), exposure=None, select=None, data=data_options)
+    whole = replace(method.data, coarse=())
+    still = replace(method, refine=Refine(), exposure=None, select=None, data=whole)
     trainer = Trainer(still, synthetic_data(has_alpha, size))
     every = 1 if method.light is None else method.light.every
     timed = max(TIMED // every, 1) * every
@@ -152,7 +152,7 @@ def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: No
             f"{path}: images of {width} × {height} pixels are read as {width // factor} × "
             f"{height // factor} to fit the time of preset {method.preset}; --set data.downscale=1 avoids it"
         )
-    return replace(method, data=replace(method.data, downscale=factor))
+    return method.downscaled(factor)
 
 
 @dataclass(frozen=True)
@@ -183,20 +183,19 @@ def planned(
     """The method with the size of images decided, and an estimate of its fit, or None if it takes seconds.
 
     Chooses the largest images whose fit takes at most `limit` seconds, by default the time of the preset.
-    Images of at most WHOLE pixels are not downscaled, nor is a size changed that the method gives. The load
-    of the machine has no influence. `tell` is called with the choice. Raises InputError as `read_dataset`
-    does.
+    Images of at most SMALL_IMAGE pixels are not downscaled, nor is a size changed that the method gives. The
+    load of the machine has no influence. `tell` is called with the choice. Raises InputError as
+    `read_dataset` does.
     """
+    # The time limit, and the images.
     promise = PRESETS[method.preset].minutes if method.preset in PRESETS else None
     limit = 60 * promise if limit is None and promise is not None else limit
-    whole = replace(method, data=replace(method.data, downscale=1))
-    data = read_views(whole, path, "train", truth=False, decode=False)
+    data = read_views(method.downscaled(1), path, "train", truth=False, decode=False)
     width, height = data.views[0].width, data.views[0].height
-    given = method.data.downscale is not None
-    if not given and limit is None:
-        method = sized(method, path, tell)
-    factor = method.data.downscale or 1
-    method = replace(method, data=replace(method.data, downscale=factor))
+
+    # Their size, unless the time limit decides it, and an estimate where the fit takes minutes.
+    free = limit is not None and method.data.downscale is None
+    method = method.downscaled(1) if free else sized(method, path, tell)
     if method.iterations * width * height < WORTH:
         return method, None
     speed = speed_of(method, data.has_alpha)
@@ -204,9 +203,12 @@ def planned(
     def at(factor: int) -> Estimate:
         return estimate(method, speed, len(data.views), (width, height), factor, data.has_alpha)
 
-    if given or limit is None:
+    factor = method.data.downscale or 1
+    if limit is None or not free:
         return method, at(factor)
-    most = min(width, height) // LEAST if width * height > WHOLE else 1
+
+    # The smallest factor whose estimate keeps the limit.
+    most = min(width, height) // LEAST if width * height > SMALL_IMAGE else 1
     while at(factor).seconds > SAFETY * limit and factor < most:
         factor += 1
     chosen = at(factor)
@@ -221,7 +223,7 @@ def planned(
             f"{path}: the fit takes {minutes(chosen.seconds)}, more than {minutes(limit)}; "
             f"--set data.downscale={factor + 1} reads smaller images"
         )
-    return replace(method, data=replace(method.data, downscale=factor)), chosen
+    return method.downscaled(factor), chosen
 
 
 def estimate(

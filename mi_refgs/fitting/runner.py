@@ -128,7 +128,7 @@ def _resumed_method(run: Run, data: Path, choice: Choice) -> Method:
     method = run.method()
     _require_same(run, method, choice)
     if choice.minutes is not None:
-        free = replace(method, data=replace(method.data, downscale=None))
+        free = method.downscaled(None)
         _require(run, "--minutes", method, planned(free, data, 60 * choice.minutes)[0])
     return method
 
@@ -280,7 +280,7 @@ def _require_same(run: Run, made: Method, choice: Choice) -> None:
 def _require(run: Run, option: str, made: Method, now: Method) -> None:
     """Raise InputError if the method of a run is not that of an option."""
     if now.data.downscale is None:  # decided when the run was started
-        now = replace(now, data=replace(now.data, downscale=made.data.downscale))
+        now = now.downscaled(made.data.downscale)
     for key, (before, after) in methods.differences(made, now).items():
         raise InputError(
             f"{run.path / 'config.toml'}: {option}: {key}: the run was started with {before}, and "

@@ -1,34 +1,50 @@
-"""Everything in a step that depends on the iteration number alone: random draws, learning rates, shared
-lights."""
+"""What follows from the method, the data and the iteration number alone: random draws, learning rates, shapes
+of parameters, lights that steps share."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import drjit as dr
 import numpy as np
 
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.initial import is_open
 from mi_refgs.fitting.optim import Group
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
+from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method
+from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
-from mi_refgs.types import Float
+from mi_refgs.types import Float, TensorXf
 
 POSITION_STEPS = 0.6
 """Fraction of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the
 released Ref-Gaussian code."""
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """Random draws and learning rates of a fit to `views` images, by (1-based) iteration."""
+@dataclass(frozen=True, eq=False)
+class FitSetup:
+    """Method and data of a fit, and what follows from them alone, by (1-based) iteration."""
 
     method: Method
-    views: int
+    data: Dataset
+
+    @cached_property
+    def open_scene(self) -> bool:
+        """Whether the images show a background that the method models apart from the object."""
+        return is_open(self.method, self.data)
+
+    @property
+    def exposure(self) -> ExposureOptions | None:
+        """Options of the per-image exposure compensation, unless the method switches it off."""
+        options = self.method.exposure
+        return None if options is None or options.gains == "off" else options
 
     def rng(self, iteration: int, operation: str) -> np.random.Generator:
         """Generator for one operation, such as "densify", of an iteration; 0 is the initialisation."""
@@ -36,8 +52,9 @@ class Schedule:
 
     def view(self, iteration: int) -> int:
         """Index of the training view: sampling without replacement, a new permutation every epoch."""
-        epoch, place = divmod(iteration - 1, self.views)
-        return int(np.random.default_rng([self.method.seed, epoch, 1]).permutation(self.views)[place])
+        count = len(self.data.views)
+        epoch, place = divmod(iteration - 1, count)
+        return int(np.random.default_rng([self.method.seed, epoch, 1]).permutation(count)[place])
 
     def sh_degree(self, iteration: int) -> int:
         """SH degree of the radiance that is in use."""
@@ -50,18 +67,20 @@ class Schedule:
         ends = [stage.until for _, stage in self.method.stages()]
         return light is not None and (iteration % light.every == 0 or iteration in ends)
 
-    def groups(self, extent: float, open_scene: bool = False) -> dict[str, Group]:
-        """Learning rates by parameter; `extent` in scene units; `open_scene`: also of the background."""
-        rates, iterations = self.method.rates, self.method.iterations
+    def groups(self, params: Mapping[str, TensorXf]) -> dict[str, Group]:
+        """Learning rates by the name of the parameter."""
+        rates, iterations, extent = self.method.rates, self.method.iterations, self.data.scene_extent
         groups = self._of_table(self.method.surfels.names, extent)
         around = self.method.surroundings
-        if open_scene and around is not None:
+        if self.open_scene and around is not None:
             table = self._of_table(around.names(self.method.surfels.primitive), around.reach * extent)
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = Group(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None:
             texels = rates.light, rates.light * rates.decay, iterations
             groups[LIGHT] = Group(*texels, relative=rates.light_relative)
+        if self.exposure is not None and GAIN in params:
+            groups[GAIN] = Group(self.exposure.rate, 0.1 * self.exposure.rate, iterations)
         return groups
 
     def _of_table(self, names: tuple[str, ...], extent: float) -> dict[str, Group]:
@@ -74,6 +93,33 @@ class Schedule:
         start, final = rates.of("position") * extent, rates.position_final * extent
         groups["position"] = Group(start, final, int(POSITION_STEPS * iterations), unit=extent)
         return groups
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every parameter but the gains, without the first axis."""
+        surfels, around = self.method.surfels, self.method.surroundings
+        found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
+        if self.open_scene and around is not None:
+            harmonics = replace(surfels, degree={"radiance_sh": around.degree})
+            found |= {AROUND + name: (harmonics.columns(name),) for name in around.names(surfels.primitive)}
+            found[BACKGROUND] = (2 * around.height, 3)
+        return found if self.method.light is None else found | {LIGHT: (2 * self.method.light.height, 3)}
+
+    def require_own(self, state: Mapping[str, np.ndarray]) -> None:
+        """Raise InputError if the method or the kind of images has changed since the state was written."""
+        expected, views = self.shapes(), len(self.data.views)
+        found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
+        for name in expected.keys() | found.keys():
+            if found.get(name) != expected.get(name):
+                raise InputError(
+                    f"config.toml: {name}: the checkpoint has {found.get(name, 'none')}, the method "
+                    f"{expected.get(name, 'none')}; undo the change, or start another run"
+                )
+        gains = state.get(f"{PARAMS}{GAIN}")
+        if gains is not None and len(gains) != views:
+            raise InputError(
+                f"{self.data.path}: frames: {views} training views, but the checkpoint has gains of "
+                f"{len(gains)}; resume with the data set that the run began with"
+            )
 
 
 GATHERED = "light_gradient"  # name of the gradient of the levels in a checkpoint

@@ -21,7 +21,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.exposure import displayed_of, image_of, psnr
 from mi_refgs.fitting.initial import converted, first_light, with_columns
 from mi_refgs.fitting.optim import Adam
-from mi_refgs.fitting.state import FitSetup
+from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method, Selection
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
@@ -36,7 +36,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     with zeros, a light of another size is resampled; entries that are kept have their history.
     """
     state = trainer.state()
-    old, rng = part(state, PARAMS), trainer.setup.schedule.rng(trainer.iteration, "branch")
+    old, rng = part(state, PARAMS), trainer.setup.rng(trainer.iteration, "branch")
     widths = {name: method.surfels.columns(name) for name in method.surfels.names}
     wanted = converted(old, widths, method, rng)
     wanted |= {name: old[name] for name in old if name == BACKGROUND or name.startswith(AROUND)}
@@ -100,11 +100,6 @@ class Decision:
     reason: str
     without: ComponentTrial | None = None
     with_it: ComponentTrial | None = None
-
-    @property
-    def gain(self) -> float | None:
-        """PSNR improvement by the component, dB."""
-        return None if self.without is None or self.with_it is None else self.with_it.psnr - self.without.psnr
 
 
 def install_trials(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:

@@ -12,22 +12,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.initial import initial_parameters, is_open
-from mi_refgs.fitting.optim import Adam, Group
+from mi_refgs.fitting.initial import initial_parameters
+from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.refine import TableEdit
-from mi_refgs.fitting.schedule import Schedule, SharedPrefilter
+from mi_refgs.fitting.schedule import FitSetup, SharedPrefilter
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method, Stage
+from mi_refgs.methods.method import AROUND, GAIN, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexColours, VertexSurfels
 from mi_refgs.occlusion.visibility import Occluder
@@ -42,69 +40,11 @@ from mi_refgs.runs.checkpoint import (
     surroundings_of,
     tensors,
 )
+from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Bool, Float, TensorXf, UInt32
-
-
-@dataclass(frozen=True, eq=False)
-class FitSetup:
-    """Method and data of a fit, and what follows from them alone."""
-
-    method: Method
-    data: Dataset
-
-    @cached_property
-    def open_scene(self) -> bool:
-        """Whether the images show a background that the method models apart from the object."""
-        return is_open(self.method, self.data)
-
-    @cached_property
-    def schedule(self) -> Schedule:
-        """Draws and learning rates by iteration."""
-        return Schedule(self.method, len(self.data.views))
-
-    @property
-    def exposure(self) -> ExposureOptions | None:
-        """Options of the per-image exposure compensation, unless the method switches it off."""
-        options = self.method.exposure
-        return None if options is None or options.gains == "off" else options
-
-    def groups(self, params: Mapping[str, TensorXf]) -> dict[str, Group]:
-        """Learning rates by the name of the parameter."""
-        groups = self.schedule.groups(self.data.scene_extent, self.open_scene)
-        if self.exposure is not None and GAIN in params:
-            rate = self.exposure.rate
-            groups[GAIN] = Group(rate, 0.1 * rate, self.method.iterations)
-        return groups
-
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of every parameter but the gains, without the first axis."""
-        surfels, around = self.method.surfels, self.method.surroundings
-        found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
-        if self.open_scene and around is not None:
-            harmonics = replace(surfels, degree={"radiance_sh": around.degree})
-            found |= {AROUND + name: (harmonics.columns(name),) for name in around.names(surfels.primitive)}
-            found[BACKGROUND] = (2 * around.height, 3)
-        return found if self.method.light is None else found | {LIGHT: (2 * self.method.light.height, 3)}
-
-    def require_own(self, state: Mapping[str, np.ndarray]) -> None:
-        """Raise InputError if the method or the kind of images has changed since the state was written."""
-        expected, views = self.shapes(), len(self.data.views)
-        found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
-        for name in expected.keys() | found.keys():
-            if found.get(name) != expected.get(name):
-                raise InputError(
-                    f"config.toml: {name}: the checkpoint has {found.get(name, 'none')}, the method "
-                    f"{expected.get(name, 'none')}; undo the change, or start another run"
-                )
-        gains = state.get(f"{PARAMS}{GAIN}")
-        if gains is not None and len(gains) != views:
-            raise InputError(
-                f"{self.data.path}: frames: {views} training views, but the checkpoint has gains of "
-                f"{len(gains)}; resume with the data set that the run began with"
-            )
 
 
 @dataclass(eq=False)
@@ -197,7 +137,7 @@ class FitState:
     @staticmethod
     def start(setup: FitSetup, gains: Mapping[str, TensorXf]) -> FitState:
         """The state before the first step; `gains`, if there are any, do not learn until they are decided."""
-        draws = setup.schedule.rng(0, "start")
+        draws = setup.rng(0, "start")
         params = initial_parameters(setup.method, setup.data, draws, setup.open_scene)
         made = FitState._assembled(setup, params | dict(gains))
         made.optimiser.set_factor(GAIN, 0.0)
@@ -231,6 +171,16 @@ class FitState:
     def shading(self, stage: Stage) -> Shading:
         """Shading options of a stage with the present occluder."""
         return Shading.resolve(stage.shading, not self.occluder.empty)
+
+    def update_missing_caches(self, shading: Shading) -> None:
+        """Compute the caches that the shading requires and the occluder lacks: all for a new mesh, and the
+        surfels at its vertices also after surfels were added or removed.
+        """
+        occluder = self.occluder
+        if shading.ambient_rays and occluder.ambient is None:
+            update_occluder_caches(occluder, self.surfels, shading.light_of(self.light), shading)
+        if shading.traced_bounces and occluder.vertex_surfels is None:
+            occluder.set_materials(self.surfels)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The content of a checkpoint."""

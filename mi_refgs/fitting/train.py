@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from itertools import tee
 from typing import Any
 
 import drjit as dr
@@ -18,19 +19,21 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.region import Region
 from mi_refgs.data.view import View
 from mi_refgs.fitting import exposure
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
 from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective, require_losses
-from mi_refgs.fitting.state import FitSetup, FitState
-from mi_refgs.fitting.surface import surface_of, update_missing_caches
+from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.fitting.state import FitState
 from mi_refgs.fitting.targets import Targets, require_memory
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.timing import phase
 from mi_refgs.methods.method import GAIN, Method, Refine, Stage
-from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
+from mi_refgs.occlusion.mesh import Mesh, extract_mesh
+from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
+from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render, render_depth
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.interrupt import held_interrupts
@@ -148,10 +151,10 @@ class Trainer:
         """Render the present state, without derivatives; `object_only`: without the background."""
         with dr.suspend_grad():
             shading = self.shading()
-            update_missing_caches(self.fit.occluder, self.surfels, self.light, shading)
+            self.fit.update_missing_caches(shading)
             light, around = shading.light_of(self.light), None if object_only else self.surroundings
             scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around)
-            degree = self.setup.schedule.sh_degree(self.iteration)
+            degree = self.setup.sh_degree(self.iteration)
             return render(scene, camera, Request(scene.all_aovs if aovs else (), sh_degree=degree))
 
     def statistics(self) -> dict[str, Any]:
@@ -282,8 +285,8 @@ class Trainer:
     # ---------------- one step ----------------
 
     def _gradient_step(self, iteration: int, stage: Stage, control: AdaptiveControl) -> None:
-        fit, schedule, weights = self.fit, self.setup.schedule, self.method.loss
-        index = schedule.view(iteration)
+        fit, setup, weights = self.fit, self.setup, self.method.loss
+        index = setup.view(iteration)
         target = self.targets.at(iteration, index)
         camera, surfels, around = target.camera, fit.surfels, fit.surroundings
 
@@ -294,19 +297,19 @@ class Trainer:
 
         # Render the view, and differentiate its loss.
         shading = self.fit.shading(stage)
-        update_missing_caches(fit.occluder, surfels, fit.light, shading)
+        fit.update_missing_caches(shading)
         light = fit.prefilter.light(fit.light, shading)
         scene = SurfelScene(surfels, shading, light, fit.occluder, around)
         asked = losses_in_use(weights)
         aovs = ("normal",) if any(loss.normals for loss in asked) else ()
-        request = Request(aovs, sh_degree=schedule.sh_degree(iteration), screen_offset=offset)
+        request = Request(aovs, sh_degree=setup.sh_degree(iteration), screen_offset=offset)
         view = partial(render, scene, request=request)
         frame = supersampled(view, camera, stage.samples, details=any(loss.maps for loss in asked))
         gain = exposure.log_gain(fit.params, index)
         loss, self.error = objective(LossInputs.of(frame, target, self.data, light, gain), weights, iteration)
         self.loss = dr.detach(loss)
         phase("loss backward")(dr.backward)(loss)
-        if schedule.light_learns(iteration):
+        if setup.light_learns(iteration):
             fit.prefilter.close()
 
         # Statistics, the optimiser's step, and the random step of positions.
@@ -337,3 +340,35 @@ class Trainer:
                 )
             self.check()
             self.restore(exposure.with_gains(self.state(), log))
+
+
+def surface_of(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    resolution: int,
+    around: Surfels | None = None,
+    region: Region | None = None,
+) -> Mesh:
+    """Fuse the depth rendered in all cameras, with `resolution` voxels along the longest side, into a mesh.
+
+    With a `region` and background surfels `around`, in all of space by the region's contraction, with
+    `resolution` voxels along its diameter.
+    """
+    points = surfels.to_numpy()["position"]
+    if around is None or region is None:
+        around, region, bounds = None, None, bounds_from_points(points)
+    else:
+        points = np.concatenate([points, around.to_numpy()["position"]])
+        low, high = bounds_from_points(region.contract(points[np.isfinite(points).all(axis=1)]))
+        bounds = np.maximum(low, -2), np.minimum(high, 2)
+    views = tee(render_depth(surfels, camera, around) for camera in cameras)
+    volume = fuse(
+        (depth for depth, _ in views[0]),
+        (alpha for _, alpha in views[1]),
+        iter(cameras),
+        bounds,
+        resolution,
+        carve=region is None,
+        region=region,
+    )
+    return extract_mesh(volume)

@@ -6,7 +6,7 @@ every window, stage and interval is scaled with it (`methods.read`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from mi_refgs.methods.build import FLAT
@@ -313,6 +313,10 @@ class Method:
             raise ValueError("iterations: less than 1; give how many to run")
         if not self.stage:
             raise ValueError("stage: expected at least one named table; add one")
+
+    def downscaled(self, factor: int | None) -> Method:
+        """The method with this `data.downscale`."""
+        return replace(self, data=replace(self.data, downscale=factor))
 
     def stages(self) -> list[tuple[str, Stage]]:
         """Stages in the order of their `until`."""

@@ -18,7 +18,7 @@ from mi_refgs.data.region import Region, write_region
 from mi_refgs.data.survey import require_several_sides, survey
 from mi_refgs.fitting.initial import initial_surfels
 from mi_refgs.fitting.optim import Adam, Group
-from mi_refgs.fitting.schedule import Schedule
+from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.reference.camera import look_at
@@ -111,11 +111,14 @@ def test_neighbour_scale_without_neighbours_follows_the_extent() -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_optimiser_step_scales_with_the_scene(scale: float) -> None:
+def test_optimiser_step_scales_with_the_scene(scale: float, tmp_path: Path) -> None:
     """Gradients of a length have the inverse unit, Adam's ε too."""
 
     def step(scale: float) -> np.ndarray:
-        groups = Schedule(methods.load("ref_gaussian", "quick"), 1).groups(scale)
+        folder = write_data(tmp_path / f"{scale}", truth=False)
+        move_cameras(folder, lambda position: scale * position)
+        setup = FitSetup(methods.load("ref_gaussian", "quick"), read_dataset(folder, "train"))
+        groups = setup.groups({})
         params = {"position": mi.TensorXf(np.zeros((4, 3), np.float32))}
         adam = Adam(params, {"position": groups["position"]})
         slope = np.array([1e-7, 1e-12, 1e-15, 3e-17])[:, None] * np.ones(3)

@@ -270,7 +270,7 @@ def test_warm_step_with_gains_compiles_nothing(method: Method) -> None:
         trainer.fit.optimiser.reset(GAIN)
         before = trainer.fit.params[GAIN].numpy()
         trainer.step()
-        index = trainer.setup.schedule.view(trainer.iteration)
+        index = trainer.setup.view(trainer.iteration)
         moved = np.flatnonzero(np.any(trainer.fit.params[GAIN].numpy() != before, axis=1))
         assert moved.tolist() == [index]
 

@@ -33,7 +33,7 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, name: str, rows: list[int], 
     original = Adam.step
 
     def step(self: Adam, iteration: int, loss: object = None) -> None:
-        if trainers[0].setup.schedule.view(iteration + 1) in views:
+        if trainers[0].setup.view(iteration + 1) in views:
             gradient = np.array(dr.grad(self.params[name]).numpy())
             gradient[[row for row in rows if row < len(gradient)], 0] = np.nan
             dr.set_grad(self.params[name], mi.TensorXf(gradient))
@@ -60,7 +60,7 @@ def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
     said: list[str] = []
     trainer = Trainer(still, ball(), run, warn=said.append)
     before = trainer.surfels.to_numpy()["albedo"]
-    failed = [i for i in range(1, 10) if trainer.setup.schedule.view(i) == 2]
+    failed = [i for i in range(1, 10) if trainer.setup.view(i) == 2]
 
     def look(state: Trainer) -> None:
         if state.iteration == failed[0]:

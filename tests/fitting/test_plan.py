@@ -56,7 +56,7 @@ def test_largest_images_within_time_limit_are_chosen(
 ) -> None:
     """Images have 20 × 20 pixels; a size that the method says stays."""
     data = write_data(tmp_path / "data", truth=False)
-    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "WHOLE": 399}.items():
+    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "SMALL_IMAGE": 399}.items():
         monkeypatch.setattr(plan, name, value)
     seconds = [plan.estimate(method, SPEED, 3, (20, 20), factor).seconds for factor in (1, 2, 3, 4)]
     assert sorted(seconds, reverse=True) == seconds
@@ -93,20 +93,16 @@ def test_small_images_are_never_downscaled_unasked(
 ) -> None:
     """400 pixels where that many are small, whatever the preset and the time; where 399 are, they are."""
     data = write_data(tmp_path / "data", truth=False)
-    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "WHOLE": 400}.items():
+    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "SMALL_IMAGE": 400}.items():
         monkeypatch.setattr(plan, name, value)
     method = dataclasses.replace(method, preset=preset)
     said: list[str] = []
     chosen, expected = plan.planned(method, data, limit, said.append)
     assert chosen.data.downscale == 1 and expected is not None and expected.width == 20
     assert (limit is None) == (not said) and all("data.downscale=2" in text for text in said)
-    assert plan.WHOLE == 400 and all(made.pixels >= 256**2 for made in PRESETS.values())
-    monkeypatch.setattr(plan, "WHOLE", 399)
+    assert plan.SMALL_IMAGE == 400 and all(made.pixels >= 256**2 for made in PRESETS.values())
+    monkeypatch.setattr(plan, "SMALL_IMAGE", 399)
     assert limit is None or plan.planned(method, data, limit)[0].data.downscale == 4
-
-
-def test_small_is_256_pixels_side() -> None:
-    assert plan.WHOLE == 256**2
 
 
 class Machine:

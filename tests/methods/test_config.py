@@ -183,9 +183,9 @@ def test_every_preset_has_the_same_events_in_the_same_order(
         trainer = Trainer(method, ball())
         done.clear()
         while trainer.iteration < method.iterations:
-            degree = trainer.setup.schedule.sh_degree(trainer.iteration)
+            degree = trainer.setup.sh_degree(trainer.iteration)
             trainer.step()
-            done += ["degree"] * (trainer.setup.schedule.sh_degree(trainer.iteration) - degree)
+            done += ["degree"] * (trainer.setup.sh_degree(trainer.iteration) - degree)
         sequences[preset] = list(done)
     assert sequences["quick"] == sequences["standard"] == sequences["paper"]
     assert Counter(sequences["quick"]) == EVENTS[variant]

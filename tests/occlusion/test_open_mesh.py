@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from mi_refgs.data.region import Region
-from mi_refgs.fitting.surface import surface_of
+from mi_refgs.fitting.train import surface_of
 from mi_refgs.occlusion import tsdf
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.reference import occlusion as ref
