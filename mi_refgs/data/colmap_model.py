@@ -260,21 +260,12 @@ def write_cameras(folder: Path, cameras: Iterable[tuple[tuple[float, ...], Lens 
     """Write cameras.txt: per camera (width, height, fx, fy, cx, cy), pixels, and lens; numbered from 1."""
     rows = []
     for i, (numbers, lens) in enumerate(cameras, 1):
-        model, coefficients = _model(lens)
+        given = {} if lens is None else lens.coefficients
+        model = "PINHOLE" if lens is None else lens.model
+        model = "FULL_OPENCV" if model == "OPENCV" and given.get("k3") else model
+        coefficients = [given.get(name, 0.0) for name in MODELS[model][1].split()[4:]]
         rows.append(f"{i} {model} {' '.join(map(repr, (*numbers, *coefficients)))}")
     _write(folder / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY, and coefficients", rows)
-
-
-def _model(lens: Lens | None) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's camera model of a lens, and its coefficients."""
-    if lens is None:
-        return "PINHOLE", ()
-    if lens.fisheye:
-        return "OPENCV_FISHEYE", lens.radial
-    k1, k2, k3 = (*lens.radial, 0.0, 0.0)[:3]
-    if not k3:
-        return "OPENCV", (k1, k2, *lens.tangential)
-    return "FULL_OPENCV", (k1, k2, *lens.tangential, k3, 0.0, 0.0, 0.0)
 
 
 def write_images(

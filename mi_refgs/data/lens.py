@@ -46,6 +46,17 @@ class Lens:
             return None
         return Lens(fisheye, (k1, k2, k3, k4) if fisheye else (k1, k2, k3), (p1, p2))
 
+    @property
+    def model(self) -> str:
+        """Name in COLMAP and nerfstudio; COLMAP's OPENCV has no k3."""
+        return "OPENCV_FISHEYE" if self.fisheye else "OPENCV"
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """The coefficients by name: k1, k2 …, and p1, p2 of a perspective lens."""
+        radial = {f"k{i}": k for i, k in enumerate(self.radial, 1)}
+        return radial if self.fisheye else radial | dict(zip(("p1", "p2"), self.tangential, strict=True))
+
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distort image points (x, y) at unit distance."""
         square = x * x + y * y

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.data.colmap_model import write_cameras, write_images, write_points, write_test_list
-from mi_refgs.data.lens import COEFFICIENTS, Lens
+from mi_refgs.data.lens import COEFFICIENTS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.transforms import Frame
+from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
 from mi_refgs.io.files import make_folder, write_json
@@ -33,57 +34,47 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     """
     sparse = target / "sparse" / "0"
     make_folder(sparse)
-    names = [_file_name(shot) for shot in shots]
+    files = [_file(shot) for shot in shots]
+    names = [file.path.as_posix() for file in files]
     poses = [shot.camera.pose() for shot in shots]
-    cameras = [(_pinhole(shot), shot.file.lens if shot.file else None) for shot in shots]
+    cameras = [((file.width, file.height, *map(float, file.intrinsics)), file.lens) for file in files]
 
     # transforms.json
     frames = []
-    for name, shot, pose, (numbers, lens) in zip(names, shots, poses, cameras, strict=True):
-        frame = {"file_path": name, **dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True))}
-        mask = None if shot.file is None else shot.file.mask
-        if mask is not None and mask.below is None:
-            frame["mask_path"] = mask.path.as_posix()
-        opengl = (pose @ MITSUBA_FROM_OPENGL).tolist()
-        frames.append({**frame, **_coefficients(lens), "transform_matrix": opengl})
+    for name, file, pose, (numbers, lens) in zip(names, files, poses, cameras, strict=True):
+        frame: dict[str, Any] = {"file_path": name}
+        frame |= zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True)
+        if file.mask is not None and file.mask.below is None:
+            frame["mask_path"] = file.mask.path.as_posix()
+        frame["camera_model"] = "PINHOLE" if lens is None else lens.model
+        frame |= (lens.coefficients if lens else {}) | {
+            "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist()
+        }
+        frames.append(frame)
     content: dict[str, Any] = {"camera_model": frames[0]["camera_model"]}
     for split in ("train", "test"):
-        content[f"{split}_filenames"] = [_file_name(shot) for shot in shots if shot.split == split]
+        listed = [name for name, shot in zip(names, shots, strict=True) if shot.split == split]
+        content[f"{split}_filenames"] = listed
     write_json(target / "transforms.json", {**content, "frames": frames})
 
     # COLMAP's model
     numbered = {camera: i for i, camera in enumerate(dict.fromkeys(cameras), 1)}
-    files = _below_images(names)
+    below = _below_images(names)
     write_cameras(sparse, numbered)
-    write_images(sparse, files, poses, [numbered[camera] for camera in cameras], [""] * len(shots))
+    write_images(sparse, below, poses, [numbered[camera] for camera in cameras], [""] * len(shots))
     write_points(sparse, [])
-    write_test_list(sparse, [file for file, shot in zip(files, shots, strict=True) if shot.split == "test"])
+    write_test_list(sparse, [name for name, shot in zip(below, shots, strict=True) if shot.split == "test"])
     written = "cameras.txt", "images.txt", "points3D.txt", "test.txt"
     return [target / "transforms.json", *(sparse / file for file in written)]
 
 
-def _file_name(shot: Shot) -> str:
+def _file(shot: Shot) -> FileCamera:
+    """Return the image file of a shot; without one, what its name and camera say of it."""
     if shot.file is not None:
-        return shot.file.path.as_posix()
-    return shot.name if Path(shot.name).suffix.lower() in ENDINGS else f"{shot.name}{ENDINGS[0]}"
-
-
-def _pinhole(shot: Shot) -> tuple[float, ...]:
-    """Return width, height, fx, fy, cx, cy in pixels, focal lengths positive."""
-    if shot.file is not None:
-        return shot.file.width, shot.file.height, *(float(x) for x in shot.file.intrinsics)
-    c = shot.camera
-    return c.width, c.height, *(float(x) for x in (-c.fx[0], -c.fy[0], c.cx[0], c.cy[0]))
-
-
-def _coefficients(lens: Lens | None) -> dict[str, Any]:
-    """Return the keys of a frame's lens as nerfstudio names them."""
-    if lens is None:
-        return {"camera_model": "PINHOLE"}
-    found = {f"k{i}": k for i, k in enumerate(lens.radial, 1)}
-    if lens.fisheye:
-        return {"camera_model": "OPENCV_FISHEYE", **found}
-    return {"camera_model": "OPENCV", **found, "p1": lens.tangential[0], "p2": lens.tangential[1]}
+        return shot.file
+    c, ending = shot.camera, "" if Path(shot.name).suffix.lower() in ENDINGS else ENDINGS[0]
+    intrinsics = (-float(c.fx[0]), -float(c.fy[0]), float(c.cx[0]), float(c.cy[0]))
+    return FileCamera(Path(f"{shot.name}{ending}"), c.width, c.height, intrinsics)
 
 
 def _below_images(names: Sequence[str]) -> list[str]:
