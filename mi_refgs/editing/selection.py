@@ -16,7 +16,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, read_mask
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.pipeline import render_depth
-from mi_refgs.render.surroundings import together
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera, splat
 
@@ -72,7 +71,7 @@ def painted(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> np.ndarray
     _require_size("--mask", mask, camera)
     own, background = scene.surfels.detach(), scene.surroundings
     others = None if background is None else background.surfels.detach()
-    table = own if others is None else together(own, others)
+    table = own if others is None else own.followed_by(others)
     with dr.suspend_grad():
         depth, _ = render_depth(own, camera, others)
     weights = [upload(mask.astype(np.float32)), mi.Float(1), depth]

@@ -29,7 +29,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot, remember_last
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
-from mi_refgs.render.surroundings import together
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.splat import Camera, splat
@@ -65,7 +64,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
         trained = replace(trained, surroundings=None)
     around, table = trained.surroundings, trained.surfels.detach()
     if around is not None and around.surfels.count:
-        table = together(table, around.surfels)
+        table = table.followed_by(around.surfels)
     if not table.count:
         raise InputError("surfels: there are none; nothing can be exported")
 

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.splat import Camera, splat, splat_compact
+from mi_refgs.kernels.rows import joined
+from mi_refgs.splat import Composited
 from mi_refgs.splat.lanes import CompactedPixels
-from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Float, Point2f
+from mi_refgs.types import Float
 
 OBJECT = "object"
 """Slot of the object's opacity; where it is blended, slots are divided by it."""
+
+AROUND = "surroundings"
+"""Slot of the radiance of the surroundings."""
+
+Slots = Mapping[str, Any]
+"""Values by name: mi.Float, or an array of several such as mi.Color3f. Every component is a feature, which
+costs time in every surfel-tile pair."""
 
 
 @dataclass(frozen=True)
@@ -29,36 +38,33 @@ class GBuffer:
     pixels: CompactedPixels | None
 
     @staticmethod
-    def blend(
-        surfels: Surfels,
-        slots: Mapping[str, Any],  # (N,) each: mi.Float, or an array of several such as mi.Color3f
-        camera: Camera,
-        screen_offset: Point2f | None,
-        compact: bool,
-        depth: bool,
-    ) -> GBuffer:
-        """Blend values of surfels by name with `splat_compact`, or `splat`, which has the depth anyway.
-
-        Every component is a feature, which costs time in every surfel-tile pair.
-        """
-        features = [part for value in slots.values() for part in parts(value)]
-        if compact:
-            blended = splat_compact(surfels, features, camera, depth=depth)
-        else:
-            blended = splat(surfels, features, camera, screen_offset)
-        rest, maps = list(blended.features), {}
-        for name, value in slots.items():
-            width = len(parts(value))
-            maps[name], rest = type(value)(*rest[:width]), rest[width:]
+    def of(blended: Composited, kinds: Slots) -> GBuffer:
+        """The maps of the `features` of slots."""
+        slots = _grouped(kinds, blended.features)
         inverse = inverse_alpha(blended.alpha)
-        own = inverse_alpha(maps[OBJECT]) if OBJECT in maps else inverse
+        own = inverse_alpha(slots[OBJECT]) if OBJECT in slots else inverse
         mean_depth = None if blended.depth is None else blended.depth * inverse
-        return GBuffer(blended.alpha, mean_depth, maps, own, blended.pixels)
+        return GBuffer(blended.alpha, mean_depth, slots, own, blended.pixels)
 
     def divided(self, name: str) -> Any:
         """A slot divided by alpha or the object's opacity: the mean of what is seen, 0 where nothing is."""
-        value = self.slots[name]
-        return type(value)(*(part * self.inverse for part in parts(value)))
+        return self.slots[name] * self.inverse
+
+
+def features(slots: Slots) -> list[Float]:
+    """The components of all slots."""
+    return [part for value in slots.values() for part in _parts(value)]
+
+
+def joined_slots(first: Slots, second: Slots, rows: tuple[int, int]) -> dict[str, Any]:
+    """Slots of two surfel models of so many surfels, joined under AD; zero where one has none."""
+    kinds = {**second, **first}
+    columns: tuple[list[Any], list[Any]] = ([], [])
+    for name, kind in kinds.items():
+        for values, count, column in zip((first, second), rows, columns, strict=True):
+            found = _parts(values[name]) if name in values else [mi.Float(0)] * len(_parts(kind))
+            column += [x if dr.width(x) == count else x + dr.zeros(mi.Float, count) for x in found]
+    return _grouped(kinds, joined(*columns))
 
 
 def inverse_alpha(alpha: Float) -> Float:
@@ -67,6 +73,12 @@ def inverse_alpha(alpha: Float) -> Float:
     return dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
 
 
-def parts(value: Any) -> list[Float]:
+def _parts(value: Any) -> list[Float]:
     """The components of a value."""
     return [*value] if dr.depth_v(value) > 1 else [value]
+
+
+def _grouped(kinds: Slots, parts: Sequence[Float]) -> dict[str, Any]:
+    """Values of the types of slots from all their components."""
+    rest = iter(parts)
+    return {name: type(kind)(*islice(rest, len(_parts(kind)))) for name, kind in kinds.items()}

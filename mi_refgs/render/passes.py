@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.kernels.memory import PASS_SAMPLES, require_image
+from mi_refgs.kernels.trees import mapped
 from mi_refgs.splat.camera import Camera
 
 Result = TypeVar("Result")
@@ -85,7 +86,7 @@ def in_passes(
             arrays.append(band.kept(value))
             return arrays[-1]
 
-        parts.append(_mapped(kept, draw(band.camera)))
+        parts.append(mapped(kept, draw(band.camera)))
         dr.eval(arrays)  # or the samples of all bands would stay in memory
 
     def stacked(*values: Any) -> Any:
@@ -94,21 +95,4 @@ def in_passes(
         sizes = [band.size[0] * band.size[1] for band in found]
         return dr.concat([x + dr.zeros(type(x), size) for x, size in zip(values, sizes, strict=True)])
 
-    return _mapped(stacked, *parts)
-
-
-def _mapped(function: Callable[..., Any], *trees: Any) -> Any:
-    """Apply a function to corresponding arrays of trees; None and flags stay."""
-    first = trees[0]
-    if first is None or isinstance(first, bool):
-        return first
-    if isinstance(first, dict):
-        return {name: _mapped(function, *(tree[name] for tree in trees)) for name in first}
-    if isinstance(first, list):
-        return [_mapped(function, *parts) for parts in zip(*trees, strict=True)]
-    if is_dataclass(first) and not isinstance(first, type):
-        values = {field.name: [getattr(tree, field.name) for tree in trees] for field in fields(first)}
-        return replace(first, **{name: _mapped(function, *several) for name, several in values.items()})
-    if dr.depth_v(first) > 1:
-        return type(first)(*(_mapped(function, *parts) for parts in zip(*trees, strict=True)))
-    return function(*trees)
+    return mapped(stacked, *parts)

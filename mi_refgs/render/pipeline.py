@@ -21,17 +21,16 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.kernels.timing import boundary
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.antialias import widened
-from mi_refgs.render.gbuffer import OBJECT, GBuffer, inverse_alpha
-from mi_refgs.render.surroundings import AROUND, Surroundings, joined_slots, together
+from mi_refgs.render.gbuffer import AROUND, OBJECT, GBuffer, features, inverse_alpha, joined_slots
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
-from mi_refgs.splat import Camera, splat
-from mi_refgs.splat.lanes import CompactedPixels
+from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives import require_known_primitive
-from mi_refgs.surfels.table import LOGIT_LIMIT, Surfels
+from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, Float, Point2f, Vector3f
 
 
@@ -115,7 +114,10 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     view = _View.of(*_without_empty_tables(scene, request), camera)
     frame, buffer = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
     if request.forward_only:
-        frame = _in_raster_order(frame.only(request.aovs), buffer.pixels)
+        frame = frame.only(request.aovs)
+        if buffer.pixels is not None:  # the background is in raster order
+            raster = buffer.pixels.to_raster(replace(frame, background=None))
+            frame = replace(raster, background=frame.background)
     return boundary(frame, "shade backward")
 
 
@@ -124,38 +126,20 @@ def render_depth(
 ) -> tuple[Float, Float]:
     """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with their surroundings."""
     if surroundings is not None:
-        surfels = together(surfels, surroundings)
+        surfels = surfels.followed_by(surroundings)
     blended = splat(surfels, [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 
 
-def _in_raster_order(frame: Frame, pixels: CompactedPixels | None) -> Frame:
-    if pixels is None:
-        return frame
-    arrays = {name: getattr(frame, name) for name in ("alpha", "depth", "normal", "radiance")}
-    arrays |= {name: getattr(frame, name) for name in ("object_alpha", "normal_alpha")}
-    dr.eval(arrays, frame.terms, frame.maps)
-    raster = pixels.to_raster
-    terms = frame.terms and RadianceTerms(**{name: raster(x) for name, x in frame.terms.known().items()})
-    maps = {name: raster(value) for name, value in frame.maps.items()}
-    return replace(frame, terms=terms, maps=maps, **{name: raster(x) for name, x in arrays.items()})
-
-
 def _without_empty_tables(scene: SurfelScene, request: Request) -> tuple[SurfelScene, Request]:
-    """Put one unseen surfel into tables without any, since Dr.Jit refuses empty arrays."""
-
-    def unseen(surfels: Surfels) -> Surfels:
-        values = {name: -LOGIT_LIMIT if name == "opacity" else 0 for name in surfels.raw}
-        shapes = {name: (1, int(tensor.shape[1])) for name, tensor in surfels.raw.items()}
-        return Surfels({name: dr.full(mi.TensorXf, values[name], shapes[name]) for name in values})
-
-    surroundings = scene.surroundings
-    if scene.surfels.count == 0:
-        scene, request = replace(scene, surfels=unseen(scene.surfels)), replace(request, screen_offset=None)
-    if surroundings is not None and surroundings.surfels.count == 0:
-        surroundings = replace(surroundings, surfels=unseen(surroundings.surfels))
-        scene, request = replace(scene, surroundings=surroundings), replace(request, screen_offset=None)
-    return scene, request
+    """The scene with `Surfels.never_empty`; an offset on the screen is then nobody's."""
+    surfels, surroundings = scene.surfels, scene.surroundings
+    if surfels.count and (surroundings is None or surroundings.surfels.count):
+        return scene, request
+    if surroundings is not None:
+        surroundings = replace(surroundings, surfels=surroundings.surfels.never_empty())
+    scene = replace(scene, surfels=surfels.never_empty(), surroundings=surroundings)
+    return scene, replace(request, screen_offset=None)
 
 
 # ---------------- the two orders ----------------
@@ -169,6 +153,7 @@ class _View:
     request: Request
     camera: Camera
     points: ShadingPoints  # the object's surfels, with the model's attributes
+    presence: dict[str, Any]  # the slot of the object's opacity, where alpha is not that
     others: dict[str, Any]  # radiance and normals of the surroundings' surfels; empty without any
     geometry: Surfels  # of the object, then of the surroundings
     background: Color3f  # pixel by pixel; None without surroundings
@@ -179,38 +164,33 @@ class _View:
         seen = _seen(surfels, camera, request.sh_degree)
         attributes = {**scene.shading.model.values(surfels, seen, scene.shading)}
         normal = attributes.pop("normal", seen.normal)  # the model's own, or the surfels'
-        others: dict[str, Any] = {}
-        geometry, background = surfels, None
+        presence, others, geometry, background = {}, {}, surfels, None
         if surroundings is not None:
             beside = _seen(surroundings.surfels, camera, request.sh_degree)
             radiance = beside.harmonic_colour(surroundings.surfels.value("radiance_sh"))
+            presence = {OBJECT: dr.full(mi.Float, 1, surfels.count)}
             others = {"radiance": radiance, "normal": beside.normal}
-            geometry, background = together(surfels, surroundings.surfels), surroundings.behind(camera)
+            geometry, background = surfels.followed_by(surroundings.surfels), surroundings.behind(camera)
         points = ShadingPoints(normal, -seen.direction, attributes)
-        return _View(scene, request, camera, points, others, geometry, background)
+        return _View(scene, request, camera, points, presence, others, geometry, background)
 
     @property
     def asked(self) -> frozenset[str]:
         """Names of the requested AOVs."""
         return frozenset(self.request.aovs)
 
-    def materials(self) -> dict[str, Any]:
-        """Requested attributes of the surfels, activated, by name."""
-        surfels = self.scene.surfels
-        return {name: surfels.value(name) for name in surfels.raw if name in self.asked}
-
-    def presence(self) -> dict[str, Any]:
-        """The slot of the object's opacity, where alpha is not that."""
-        return {OBJECT: dr.full(mi.Float, 1, self.scene.surfels.count)} if self.others else {}
-
     def blend(self, slots: dict[str, Any], others: dict[str, Any]) -> GBuffer:
         """Blend slots of the object's surfels together with those of the surroundings, in one sort."""
         if self.others:
             own = self.scene.surfels.count
             slots = joined_slots(slots, others, (own, self.geometry.count - own))
+        values = features(slots)
         # Antialiasing reads neighbours in the image.
-        compact, depth = self.request.forward_only and not self.scene.shading.antialias, "depth" in self.asked
-        return GBuffer.blend(self.geometry, slots, self.camera, self.request.screen_offset, compact, depth)
+        if self.request.forward_only and not self.scene.shading.antialias:
+            blended = splat_compact(self.geometry, values, self.camera, depth="depth" in self.asked)
+        else:
+            blended = splat(self.geometry, values, self.camera, self.request.screen_offset)
+        return GBuffer.of(blended, slots)
 
 
 def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView:
@@ -242,10 +222,10 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
     # Slots: the radiance and the requested AOVs only, since each costs time in every surfel-tile pair.
     asked_terms = {name: term for name, term in terms.known().items() if name in asked}
     slots = {"radiance": terms.total()} | ({"normal": points.normal} if "normal" in asked else {})
-    materials = view.materials()
+    materials = scene.surfels.values(asked)
     slots |= asked_terms | materials
     if asked - {"normal"}:  # terms and maps are those of the object: they need its opacity
-        slots |= view.presence()
+        slots |= view.presence
     buffer = view.blend(slots, {name: value for name, value in view.others.items() if name in slots})
 
     # Frame.
@@ -270,9 +250,9 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
     scene, camera, shading = view.scene, view.camera, view.scene.shading
     # G-buffer: the model's attributes and the requested ones.
     slots = {"normal": view.points.normal} | view.points.attributes
-    slots |= {name: value for name, value in view.materials().items() if name not in slots}
+    slots |= {name: value for name, value in scene.surfels.values(view.asked).items() if name not in slots}
     others = {AROUND: view.others["radiance"]} if view.others else {}
-    buffer = view.blend(slots | view.presence(), others)
+    buffer = view.blend(slots | view.presence, others)
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
     normal, alpha = buffer.slots["normal"], buffer.slots.get(OBJECT, buffer.alpha)
 

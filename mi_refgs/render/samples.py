@@ -12,9 +12,9 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.trees import mapped
 from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.shade.points import RadianceTerms
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Color3f, Float
 
@@ -49,11 +49,7 @@ def supersampled(
         fine = replace(fine, terms=None, maps={})
 
     def mean(value: Any) -> Any:
-        if value is None:
-            return None
-        if dr.depth_v(value) > 1:
-            return type(value)(*(box_mean(part, camera, factor) for part in value))
-        return box_mean(value, camera, factor)
+        return mapped(lambda plane: box_mean(plane, camera, factor), value)
 
     # Two of the three opacities, or all, may be one array.
     alphas: dict[int, Any] = {}
@@ -66,18 +62,16 @@ def supersampled(
     def by_alpha(value: Float) -> Float:
         return mean(value * fine.alpha) * inverse
 
-    distance = terms = None
+    distance = None
     if details and fine.depth is not None:
         distance = by_alpha(ray_distance(fine.depth, fine_camera))
-    if fine.terms is not None:
-        terms = RadianceTerms(**{name: mean(term) for name, term in fine.terms.known().items()})
     return replace(
         fine,
         alpha=alpha,
         depth=None if fine.depth is None else by_alpha(fine.depth),
         normal=mean(fine.normal),
         radiance=mean(fine.radiance),
-        terms=terms,
+        terms=mean(fine.terms),
         maps={
             name: mean(value * fine.object_alpha) * inverse_alpha(object_alpha)
             for name, value in fine.maps.items()

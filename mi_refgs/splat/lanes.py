@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PATCH_EDGE, TRANSMITTANCE_MIN
+from mi_refgs.kernels.trees import mapped
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
 from mi_refgs.types import Bool, Float, Point2f, UInt32
@@ -180,11 +181,14 @@ class CompactedPixels:
         dr.eval(maps)
         return maps
 
-    def to_raster(self, value: Any) -> Any:
-        """Evaluated values (P,) as ones (H·W,), 0 where there is nothing; None and constants stay."""
-        if value is None or dr.width(value) == 1:
-            return value
-        return dr.gather(type(value), value, self.index, self.there)
+    def to_raster(self, values: Any) -> Any:
+        """Arrays (P,), and what contains them, as ones (H·W,), 0 where there is nothing; constants stay."""
+        dr.eval(values)
+
+        def raster(value: Any) -> Any:
+            return value if dr.width(value) == 1 else dr.gather(type(value), value, self.index, self.there)
+
+        return mapped(raster, values)
 
 
 def any_of(flags: list[Bool]) -> Bool:

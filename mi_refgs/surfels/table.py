@@ -12,7 +12,7 @@ Named rules for degenerate values (each keeps values and gradients finite for ev
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import drjit as dr
@@ -22,7 +22,7 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
-from mi_refgs.kernels.rows import columns_of
+from mi_refgs.kernels.rows import columns_of, joined
 from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
 from mi_refgs.surfels.primitives import Primitive, primitive_of, require_known_primitive
 from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, Vector3f
@@ -178,6 +178,10 @@ class Surfels:
             return mi.Color3f(*columns)
         return columns[0] if len(columns) == 1 else columns
 
+    def values(self, names: Collection[str]) -> dict[str, Any]:
+        """Activated values of the attributes among `names`, by name; those that are absent are left out."""
+        return {name: self.value(name) for name in self.raw if name in names}
+
     def position(self) -> Point3f:
         """World positions, scene units."""
         return mi.Point3f(*self.columns("position"))
@@ -236,12 +240,37 @@ class Surfels:
     # ---------------- copies ----------------
 
     def gather(self, parent: Any) -> Surfels:
-        """Copies, detached and not `screened`: surfel i of the result is surfel parent[i] (mi.UInt32)."""
-        return Surfels({name: gather_rows(tensor, parent) for name, tensor in self.raw.items()})
+        """Copies, detached: surfel i of the result is surfel parent[i] (mi.UInt32)."""
+        raw = {name: gather_rows(tensor, parent) for name, tensor in self.raw.items()}
+        return Surfels(raw, self.screened)
 
     def detach(self) -> Surfels:
-        """The same values, detached from the AD graph and not `screened`."""
-        return Surfels({name: dr.detach(tensor) for name, tensor in self.raw.items()})
+        """The same values, detached from the AD graph."""
+        return Surfels({name: dr.detach(tensor) for name, tensor in self.raw.items()}, self.screened)
+
+    def followed_by(self, other: Surfels) -> Surfels:
+        """Geometry of these surfels, then of `other`'s, under AD, both of one primitive.
+
+        Surfels of a `screened` table that are not `usable` are transparent.
+        """
+
+        def values(surfels: Surfels, name: str) -> Float:
+            found = surfels.raw[name].array
+            hides = surfels.screened and name == "opacity"
+            return dr.select(surfels.usable(), found, -LOGIT_LIMIT) if hides else found
+
+        shapes = {name: (self.count + other.count, width) for name, width in self.primitive.widths.items()}
+        arrays = joined(*([values(surfels, name) for name in shapes] for surfels in (self, other)))
+        tensors = (mi.TensorXf(*pair) for pair in zip(arrays, shapes.values(), strict=True))
+        return Surfels(dict(zip(shapes, tensors, strict=True)))
+
+    def never_empty(self) -> Surfels:
+        """These surfels, or one that covers no pixel where there are none: Dr.Jit refuses empty arrays."""
+        if self.count:
+            return self
+        values = {name: -LOGIT_LIMIT if name == "opacity" else 0 for name in self.raw}
+        shapes = {name: (1, int(tensor.shape[1])) for name, tensor in self.raw.items()}
+        return Surfels({name: dr.full(mi.TensorXf, values[name], shapes[name]) for name in values})
 
     def enable_grad(self) -> None:
         """Make every raw tensor a leaf of the AD graph."""
