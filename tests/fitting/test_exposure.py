@@ -29,7 +29,7 @@ from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
 from tests.fitting.image_checks import BACKGROUND, HEIGHT, STEP, WIDTH, planes, shown, view_of
 from tests.helpers import with_pixels
-from tests.scenes.highlight import SIZE, ball, run_folder, small_method
+from tests.scenes.highlight import SIZE, ball, require_same_state, run_folder, small_method, step_to
 
 GAINS = np.array([1.4, 0.7, 0.9])
 DECIDED = 8
@@ -143,13 +143,6 @@ def method(tmp_path: Path) -> Method:
     )
 
 
-def fit(method: Method, data: Dataset) -> Trainer:
-    trainer = Trainer(method, data)
-    while trainer.iteration < method.iterations:
-        trainer.step()
-    return trainer
-
-
 def decide(trainer: Trainer, iteration: int) -> None:
     """Decide about gains as a step does that ends with this iteration."""
     trainer.fit.iteration = iteration
@@ -211,7 +204,8 @@ def test_gains_that_fit_half_of_the_pixels_are_rejected(
 
 def test_rejected_gains_leave_fit_unchanged(method: Method, one_thread: None) -> None:
     method = dataclasses.replace(method, iterations=DECIDED + 4)
-    trainer, without = fit(method, ball()), fit(dataclasses.replace(method, exposure=None), ball())
+    both = method, dataclasses.replace(method, exposure=None)
+    trainer, without = (step_to(Trainer(chosen, ball()), method.iterations) for chosen in both)
     assert trainer.fit.exposure is not None and not trainer.fit.exposure["gains"]
     assert without.fit.exposure is None
     found, expected = trainer.state(), without.state()
@@ -235,21 +229,12 @@ def test_fit_with_gains_resumes_bit_for_bit(
     data = exposed(ball(), rng.uniform(-0.5, 0.3, (6, 3)))
     views = tuple(dataclasses.replace(view, exposure=0.1 * i) for i, view in enumerate(data.views))
     data = dataclasses.replace(data, views=views)
-    straight = fit(method, data)
-    first = Trainer(method, data, run_folder(tmp_path / "run", method))
+    straight = step_to(Trainer(method, data), method.iterations)
+    step_to(Trainer(method, data, run_folder(tmp_path / "run", method)), stop).save()
     said: list[str] = []
-    while first.iteration < stop:
-        first.step()
-    first.save()
-    second = Trainer(method, data, Run(tmp_path / "run"))
-    second.tell = said.append
-    while second.iteration < method.iterations:
-        second.step()
-    assert len(said) == (stop < DECIDED)
-    expected, found = straight.state(), second.state()
-    assert expected.keys() == found.keys() and f"params/{GAIN}" in found
-    for name in expected.keys() - {"seconds"}:
-        assert np.array_equal(expected[name], found[name]), name
+    second = Trainer(method, data, Run(tmp_path / "run"), tell=said.append)
+    step_to(second, method.iterations)
+    assert len(said) == (stop < DECIDED) and f"params/{GAIN}" in require_same_state(straight, second)
     fewer = dataclasses.replace(data, views=data.views[1:])
     with pytest.raises(InputError, match="5 training views, but the checkpoint has gains of 6"):
         Trainer(method, fewer, Run(tmp_path / "run"))
@@ -258,13 +243,9 @@ def test_fit_with_gains_resumes_bit_for_bit(
 def test_warm_step_with_gains_compiles_nothing(method: Method) -> None:
     """Another view has other gains, and no other kernel; a view's gain moves with its own gradient."""
     trainer = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains="on", after=2)), ball())
-    while trainer.iteration < 16:
-        trainer.step()
-    dr.sync_thread()
+    step_to(trainer, 16)
     misses = dr.detail.launch_stats()[2]
-    for _ in range(4):
-        trainer.step()
-    dr.sync_thread()
+    step_to(trainer, 20)
     assert dr.detail.launch_stats()[2] == misses
     for _ in range(2):
         trainer.fit.optimiser.reset(GAIN)

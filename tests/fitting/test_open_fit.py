@@ -26,6 +26,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.table import Surfels
+from tests.scenes.highlight import require_same_state, step_to
 from tests.scenes.tiny import METHOD, REGION, write_data, write_open_data
 
 STEPS = 12
@@ -143,18 +144,11 @@ def test_surfels_beyond_border_change_tables(method: Method) -> None:
 
 def test_resume_repeats_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:
     """Both tables, the background and their history, across edits of the tables."""
-    straight = Trainer(method, data)
-    for _ in range(5):
-        straight.step()
+    straight = step_to(Trainer(method, data), 5)
     resumed = Trainer(method, data, state=straight.state())
-    for trainer in (straight, resumed):
-        while trainer.iteration < STEPS:
-            trainer.step()
-    one, other = straight.state(), resumed.state()
-    assert one.keys() == other.keys() and "optimiser/surroundings/scale/first" in one
-    for name in one.keys() - {"seconds"}:
-        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
-    assert len(one["params/surroundings/position"]) != 60  # it was edited
+    found = require_same_state(step_to(straight, STEPS), step_to(resumed, STEPS))
+    assert "optimiser/surroundings/scale/first" in found
+    assert len(found["params/surroundings/position"]) != 60  # it was edited
 
 
 def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method, tmp_path: Path) -> None:
@@ -197,9 +191,7 @@ def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> N
     raw = trainer.fit.tables[1].surfels.to_numpy()
     raw["opacity"][[3, 5]] = np.nan
     trainer.fit.tables[1].replace(Surfels.from_numpy(raw))
-    for _ in range(2):
-        trainer.step()
-    trainer.check()
+    step_to(trainer, 2).check()
     assert trainer.fit.tables[1].surfels.count == 58 and trainer.surfels.count == 80
     assert "surroundings/opacity" in said[0]
 

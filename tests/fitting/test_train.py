@@ -23,7 +23,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
 from mi_refgs.runs.run import Run
-from tests.scenes.highlight import SIZE, ball, run_folder, small_method
+from tests.scenes.highlight import SIZE, ball, require_same_state, run_folder, small_method, step_to
 
 
 @pytest.fixture
@@ -79,15 +79,9 @@ def test_resume_repeats_straight_run_bit_for_bit(
     with pytest.raises(KeyboardInterrupt):
         first.train(stop)
     second = Trainer(method, data, Run(tmp_path / "resumed"))
-    left, found = first.state(), second.state()
-    assert second.iteration == 16 and left.keys() == found.keys() and kept <= found.keys()
-    assert all(np.array_equal(left[name], found[name]) for name in left)
+    assert second.iteration == 16 and kept <= require_same_state(first, second).keys()
     second.train()
-    expected, got = straight.state(), second.state()
-    assert expected.keys() == got.keys()
-    for name in expected.keys() - {"seconds"}:
-        assert np.array_equal(expected[name], got[name]), name
-    assert "mesh/faces" in expected
+    assert "mesh/faces" in require_same_state(straight, second)
 
 
 def test_stage_has_its_own_rates(method: Method) -> None:
@@ -102,8 +96,7 @@ def test_stage_has_its_own_rates(method: Method) -> None:
     assert first["slow"]["metallic"] == 0 < first["own"]["metallic"]
     assert first["slow"]["light"] == pytest.approx(0.1 * first["own"]["light"], rel=1e-3)
     assert first["slow"]["albedo"] == pytest.approx(first["own"]["albedo"], rel=1e-3)
-    while trainer.iteration < 8:
-        trainer.step()
+    step_to(trainer, 8)
     before_deferred = trainer.fit.params["metallic"].numpy().copy()
     trainer.step()
     assert np.abs(trainer.fit.params["metallic"].numpy() - before_deferred).max() > 0
@@ -142,24 +135,6 @@ def test_screen_gradient_is_in_normalised_device_coordinates(
     expected = 0.5 * (SIZE // 3) * factor * np.linalg.norm(np.array(dr.grad(offsets[0])), axis=0)
     assert expected.max() > 0
     np.testing.assert_allclose(trainer.fit.tables[0].gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
-
-
-def test_kill_loses_at_most_one_checkpoint_interval(method: Method, tmp_path: Path) -> None:
-    """A killed process leaves its last periodic checkpoint, and a torn file is passed over."""
-    run = run_folder(tmp_path / "run", method)
-    trainer = Trainer(method, ball(), run)
-
-    class Killed(BaseException):
-        pass
-
-    def kill(state: Trainer) -> None:
-        if state.iteration == 13:
-            raise Killed
-
-    with pytest.raises(Killed):
-        trainer.train(kill)
-    (run.path / "checkpoints" / "0000013.npz").write_bytes(b"PK torn")
-    assert Trainer(method, ball(), run).iteration == 10
 
 
 def send_in_iteration_7(monkeypatch: pytest.MonkeyPatch, *numbers: signal.Signals) -> list[int]:
@@ -282,49 +257,25 @@ def test_folder_that_cannot_be_written_is_refused_before_first_step(
     assert not (run.path / "metrics.jsonl").exists()
 
 
-def test_run_is_not_overwritten(method: Method, tmp_path: Path) -> None:
-    run_folder(tmp_path / "run", method)
-    with pytest.raises(InputError, match="--resume"):
-        run_folder(tmp_path / "run", method)
-
-
 @pytest.mark.parametrize(
     "options, most", [({}, 80), ({"traced_bounces": 1, "samples": 4, "antialias": True}, 100)]
 )
 def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: Method) -> None:
     trainer = Trainer(dataclasses.replace(with_deferred(method, options), refine=methods.Refine()), ball())
-    while trainer.iteration < 22:  # into the deferred stage, with a mesh
-        trainer.step()
-    dr.sync_thread()
+    step_to(trainer, 22)  # into the deferred stage, with a mesh
     launches, _, misses = dr.detail.launch_stats()
-    for _ in range(3):
-        trainer.step()
-    dr.sync_thread()
+    step_to(trainer, 25)
     after, _, misses_after = dr.detail.launch_stats()
     assert misses_after == misses
     assert (after - launches) / 3 < most
 
 
-def test_images_begin_coarse(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 3² pixels, then of 2², then whole images: each is rendered in its own size."""
-    trainer, widths, steps, real = Trainer(method, ball()), [], [], train.render
-
-    def rendered(scene: Any, camera: Any, request: Any) -> Any:
-        widths.append(camera.width)
-        return real(scene, camera, request)
-
-    monkeypatch.setattr(train, "render", rendered)
-    for _ in range(13):
-        trainer.step()
-        steps.append(float(trainer.loss[0]))
-    assert widths == [SIZE // 3] * 6 + [SIZE // 2] * 6 + [SIZE]
-    assert np.all(np.isfinite(steps))
-
-
 def test_another_size_compiles_once(method: Method) -> None:
-    """Sizes in turn: the second step of each compiles nothing."""
+    """Images begin in blocks of 3², then of 2² pixels; the second step of each size compiles nothing."""
     method = dataclasses.replace(method, refine=methods.Refine(), mesh=None)
     trainer, misses = Trainer(method, ball()), []
+    widths = [trainer.targets.at(iteration, 0).camera.width for iteration in range(1, 14)]
+    assert widths == [SIZE // 3] * 6 + [SIZE // 2] * 6 + [SIZE]
     for iteration in (5, 5, 11, 11, 5, 5, 11, 11):
         trainer.fit.iteration = iteration
         before = dr.detail.launch_stats()[2]

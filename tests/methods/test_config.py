@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import typing
 from collections import Counter
 from collections.abc import Callable
@@ -21,9 +20,10 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.build import scaled
+from mi_refgs.methods.method import LOSS_WEIGHTS
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import refused
+from tests.helpers import ROOT, refused
 from tests.scenes.highlight import ball
 
 
@@ -319,30 +319,12 @@ def test_bad_settings_of_relighting_are_named(assignment: str, words: str) -> No
         methods.load("relighting", "quick", [assignment])
 
 
-OLD_LOSSES = """[loss]
-ssim = 0.2
-normal = 0.2
-normal_start = 0
-normal_rise = 2000
-smooth = 0.0
-smooth_until = 6000
-alpha = 0.2
-half_metal = 0.0
-half_metal_start = 0
-half_metal_rise = 0
-materials = 0.0
-light_colour = 0.0
-[loss.registered]
-"""
-
-
 def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
     """Each key of `read.RENAMED`: in the config.toml of a run, in `drop`, in assignments and in own files."""
     now = methods.load("auto", "quick", ["select.component.degree_1.trial=9"], ["levels_3"])
     old = methods.dump(now).replace("[select.component", "[select.term")
     old = old.replace("components =", "terms =").replace('\nname = "auto"', '\nvariant = "auto"', 1)
     old = old.replace("attributes =", "channels =").replace("[rates.attribute]", "[rates.channel]")
-    old = re.sub(r"\[loss\..*?(?=\[rates\])", OLD_LOSSES, old, flags=re.DOTALL)
     keys = "[select.term.degree_1]", "terms = [", 'variant = "auto"', "[rates.channel]", "\nchannels ="
     assert all(key in old for key in keys)
     (tmp_path / "config.toml").write_text(old)
@@ -356,6 +338,8 @@ def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
         'extends = "ref_gaussian"\ndrop = ["rates.channel.scale"]\n[surfels]\nfrom_pictures = ["albedo"]\n'
         "[loss]\nnormal_rise = 600\n[loss.registered.rough]\nweight = 0.5\n"
     )
+    stored = methods.load_resolved(ROOT / "tests/runs/run_of_0_1/object/config.toml")
+    assert stored.loss == LOSS_WEIGHTS
     own = methods.load(str(tmp_path / "own.toml"), "quick", ["loss.registered.rough.until=9"])
     assert own.surfels.from_images == ("albedo",) and "scale" not in own.rates.attribute
     assert own.loss["normal"] == methods.LossWeight(0.2, rise=200)

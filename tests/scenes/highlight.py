@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 
 from benchmarks.common.fits import ball_data
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import Run
@@ -75,3 +77,20 @@ def run_folder(path: Path, method: Method) -> Run:
     run = Run(path)
     run.create(method, "ball")
     return run
+
+
+def step_to(trainer: Trainer, iteration: int) -> Trainer:
+    """Take steps up to an iteration, and wait for the device."""
+    while trainer.iteration < iteration:
+        trainer.step()
+    dr.sync_thread()
+    return trainer
+
+
+def require_same_state(expected: Trainer, found: Trainer) -> dict[str, np.ndarray]:
+    """Require that two fits have checkpoints of equal bits, but for the seconds; return the second one's."""
+    one, other = expected.state(), found.state()
+    assert one.keys() == other.keys()
+    for name in one.keys() - {"seconds"}:
+        np.testing.assert_array_equal(other[name], one[name], err_msg=name)
+    return other
