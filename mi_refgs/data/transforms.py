@@ -36,11 +36,9 @@ from mi_refgs.io.ply import read_vertices
 
 SUFFIXES = (*ENDINGS, ".exr")
 """Endings that `file_path` may have or omit, in the order in which they are tried."""
-CAMERA_MODELS = {
-    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False),
-    **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), True),
-}
-"""Values of `camera_model`, as COLMAP and nerfstudio name them, and whether each is a fisheye."""
+CAMERA_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
+CAMERA_MODELS |= {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+"""Values of `camera_model`, as COLMAP and nerfstudio name them."""
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of unsupported lenses, refused unless they are 0 or false."""
 MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}
@@ -140,7 +138,7 @@ class Frame:
                 f"{self.field(odd[0] if odd else 'camera_model')}: this lens is not supported; "
                 "undistort the images, or give OpenCV's perspective or fisheye coefficients"
             )
-        fisheye = fisheye or CAMERA_MODELS[model]
+        fisheye = fisheye or model.endswith("FISHEYE")
         given = {key: self.number(key) or 0.0 for key in COEFFICIENTS}
         if (given["p1"] or given["p2"]) if fisheye else given["k4"]:
             field, kind = ("p1, p2", "fisheye") if fisheye else ("k4", "perspective")

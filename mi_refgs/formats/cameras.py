@@ -47,9 +47,8 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
         if file.mask is not None and file.mask.below is None:
             frame["mask_path"] = file.mask.path.as_posix()
         frame["camera_model"] = "PINHOLE" if lens is None else lens.model
-        frame |= (lens.coefficients if lens else {}) | {
-            "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist()
-        }
+        frame |= lens.coefficients if lens else {}
+        frame["transform_matrix"] = (pose @ MITSUBA_FROM_OPENGL).tolist()
         frames.append(frame)
     content: dict[str, Any] = {"camera_model": frames[0]["camera_model"]}
     for split in ("train", "test"):

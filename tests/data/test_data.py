@@ -17,6 +17,7 @@ from mi_refgs.data.view import evenly_spread
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, read_png, write_png
 from tests.helpers import read_loaded, refused
+from tests.scenes.layouts import change_transforms
 
 ANGLE = 0.7  # camera_angle_x, radians
 WIDTH, HEIGHT = 6, 4
@@ -108,9 +109,8 @@ def test_fitting_downscale_meets_pixel_budget(folder: Path) -> None:
     """Photographs of 1080 × 1920 and their like, read no larger than asked for."""
     Image.new("RGB", (1080, 1920)).save(folder / "large.jpg")
     write_exr(folder / "large.exr", np.zeros((30, 21, 3)))
-    content = read(folder)
-    content["frames"] = [content["frames"][0] | {"file_path": "large.jpg"}]
-    write(folder, "train", content)
+    frame = {"file_path": "large.jpg", "transform_matrix": pose(0).tolist()}
+    change_transforms(folder, lambda content: content.update(frames=[frame]), "train")
     for pixels, factor in ((65536, 6), (1080 * 1920, 1), (1080 * 1920 - 1, 2), (1, 961)):
         assert fitting_downscale(folder, "png", pixels) == (factor, 1080, 1920)
     assert fitting_downscale(folder, "exr", 70) == (3, 21, 30)
@@ -177,12 +177,10 @@ def test_holdout_without_a_test_file(folder: Path) -> None:
 
 
 def test_relative_names_inside_the_folder_are_accepted(folder: Path) -> None:
-    content = read(folder)
-    content["frames"][0]["file_path"] = "./test/../train/r_1.png"
-    write(folder, "train", content)
     (folder / "links").symlink_to(folder / "train")  # followed: the user made it
-    content["frames"][1]["file_path"] = "links/r_1.png"
-    write(folder, "train", content)
+    names = ["./test/../train/r_1.png", "links/r_1.png"]
+    frames = [{"file_path": name, "transform_matrix": pose(0).tolist()} for name in names]
+    edit(lambda content: content.update(frames=frames))(folder)
     views = read_loaded(folder, "train").views
     np.testing.assert_array_equal(views[0].image, views[1].image)
 
@@ -206,9 +204,7 @@ def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:
     write_exr(folder / "n.exr", normal, names="XYZ")
     write_exr(folder / "d.exr", depth)
     write_exr(folder / "environment.exr", np.ones((2, 4, 3)))
-    content = read(folder)
-    content["frames"][0] |= {"normal_path": "n.exr", "depth_path": "d.exr"}
-    write(folder, "train", content)
+    edit(lambda content: content["frames"][0].update(normal_path="n.exr", depth_path="d.exr"))(folder)
     data = read_loaded(folder, "train", downscale=2)
     assert data.environment == folder / "environment.exr"
     view = data.views[0]
@@ -221,13 +217,7 @@ def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:
 
 def edit(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
     """Damage to the training file's content."""
-
-    def damage(folder: Path) -> None:
-        content = read(folder)
-        change(content)
-        write(folder, "train", content)
-
-    return damage
+    return lambda folder: change_transforms(folder, change, "train")
 
 
 def named(key: str, value: Any) -> Callable[[Path], None]:

@@ -16,6 +16,7 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.formats import FORMATS, Format, Option, write
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
+from mi_refgs.io.ownership import RECORD
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.run import Run
@@ -63,7 +64,11 @@ def test_registered_format_is_a_choice_of_the_command(
 
 
 def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: Path, tmp_path: Path) -> None:
-    assert main(["export", str(finished), "--to", "plain,cameras", "-o", str(tmp_path / "out")]) == 0
+    """Their names are separated by commas and blanks."""
+    names = "plain,cameras, exr, 3dgs-ply, gltf-splats,"
+    assert main(["export", str(finished), "--to", names, "-o", str(tmp_path / "out")]) == 0
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert files == {RECORD, "plain.txt", "cameras", "exr.exr", "3dgs-ply.ply", "gltf-splats.glb"}
     assert (tmp_path / "out" / "plain.txt").read_text() == "3"
     assert (tmp_path / "out" / "cameras" / "transforms.json").is_file()
 
@@ -79,6 +84,13 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
             "--level: no option of cameras; leave it out, or choose a format that has it (plain)",
         ),
         (["--to", "plain", "-o", "OUT.ply"], "suffix: plain writes .txt"),
+        (
+            ["--to", "exr", "-o", "OUT.exr", "--view", "9"],
+            "--view: 9 is out of range; there are 5, give 0 to 4",
+        ),
+        (["--to", "usd", "-o", "OUT.usdz", "--faces=3"], "--faces: 3 is out of range"),
+        (["--to", "usd", "-o", "OUT.usdz", "--texture=7"], "--texture: 7 is out of range"),
+        (["--to", "usd", "-o", "OUT.usdz", "--texture=100000"], "--texture: 100000 is out of range"),
     ],
 )
 def test_bad_export_arguments_are_refused(

@@ -13,13 +13,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.cli import main
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot, write
 from mi_refgs.formats.gaussians import THIN, gaussians
 from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.exr import read_exr
-from mi_refgs.io.ownership import RECORD
 from mi_refgs.render.display import display_image
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
@@ -262,15 +260,3 @@ def test_exr_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: P
     np.testing.assert_allclose(np.linalg.norm(normal[solid], axis=-1), 1, atol=1e-5)
     np.testing.assert_allclose(layers["roughness.V"][solid], 0.6, atol=1e-3)
     assert {"metallic.V", "visibility.V"} <= {*layers} and solid.mean() > 0.2
-
-
-def test_exr_view_out_of_range_is_refused(finished: Path, tmp_path: Path) -> None:
-    command = ["export", finished, "--to", "exr", "-o", tmp_path / "a.exr", "--view", "9"]
-    refused(command, "--view: 9 is out of range; there are 5, give 0 to 4")
-
-
-def test_formats_are_separated_by_commas_and_blanks(finished: Path, tmp_path: Path) -> None:
-    command = ["export", str(finished), "--to", "exr, 3dgs-ply, gltf-splats,", "-o", str(tmp_path / "all")]
-    assert main(command) == 0
-    names = {path.name for path in (tmp_path / "all").iterdir()}
-    assert names == {RECORD, "exr.exr", "3dgs-ply.ply", "gltf-splats.glb"}
