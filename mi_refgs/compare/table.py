@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -83,58 +84,50 @@ def table_of(folder: Path) -> Table:
     Raises InputError for runs on one data set that were measured on images of different sizes.
     """
     about = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
-    data, variants = about.get("data", []), about.get("variants", [])
 
-    def order(job: Job) -> tuple[int, int, int]:
+    def order(job: Job) -> tuple[Any, ...]:
         """Data sets and methods in the order in which they were given; others last."""
-        place = data.index(job.data) if job.data in data else len(data)
-        return place, variants.index(job.name) if job.name in variants else len(variants), job.seed
+        key: list[Any] = []
+        for name, value in (("data", job.data), ("variants", job.name)):
+            given = about.get(name, [])
+            key += [given.index(value) if value in given else len(given), value]
+        return *key, job.seed
 
     table = Table(about=about)
-    scenes: dict[str, Scene] = {}
-    rows: dict[tuple[str, str], Row] = {}
-    metrics: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    sizes: dict[str, dict[str, list[int]]] = {}
-    for job in sorted(jobs_in(folder), key=order):
-        # Find or add the row.
-        key = job.data, job.name
-        scene = scenes.setdefault(job.data, Scene(Path(job.data).name, job.data))
-        if key not in rows:
-            rows[key], metrics[key] = Row(key[1], key[1]), []
-            scene.rows.append(rows[key])
-        row = rows[key]
+    for data, jobs_of_scene in groupby(sorted(jobs_in(folder), key=order), lambda job: job.data):
+        scene, sizes = Scene(Path(data).name, data), dict[str, list[int]]()
+        for name, jobs_of_row in groupby(jobs_of_scene, lambda job: job.name):
+            row, metrics = Row(name, name), list[dict[str, Any]]()
+            for job in jobs_of_row:
+                # Sort the job into finished, failed and unfinished.
+                try:
+                    if job.run.exists():
+                        _describe(row, job, table)
+                    done = finished(job)
+                except InputError as error:  # a config.toml of another version
+                    row.failed[job.seed] = str(error)
+                    continue
+                if not done:
+                    if (failure := job.run.path / FAILED).is_file():
+                        row.failed[job.seed] = str(read_json(failure).get("reason"))
+                    else:
+                        row.unfinished.append(job.seed)
+                    continue
 
-        # Sort the job into finished, failed and unfinished.
-        try:
-            if job.run.exists():
-                _describe(row, job, table)
-            done = finished(job)
-        except InputError as error:  # a config.toml of another version
-            row.failed[job.seed] = str(error)
-            continue
-        if not done:
-            if (failure := job.run.path / FAILED).is_file():
-                row.failed[job.seed] = str(read_json(failure).get("reason"))
-            else:
-                row.unfinished.append(job.seed)
-            continue
-
-        # Collect its metrics.
-        found = read_metrics(job.run)
-        assert found is not None
-        metrics[key].append(found)
-        row.seeds.append(job.seed)
-        row.runs.append(str(job.run.path.relative_to(folder.resolve())))
-        scene.image_size, scene.test_views = found["image_size"], found["test_views"]
-        scene.downscale = found.get("downscale")
-        sizes.setdefault(job.data, {})[row.runs[-1]] = scene.image_size
-        if found["machine"] not in table.machines:
-            table.machines.append(found["machine"])
-    for found in sizes.values():
-        require_one_size(str(folder), found, "remove the runs of one size, and fit them again in the other")
-    for key, row in rows.items():
-        _fill(row, metrics[key])
-    table.scenes = list(scenes.values())
+                # Collect its metrics.
+                found = read_metrics(job.run)
+                assert found is not None
+                metrics.append(found)
+                row.seeds.append(job.seed)
+                row.runs.append(str(job.run.path.relative_to(folder.resolve())))
+                sizes[row.runs[-1]] = scene.image_size = found["image_size"]
+                scene.test_views, scene.downscale = found["test_views"], found.get("downscale")
+                if found["machine"] not in table.machines:
+                    table.machines.append(found["machine"])
+            _fill(row, metrics)
+            scene.rows.append(row)
+        require_one_size(str(folder), sizes, "remove the runs of one size, and fit them again in the other")
+        table.scenes.append(scene)
     return table
 
 
