@@ -190,7 +190,7 @@ def began(
 ) -> Began:
     """Outputs of commands, and what takes long left out of their repetition."""
     slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)
-    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "WHOLE": 0}.items():
+    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "SMALL_IMAGE": 0}.items():
         monkeypatch.setattr(plan, name, value)
     out = tmp_path / "out"
 

@@ -88,20 +88,14 @@ def test_evaluate_writes_every_metric_sheet_and_render(run: Run) -> None:
         assert missing == bool(result[f"{key}_reason"]), key
 
 
-def test_metrics_and_scene_file_equal_the_trainer(run: Run, trainer: Trainer, views: Dataset) -> None:
-    """Exported, read back and measured, or rendered by Mitsuba: the state of the trainer, view by view."""
+def test_metrics_equal_those_of_the_trainer(run: Run, trainer: Trainer, views: Dataset) -> None:
+    """Exported, read back and measured: the state of the trainer, view by view."""
     result, scores = evaluate(run), []
     for view in (view.load() for view in views.views):
         planes = displayed(trainer.view(view.camera()), views.background, views.is_linear_radiance)
         scores.append(metrics.psnr(images.image_array(planes, SIZE, SIZE), view.image))
     assert math.isclose(result["psnr"], np.mean(scores), abs_tol=1e-4)
     assert [view["psnr"] for view in result["views"]] == pytest.approx(scores, abs=1e-4)
-
-    image = np.array(mi.render(mi.load_file(str(run.path / "scene.xml"))))
-    frame = trainer.view(views.views[0].camera())
-    expected = images.image_array([*frame.radiance, frame.alpha], SIZE, SIZE)
-    assert expected[SIZE // 2, SIZE // 2, 3] > 0.3
-    np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
 def test_evaluate_measures_the_scene_files(run: Run) -> None:

@@ -25,9 +25,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.methods.read import load
 from mi_refgs.render import passes
-from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import export
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run, read_log
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -450,16 +448,6 @@ def test_a_photographed_object_is_displayed_with_or_without_background(photograp
         assert np.array_equal(ours, theirs) and not np.array_equal(ours, all_)
 
 
-def test_a_scene_file_is_displayed_with_or_without_background(
-    photographed: TrainedScene, tmp_path: Path
-) -> None:
-    export(photographed, tmp_path, front().camera(24, 24))
-    drawable = MitsubaScene(load_scene(tmp_path / "scene.xml"), "scene.xml")
-    assert drawable.backdrops == ("background", "white", "grey", "black")
-    for name in drawable.backdrops:
-        assert np.abs(shown(drawable, backdrop=name) - shown(photographed, backdrop=name)).max() <= 2, name
-
-
 def test_a_fit_is_displayed_with_or_without_background(
     data: Path, method: Path, photographed: TrainedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -610,20 +598,6 @@ def test_a_missing_viser_is_refused(finished: Path, monkeypatch: pytest.MonkeyPa
 
 
 # ---------------- Mitsuba scenes ----------------
-
-
-def test_the_scene_file_of_a_run_is_drawn_like_the_run(finished: Path) -> None:
-    drawable = MitsubaScene(load_scene(finished / "scene.xml", []), "scene.xml")
-    own = ReconstructionView(TrainedScene.read(finished))
-    assert drawable.variables == own.variables
-    for name in ("image", "normal", "roughness", "depth", "specular"):
-        request = SampleRequest(drawable.start(), 24, 24, DisplayOptions(name))
-        found, wanted = (
-            to_bytes(displayed_planes(each.draw(request).planes, request.look), 24, 24).astype(int)
-            for each in (drawable, own)
-        )
-        assert np.abs(found - wanted).max() <= 2 and np.ptp(wanted) > 0, name
-    assert len(drawable.fine(SampleRequest(drawable.start(), 12, 10, DisplayOptions()))) == 4
 
 
 def test_the_environment_of_a_path_traced_scene_rotates() -> None:
