@@ -46,7 +46,7 @@ def _curve(name: str, at: float) -> dict[str, Any]:
     value = display.srgb_from_linear(plane)
     dr.backward(dr.sum(value))
     straight = np.float32(x) <= np.float32(JOINT)
-    exact = 12.92 * x if straight else oracle.srgb(x)
+    exact = 12.92 * x if straight else float(oracle.srgb(np.array(x)))
     slope = 12.92 if straight else 1.055 / 2.4 * x ** (1 / 2.4 - 1)
     errors = {"value": _relative(value[0], exact), "slope": _relative(dr.grad(plane)[0], slope)}
     return {"at": name} | errors
@@ -101,7 +101,7 @@ def _loss(name: str, radiance: Array, alpha: Array, target: Array, target_alpha:
         image = oracle.display_image(values[..., :3], values[..., 3], (0.5, 0.5, 0.5))
         image = np.where((target >= losses.SATURATED) & (image > target), target, image)
         value = 0.8 * oracle.l1(image, target) + 0.2 * (1 - oracle.ssim(image, target))
-        return value + 0.2 * oracle.alpha_loss(values[..., 3], target_alpha)
+        return value + 0.2 * oracle.l1(values[..., 3], target_alpha)
 
     values = np.concatenate([radiance, alpha[..., None]], axis=-1)
     places = [(r, c) for r in (0, 4, 7) for c in (1, 5)]

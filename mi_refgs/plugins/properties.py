@@ -58,13 +58,6 @@ def _choice(props: Any, name: str, default: str, options: tuple[str, ...]) -> An
     return value
 
 
-def _flag(props: Any, name: str, default: bool) -> bool:
-    value = _get(props, name, default)
-    if not isinstance(value, bool):
-        raise InputError(f"refgs: {name}: {abbreviated(value)} is neither true nor false; give a boolean")
-    return value
-
-
 def _tensor(props: Any, name: str) -> Any:
     """Return a tensor property as mi.TensorXf; None where it is absent."""
     value = _get(props, name, None)
@@ -185,7 +178,7 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
     shading = Shading(at, reflectance, diffuse)
-    occlusion = _flag(props, "occlusion", mesh is not None and shading.traceable)
+    occlusion = _get(props, "occlusion", mesh is not None and shading.traceable)
     quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
     shading = replace(shading, occlusion=occlusion, **quality)
     shading.require_inputs(surfels.raw, mesh=mesh is not None)

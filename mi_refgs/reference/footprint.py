@@ -1,4 +1,11 @@
-"""Interface of footprints: each primitive is a module with the functions of `Footprints`.
+"""What the footprints of surfels and of 3D Gaussians share: each primitive is a module with four functions.
+
+    culled(raw, camera, rules)           which rows (N,) cover no pixel
+    footprint(raw, camera, rules, x, y)  Sample (N, P) at pixel centres x, y (P,)
+    sort_key(raw, camera, pixels, corner)
+                                         depth (N, P) by which rows are ordered in the tiles of pixels (raster
+                                         indices); `corner` is the first pixel's place in its tile
+    normal(raw)                          which of the three axes (N,) is the normal
 
 Letters: N primitives, P pixels. Raw channels are real or, for derivatives by a complex step, complex. The
 columns of its `scale` say which primitive a table is of.
@@ -7,7 +14,6 @@ columns of its `scale` say which primitive a table is of.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -45,26 +51,3 @@ def tile_centres(camera: PinholeCamera, pixels: Array, corner: tuple[int, int]) 
     x = (pixels % camera.width + corner[0]) // width * width + width / 2 - corner[0]
     y = (pixels // camera.width + corner[1]) // height * height + height / 2 - corner[1]
     return x, y
-
-
-class Footprints(Protocol):
-    """The functions of `reference.surfel` and `reference.gaussian`."""
-
-    def culled(self, raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
-        """Which rows (N,) cover no pixel."""
-
-    def footprint(
-        self, raw: dict[str, Array], camera: PinholeCamera, rules: Rules, x: Array, y: Array
-    ) -> Sample:
-        """Footprints at pixel centres x, y (P,)."""
-
-    def sort_key(
-        self, raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: tuple[int, int]
-    ) -> Array:
-        """Depth (N, P) by which rows are ordered in the tiles of pixels (raster indices).
-
-        `corner` is the first pixel's place in its tile.
-        """
-
-    def normal(self, raw: dict[str, Array]) -> Array:
-        """Which of the three axes (N,) is the normal."""

@@ -1,4 +1,4 @@
-"""Losses, depth normals, Adam, relocation and antialiased roughness in float64, pixel by pixel.
+"""Losses, depth normals, Adam, relocation and antialiased roughness in float64.
 
 Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fast path.
 """
@@ -6,72 +6,65 @@ Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fas
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from mi_refgs.reference.light import radiance_of
 
-
-def srgb(linear: float) -> float:
-    """sRGB encoding of one value (IEC 61966-2-1), unbounded above."""
-    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+Array = np.ndarray
 
 
-def display_image(
-    radiance: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]
-) -> np.ndarray:
+def srgb(linear: Array) -> Array:
+    """sRGB encoding (IEC 61966-2-1), unbounded above."""
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    )
+
+
+def display_image(radiance: Array, alpha: Array, background: tuple[float, float, float]) -> Array:
     """A srgb(L / A) + (1 - A) background; the background alone where A < 1e-6."""
-    out = np.empty_like(radiance)
-    for index in np.ndindex(radiance.shape):
-        a = alpha[index[:2]]
-        shown = a * srgb(radiance[index] / a) if a >= 1e-6 else 0.0
-        out[index] = shown + (1 - a) * background[index[2]]
-    return out
+    a = alpha[..., None]
+    shown = np.where(a >= 1e-6, a * srgb(radiance / np.where(a >= 1e-6, a, 1)), 0)
+    return shown + (1 - a) * np.array(background)
 
 
-def l1(image: np.ndarray, target: np.ndarray, clipped: np.ndarray | None = None) -> float:
+def l1(image: Array, target: Array, clipped: Array | bool = False) -> float:
     """Mean absolute difference; where `clipped`, an image above the target is no error."""
-    total = 0.0
-    for index in np.ndindex(image.shape):
-        if clipped is None or not (clipped[index] and image[index] > target[index]):
-            total += abs(image[index] - target[index])
-    return total / image.size
+    return float(np.mean(np.where(clipped & (image > target), 0, np.abs(image - target))))
 
 
-def ssim(image: np.ndarray, target: np.ndarray) -> float:
+def ssim(image: Array, target: Array) -> float:
     """Mean SSIM: 11×11 Gaussian window with σ = 1.5, zeros outside the image, C1 = 1e-4, C2 = 9e-4."""
-    height, width, channels = image.shape
-    weights = np.array([math.exp(-((k - 5) ** 2) / (2 * 1.5**2)) for k in range(11)])
+    weights = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
     window = np.outer(weights, weights) / weights.sum() ** 2
-    x_padded, y_padded = (np.pad(array, ((5, 5), (5, 5), (0, 0))) for array in (image, target))
-    total = 0.0
-    for row, column, channel in np.ndindex(height, width, channels):
-        x = x_padded[row : row + 11, column : column + 11, channel]
-        y = y_padded[row : row + 11, column : column + 11, channel]
-        μx, μy = np.sum(window * x), np.sum(window * y)
-        σx2, σy2 = np.sum(window * x * x) - μx**2, np.sum(window * y * y) - μy**2
-        σxy = np.sum(window * x * y) - μx * μy
-        total += (2 * μx * μy + 1e-4) * (2 * σxy + 9e-4) / ((μx**2 + μy**2 + 1e-4) * (σx2 + σy2 + 9e-4))
-    return float(total / image.size)
+
+    def mean(values: Array) -> Array:
+        return np.sum(window * _windows(values, 11, "constant"), axis=(-2, -1))
+
+    μx, μy = mean(image), mean(target)
+    σx2, σy2 = mean(image**2) - μx**2, mean(target**2) - μy**2
+    σxy = mean(image * target) - μx * μy
+    total = (2 * μx * μy + 1e-4) * (2 * σxy + 9e-4) / ((μx**2 + μy**2 + 1e-4) * (σx2 + σy2 + 9e-4))
+    return float(total.mean())
 
 
-def alpha_loss(alpha: np.ndarray, target: np.ndarray) -> float:
-    """Mean absolute difference."""
-    total = 0.0
-    for index in np.ndindex(alpha.shape):
-        total += abs(float(alpha[index]) - float(target[index]))
-    return total / alpha.size
+def _windows(values: Array, size: int, mode: Any) -> Array:
+    """Windows (H, W, C, size, size) around the pixels of an image padded by np.pad's `mode`."""
+    margin = size // 2
+    padded = np.pad(values, ((margin, margin), (margin, margin), (0, 0)), mode=mode)
+    return np.lib.stride_tricks.sliding_window_view(padded, (size, size), (0, 1))
 
 
 def normals_from_depth(
-    depth: np.ndarray,
-    alpha: np.ndarray,
+    depth: Array,
+    alpha: Array,
     fx: float,
     fy: float,
     cx: float,
     cy: float,
-    world_from_camera: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    world_from_camera: Array,
+) -> tuple[Array, Array]:
     """World normals (H, W, 3) of a camera-depth map and their validity (H, W), by central differences.
 
     Steps between two surfaces, which the viewing ray meets at a cosine of at most 0.2, are not valid.
@@ -79,7 +72,7 @@ def normals_from_depth(
     height, width = depth.shape
     normals, valid = np.zeros((height, width, 3)), np.zeros((height, width), dtype=bool)
 
-    def point(row: int, column: int) -> np.ndarray:
+    def point(row: int, column: int) -> Array:
         return depth[row, column] * np.array([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, 1.0])
 
     for row in range(1, height - 1):
@@ -108,38 +101,28 @@ def normals_from_depth(
     return normals, valid
 
 
-def normal_consistency(
-    normal: np.ndarray, depth_normal: np.ndarray, valid: np.ndarray, weight: np.ndarray
-) -> float:
+def normal_consistency(normal: Array, depth_normal: Array, valid: Array, weight: Array) -> float:
     """Mean over all pixels of A (A - N · n_d) where n_d is valid; `weight` is the constant A."""
-    total = 0.0
-    for index in np.ndindex(valid.shape):
-        if valid[index]:
-            total += weight[index] * (weight[index] - np.dot(normal[index], depth_normal[index]))
-    return float(total / valid.size)
+    return float(np.mean(np.where(valid, weight * (weight - np.sum(normal * depth_normal, axis=-1)), 0)))
 
 
-def smoothness(maps: np.ndarray, image: np.ndarray, edge: float = 1.0) -> float:
+def smoothness(maps: Array, image: Array, edge: float = 1.0) -> float:
     """Mean over pixels of Σ_axis ‖∂M‖ exp(-edge ‖∂I‖), ‖·‖ the mean absolute value of the planes."""
-    height, width, _ = maps.shape
     kernel = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 8
-    padded = [np.pad(array, ((1, 1), (1, 1), (0, 0)), mode="edge") for array in (maps, image)]
-    total = np.float64(0)
-    for row, column in np.ndindex(height, width):
-        for stencil in (kernel, kernel.T):
-            bend, step = (
-                np.mean(np.abs(np.tensordot(stencil, p[row : row + 3, column : column + 3]))) for p in padded
-            )
-            total += bend * math.exp(-edge * step)
-    return float(total / (height * width))
+
+    def slope(values: Array, stencil: Array) -> Array:
+        return np.mean(np.abs(np.sum(stencil * _windows(values, 3, "edge"), axis=(-2, -1))), axis=-1)
+
+    axes = (kernel, kernel.T)
+    return float(np.mean(sum(slope(maps, s) * np.exp(-edge * slope(image, s)) for s in axes)))
 
 
-def half_metal(metallic: np.ndarray, alpha: np.ndarray) -> float:
+def half_metal(metallic: Array, alpha: Array) -> float:
     """Mean over pixels of A m (1 - m)."""
     return float(np.mean(alpha * metallic * (1 - metallic)))
 
 
-def _irradiances(level: np.ndarray, count: int = 256) -> np.ndarray:
+def _irradiances(level: Array, count: int = 256) -> Array:
     """Colours (count, 3) of an irradiance map in the directions of a spherical Fibonacci lattice around y."""
     i = np.arange(count)
     z = 1 - (2 * i + 1) / count
@@ -147,23 +130,23 @@ def _irradiances(level: np.ndarray, count: int = 256) -> np.ndarray:
     return radiance_of(level, np.stack([ring * np.cos(φ), ring * np.sin(φ), z], axis=1))
 
 
-def mean_irradiance(level: np.ndarray) -> float:
+def mean_irradiance(level: Array) -> float:
     """Mean over directions and channels of an irradiance map (h, 2h, 3)."""
     return float(_irradiances(level).mean())
 
 
-def light_colour(level: np.ndarray, scale: float) -> float:
+def light_colour(level: Array, scale: float) -> float:
     """Mean over directions of the mean |E - grey E| of the channels, over `scale`, which is a constant."""
     irradiance = _irradiances(level)
     return float(np.mean(np.abs(irradiance - irradiance.mean(1, keepdims=True))) / scale)
 
 
 def adam(
-    parameter: np.ndarray,
-    gradients: list[np.ndarray],
-    rates: list[np.ndarray | float],
+    parameter: Array,
+    gradients: list[Array],
+    rates: list[Array | float],
     epsilon: float = 1e-15,
-) -> np.ndarray:
+) -> Array:
     """Adam in the form of its Algorithm 1 (bias-corrected moments); ε as in the efficient order."""
     θ, m, v = parameter.astype(np.float64), np.zeros(parameter.shape), np.zeros(parameter.shape)
     for t, (g, rate) in enumerate(zip(gradients, rates, strict=True), start=1):
@@ -174,7 +157,7 @@ def adam(
     return θ
 
 
-def widened_roughness(roughness: np.ndarray, normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+def widened_roughness(roughness: Array, normal: Array, alpha: Array) -> Array:
     """Maps (H, W), (H, W, 3), (H, W); as `render.antialias.widened`."""
     height, width = alpha.shape
     out = np.array(roughness, np.float64)
@@ -208,8 +191,5 @@ def relocated(opacity: float, number: int) -> tuple[float, float]:
 
 def line_integral(opacity: float, number: int, scale: float, steps: int = 20_000) -> float:
     """∫ 1 - (1 - o exp(-x²/2s²))^N dx along a line through their centre, by the middles of equal steps."""
-    width, total = 20 * scale, 0.0
-    for i in range(steps):
-        x = ((i + 0.5) / steps - 0.5) * width
-        total += 1 - (1 - opacity * math.exp(-0.5 * (x / scale) ** 2)) ** number
-    return total * width / steps
+    x = 20 * scale * ((np.arange(steps) + 0.5) / steps - 0.5)
+    return float(20 * scale * np.mean(1 - (1 - opacity * np.exp(-0.5 * (x / scale) ** 2)) ** number))

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mi_refgs.reference import gaussian, surfel
 from mi_refgs.reference.camera import PinholeCamera
-from mi_refgs.reference.footprint import GEOMETRY, Footprints, Rules, Sample
+from mi_refgs.reference.footprint import GEOMETRY, Rules, Sample
 
 Array = np.ndarray
 STEP = 1e-40
 
 
-def primitive_of(raw: dict[str, np.ndarray]) -> Footprints:
+def primitive_of(raw: dict[str, np.ndarray]) -> Any:
     """3D Gaussians have a third standard deviation."""
     return gaussian if raw["scale"].shape[1] == 3 else surfel
 
@@ -147,7 +148,7 @@ def differentiate(
 def sorted_rows(
     raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: tuple[int, int] = (0, 0)
 ) -> Array:
-    """Rows (N, P) from front to back at pixels (raster indices); `corner` as in `Footprints.sort_key`."""
+    """Rows (N, P) from front to back at pixels (raster indices); `corner` as in `sort_key`."""
     return np.argsort(primitive_of(raw).sort_key(raw, camera, pixels, corner), axis=0, kind="stable")
 
 

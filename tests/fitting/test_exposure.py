@@ -77,9 +77,10 @@ def test_exposure_of_step_and_its_derivative(
     view = view_of(goal, alpha, linear)
     data = Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None)
     target = Target.of(view, BACKGROUND)
-    clipped = None if target.clipped is None else np.stack([np.array(x) for x in target.clipped], -1)
-    clipped = None if clipped is None else clipped.reshape(radiance.shape)
-    encode = np.vectorize(reference.srgb)
+    clipped = np.zeros(radiance.shape, bool)
+    if target.clipped is not None:
+        clipped = np.stack([np.array(x) for x in target.clipped], -1).reshape(radiance.shape)
+    encode = reference.srgb
     goal = encode(np.asarray(view.image, np.float64)) if linear else np.asarray(view.image, np.float64)
 
     def define(log: np.ndarray) -> float:

@@ -45,6 +45,7 @@ from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, composited
 from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
+from tests.laws.covering import covering_array
 from tests.scenes.integrator import (
     OTHER_OPTIONS,
     background_light,
@@ -335,24 +336,7 @@ FEATURES: dict[str, tuple[Any, ...]] = {
 }
 
 
-def pairwise(features: dict[str, tuple[Any, ...]], seed: int) -> list[dict[str, Any]]:
-    """Rows of one value for each feature in which every pair of values of two features occurs."""
-    rng = np.random.default_rng(seed)
-    rows = [dict(zip(features, values, strict=True)) for values in itertools.product(*features.values())]
-
-    def pairs(row: dict[str, Any]) -> set[Any]:
-        return set(itertools.combinations(row.items(), 2))
-
-    rows = [rows[i] for i in rng.permutation(len(rows))]
-    left, chosen = set().union(*map(pairs, rows)), []
-    while left:
-        chosen.append(max(rows, key=lambda row: len(pairs(row) & left)))
-        left -= pairs(chosen[-1])
-    return chosen
-
-
-ROWS = pairwise(FEATURES, seed=5)
-
+ROWS = covering_array(FEATURES, (), seed=5)
 
 LOSSLESS = [
     (Shading("pixel", "displayed"), "gaussian"),

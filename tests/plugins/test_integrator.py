@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from mi_refgs.constants import TILE_SIZES, tile_size
 from mi_refgs.reference.camera import look_at
@@ -74,51 +73,6 @@ def test_parameter_keys_do_not_depend_on_the_address(tmp_path: Path) -> None:
     assert "refgs.roughness" in params and "refgs.light" not in params
 
 
-def test_background_is_under_alpha(tmp_path: Path) -> None:
-    run_folder(tmp_path)
-    transparent = image(mi.load_file(str(tmp_path / "scene.xml")))
-    run_folder(tmp_path, background=(1, 0.5, 0.25))
-    opaque = image(mi.load_file(str(tmp_path / "scene.xml")))
-    assert np.all(opaque[..., 3] == 1)
-    expected = transparent[..., :3] + (1 - transparent[..., 3:]) * np.array([1, 0.5, 0.25])
-    np.testing.assert_allclose(opaque[..., :3], expected, atol=1e-6)
-
-
-def test_light_of_the_scene_equals_own_light(tmp_path: Path) -> None:
-    EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
-    turn = mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 70)
-    for transform in (mi.ScalarTransform4f(), turn):
-        emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr"), "scale": 2.0}
-        emitter["to_world"] = transform
-        nested = image(scene(light=emitter))
-        np.testing.assert_allclose(image(lit_scene(emitter)), nested, atol=1e-5)
-    assert np.abs(nested - image(scene())).max() > 0.05
-
-
-def test_turned_light_turns_with_the_scene(tmp_path: Path) -> None:
-    """Rotating the light, the surfels' SH-free part and the camera together changes nothing."""
-    EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
-    turn = mi.ScalarTransform4f().rotate([0, 1, 0], 90)  # a quarter turn about the pole moves whole columns
-    raw = {name: values for name, values in raw_channels().items() if not name.endswith("_sh")}
-    matrix = np.array(turn.matrix)[:3, :3]
-    turned = dict(raw, position=(raw["position"] @ matrix.T).astype(np.float32))
-    rotation = Rotation.from_matrix(matrix) * Rotation.from_quat(raw["rotation"])
-    turned["rotation"] = rotation.as_quat().astype(np.float32)
-    emitter = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
-    before = image(scene(raw=raw, light=emitter))
-    moved = sensor(to_world=turn @ sensor()["to_world"])
-    after = image(scene(moved, raw=turned, light=dict(emitter, to_world=turn)))
-    np.testing.assert_allclose(after, before, atol=2e-4)
-    assert np.abs(image(scene(moved, raw=turned, light=emitter)) - before).max() > 0.02
-
-
-def test_constant_emitters() -> None:
-    emitter = {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}}
-    own = image(scene(light=emitter))
-    np.testing.assert_allclose(image(lit_scene(emitter)), own, rtol=1e-3, atol=1e-4)
-    assert mi.traverse(scene(light=emitter))["integrator.light"].shape[2] == 3
-
-
 def test_terms_add_up_and_radiance_needs_no_light() -> None:
     parts = [image(scene(terms=term)) for term in ("diffuse", "specular", "indirect")]
     np.testing.assert_allclose(sum(parts), image(scene()), atol=1e-5)
@@ -179,6 +133,8 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
         ({"aovs": "a:colour"}, "unknown type 'colour'"),
         ({"aovs": "a:depth,a:normal"}, "occurs twice"),
         ({"occlusion": True}, "no mesh"),
+        ({"occlusion": "yes"}, "occlusion: 'yes'"),
+        ({"visibility_rays": 1.5}, "visibility_rays: 1.5 is not allowed"),
         ({"mesh": "nowhere.ply"}, "nowhere.ply: mesh: no such file"),
         ({"filename": "nowhere.ply"}, "nowhere.ply: file: cannot be read"),
         ({"light": {"type": "point"}}, "not a PointLight"),

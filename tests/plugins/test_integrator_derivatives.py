@@ -9,7 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.shade.light.envmap import EnvironmentLight
 from tests.helpers import refused
 from tests.scenes.integrator import (
     check_derivatives,
@@ -22,25 +21,10 @@ from tests.scenes.integrator import (
 )
 
 
-@pytest.mark.parametrize("key", [*(name for name in raw_channels() if name != "indirect_sh"), "light"])
-def test_derivatives_of_every_attribute(key: str) -> None:
-    check_derivatives(scene(), f"integrator.{key}")
-
-
 @pytest.mark.parametrize("key", ["position", "opacity", "albedo", "light"])
 def test_derivatives_with_irradiance_and_supersampling(key: str) -> None:
     of = scene(diffuse="irradiance", aovs="nn:normal,d:depth,a:albedo")
     check_derivatives(of, f"integrator.{key}", spp=4)
-
-
-@pytest.mark.parametrize("key", ["rotation", "metallic", "light"])
-def test_derivatives_when_shading_at_surfels(key: str) -> None:
-    check_derivatives(scene(shade_at="surfel"), f"integrator.{key}")
-
-
-@pytest.mark.parametrize("key", ["indirect_sh", "opacity"])
-def test_derivatives_with_occlusion(key: str, tmp_path: Path) -> None:
-    check_derivatives(scene(mesh=plane_mesh(tmp_path)), f"integrator.{key}")
 
 
 def test_indirect_light_trains_from_zero(tmp_path: Path) -> None:
@@ -52,11 +36,6 @@ def test_indirect_light_trains_from_zero(tmp_path: Path) -> None:
     dr.enable_grad(leaf)
     dr.backward(dr.sum(mi.render(of, params), axis=None))
     assert np.abs(dr.grad(leaf).numpy()).max() > 1e-3
-
-
-def test_derivatives_of_the_scenes_environment(tmp_path: Path) -> None:
-    EnvironmentLight.from_radiance(sky()).write(tmp_path / "sky.exr")
-    check_derivatives(lit_scene({"type": "envmap", "filename": str(tmp_path / "sky.exr")}), "sky.data")
 
 
 @pytest.mark.parametrize("columns", [64, 48], ids=["as it is", "resampled"])
@@ -75,19 +54,6 @@ def test_the_scale_of_an_environment_has_a_derivative(columns: int, tmp_path: Pa
     dr.set_grad(scale, 1)
     tangent = dr.forward_to(mi.render(of, params))
     np.testing.assert_allclose(tangent.numpy(), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_derivatives_of_a_constant_environment() -> None:
-    constant = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
-    of = lit_scene(constant, terms="specular")
-    params = mi.traverse(of)
-    colour = mi.Color3f(1, 1, 1)
-    dr.enable_grad(colour)
-    params["sky.radiance.value"] = colour
-    params.update()
-    rendered = mi.render(of, params)
-    dr.backward(dr.sum(rendered, axis=None))
-    np.testing.assert_allclose(np.ravel(dr.grad(colour)), rendered.numpy().sum((0, 1)), rtol=1e-4)
 
 
 def test_resampled_environments_refuse_derivatives(tmp_path: Path) -> None:

@@ -29,7 +29,6 @@ from tests.scenes.integrator import (
     PREFIX,
     WIDTH,
     background_light,
-    check_derivatives,
     far_channels,
     image,
     open_scene,
@@ -42,16 +41,6 @@ from tests.scenes.integrator import (
 
 def camera() -> Camera:
     return Camera.from_sensor(mi.load_dict(sensor()))
-
-
-@pytest.mark.parametrize("key", [*(PREFIX + name for name in far_channels()), "background", "albedo"])
-def test_derivatives_of_surroundings(key: str) -> None:
-    check_derivatives(open_scene(), f"integrator.{key}")
-
-
-@pytest.mark.parametrize("key", [f"{PREFIX}position", f"{PREFIX}radiance_sh", "background", "radiance_sh"])
-def test_derivatives_when_shading_at_surfels(key: str) -> None:
-    check_derivatives(open_scene(shade_at="surfel"), f"integrator.{key}", spp=4)
 
 
 def test_image_matches_the_renderer() -> None:
@@ -67,18 +56,6 @@ def test_image_matches_the_renderer() -> None:
     np.testing.assert_array_equal(seen[..., 3], 1)
     transparent = image(scene(rgba))
     assert transparent[..., 3].min() < 0.5 and np.abs(transparent[..., :3] - seen[..., :3]).max() > 0.1
-
-
-def test_surroundings_or_background_only() -> None:
-    """A background alone is opaque; surroundings alone stay transparent where nothing is."""
-    rgba = sensor(film={"pixel_format": "rgba"})
-    plain, before = image(scene(rgba)), image(scene(rgba, background=background_light().raw))
-    np.testing.assert_array_equal(before[..., 3], 1)
-    empty = plain[..., 3] == 0
-    assert empty.any() and (before[empty][:, :3] > 0.3).all()
-    around = {PREFIX + name: mi.TensorXf(values) for name, values in far_channels().items()}
-    seen = image(scene(rgba, **around))
-    assert seen[..., 3].max() < 1 and seen[..., 3].mean() > plain[..., 3].mean()
 
 
 def test_values_that_cannot_be_used_are_told_of_and_left_out() -> None:

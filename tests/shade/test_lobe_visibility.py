@@ -123,7 +123,6 @@ def test_many_rays_converge_to_the_traced_fraction(roughness: float) -> None:
     for rays in (1, 4, 16, 64, 1024):
         visibility = np.array(seen(points, place, ShadingOptions(visibility_rays=rays)).visibility)
         error[rays] = float(np.sqrt(np.mean((visibility - truth) ** 2)))
-    print(f"roughness {roughness}: " + ", ".join(f"{k}: {e:.4f}" for k, e in error.items()))
     assert error[4] < 0.7 * error[1] and error[16] < 0.6 * error[4] and error[64] < 0.6 * error[16]
     assert error[1024] < 5e-3
 
