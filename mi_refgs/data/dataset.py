@@ -20,7 +20,7 @@ from mi_refgs.data.exposure import log_exposure
 from mi_refgs.data.images import ImageCache, ImageFile, ImageSource
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.region import Region, read_region, region_of
-from mi_refgs.data.view import FileCamera, View
+from mi_refgs.data.view import FileCamera, View, evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.registry import Registry
 
@@ -292,8 +292,7 @@ def _own_alpha(view: View) -> bool:
 def _opaque(views: tuple[View, ...]) -> bool:
     """Whether images with alpha have no transparent pixel; OPAQUE_CHECKED evenly spaced ones are examined."""
     own = [view for view in views if _own_alpha(view)]
-    chosen = np.unique(np.linspace(0, len(own) - 1, OPAQUE_CHECKED).astype(int)) if own else ()
-    loaded = (own[i].load().alpha for i in chosen)
+    loaded = (own[i].load().alpha for i in evenly_spread(len(own), OPAQUE_CHECKED))
     return bool(own) and all(alpha is None or alpha.min() >= 1 for alpha in loaded)
 
 
