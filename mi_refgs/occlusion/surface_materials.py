@@ -68,8 +68,7 @@ class VertexSurfels:
                 )
         if not surfels.count:
             raise InputError("occluder: surfels: there are none to take materials from")
-        surfels = surfels.detach().cleaned()
-        usable = np.flatnonzero(surfels.usable().numpy())
+        usable, surfels = np.flatnonzero(surfels.usable().numpy()), surfels.detach().cleaned()
         if not len(usable):
             raise InputError("occluder: surfels: none has finite values; correct them, or trace nothing")
 

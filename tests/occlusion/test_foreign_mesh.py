@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.surfels.table import Surfels
@@ -85,6 +86,14 @@ def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, 
     )
     made.set_materials(surfels)
     rows = np.array(made.surface(surfels).rows).reshape(count, 8)
+    # A surfel that is not usable serves no vertex.
+    broken = surfels.to_numpy()
+    broken["position"][7] = np.nan
+    made.set_materials(Surfels.from_numpy(broken))
+    assert made.vertex_surfels is not None and 7 not in np.array(made.vertex_surfels.surfel)
+    with pytest.raises(InputError, match="none has finite values"):
+        made.set_materials(Surfels.from_numpy(broken | {"roughness": np.full((count, 1), np.inf)}))
+    made.set_materials(surfels)
     sideways = np.abs(ball.vertices[:, 2]) < 0.4
     np.testing.assert_allclose(rows[sideways, 5:], ball.vertices[sideways], atol=0.03)
     np.testing.assert_allclose(rows[:, 4], surfels.value("roughness").numpy(), atol=0.04)
