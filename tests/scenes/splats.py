@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +20,6 @@ from mi_refgs.surfels.table import Surfels
 MAX_LEFT_OUT = 0.05
 """Share of the covered pixels that may lie in the band around declared discontinuities."""
 
-Mutation = Callable[[pytest.MonkeyPatch], None]
 PARAMETERS = ("position", "rotation", "scale", "opacity", "features")
 
 
@@ -158,24 +156,24 @@ def check_screen_offset(scene: Scene) -> None:
     assert dr.grad(offset).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
 
 
-def scaled_column(adjoint: type, index: int) -> Mutation:
-    """Mutant of an adjoint: one of its columns is 10 % too large."""
-
-    def mutate(monkeypatch: pytest.MonkeyPatch) -> None:
-        original = adjoint.columns  # type: ignore[attr-defined]
-
-        def mutant(self: Any, row: list[Any]) -> list[Any]:
-            columns = original(self, row)
-            columns[index] = columns[index] * 1.1
-            return columns
-
-        monkeypatch.setattr(adjoint, "columns", mutant)
-
-    return mutate
+DEGENERATE: dict[str, tuple[str, slice, Any]] = {
+    "scales of 0": ("scale", slice(None), -1e4),
+    "scales without end": ("scale", slice(None), 1e4),
+    "one scale without end": ("scale", slice(1), 1e4),
+    "quaternions of 0": ("rotation", slice(None), 0),
+    "opacity of 1": ("opacity", slice(None), 1e4),
+    "at the camera": ("position", slice(None), None),
+    "none": ("position", slice(0), 0),
+}
+"""Attribute, columns and their raw value."""
 
 
-def check_finite(scene: Scene) -> None:
+def check_degenerate(scene: Scene, case: str) -> None:
     """Images and gradients of degenerate surfels, or of none, are finite."""
+    name, columns, value = DEGENERATE[case]
+    raw = {key: values[: 0 if case == "none" else None].copy() for key, values in scene.raw.items()}
+    raw[name][:, columns] = scene.camera.to_world[:3, 3] if value is None else value
+    scene = Scene(raw, scene.features[: len(raw[name])], scene.camera)
     maps = fast_maps(scene)
     assert all(np.isfinite(x.numpy()).all() for x in [*maps.features, maps.depth, maps.alpha])
     if len(scene.features):
