@@ -3,7 +3,6 @@
     python -m benchmarks.splatting                     the page docs/splatting.md, in five minutes on 2 cores
     python -m benchmarks.splatting --scene runs/glossy the same, with the surfels of a fitted scene
     python -m benchmarks.splatting --small -o out      a small instance, below a minute
-    python -m benchmarks.splatting --full              slow renderers in more cases, everything more often
 
 Writes splatting.md, images/splatting_*.png, splatting.csv and splatting.json to the output folder; without
 -o, the page and its images go to docs/ and the two others to runs/.
@@ -15,7 +14,7 @@ import sys
 from dataclasses import replace
 
 from benchmarks.common.report import make_parser, write_reports
-from benchmarks.splatting.cases import FULL, PAGE, SMALL
+from benchmarks.splatting.cases import PAGE, SMALL
 from benchmarks.splatting.measure import measure
 from benchmarks.splatting.page import page, plot
 
@@ -23,8 +22,7 @@ from benchmarks.splatting.page import page, plot
 def main(arguments: list[str] | None = None) -> int:
     """Measure, and write the reports; exit code 2 for bad input."""
     small = (SMALL, "a coarse instance, below a minute")
-    full = (FULL, "more repeats, and more cases of slow renderers")
-    parser = make_parser("splatting", __doc__, PAGE, small=small, full=full)
+    parser = make_parser("splatting", __doc__, PAGE, small=small)
     parser.add_argument(
         "--scene", metavar="RUN", action="append", default=[], help="run folder of a fit; repeatable"
     )

@@ -57,13 +57,6 @@ class Settings:
 
 
 PAGE = Settings()
-FULL = Settings(
-    repeats=15,
-    seconds=6.0,
-    volprim=tuple((n, size) for n in PAGE.surfels for size in (128, 256, 512)),
-    volprim_repeats=3,
-    errors=tuple((n, size) for n in PAGE.surfels for size in (128, 256, 512)),
-)
 SMALL = Settings(
     surfels=(200, 2_000),
     sizes=(32, 64),

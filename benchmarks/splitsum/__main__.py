@@ -2,7 +2,6 @@
 
     python -m benchmarks.splitsum                      the page docs/splitsum.md, below 10 minutes on 2 cores
     python -m benchmarks.splitsum --small -o out       a small instance, below a minute
-    python -m benchmarks.splitsum --full -o out        more pixels, more samples
     python -m benchmarks.splitsum --envmap sky.exr --shape sphere -o out   your light beside the built-in ones
 
 Writes splitsum.md, images/splitsum_*.png, splitsum.csv and splitsum.json to the output folder; without -o,
@@ -18,14 +17,13 @@ from benchmarks.common.report import make_parser, write_reports
 from benchmarks.common.view import BUILT_IN
 from benchmarks.splitsum.measure import measure
 from benchmarks.splitsum.page import page, plot
-from benchmarks.splitsum.setup import CONVEX, FULL, PAGE, SMALL
+from benchmarks.splitsum.setup import CONVEX, PAGE, SMALL
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, and write the reports; exit code 2 for bad input."""
     small = (SMALL, "a coarse instance, below a minute")
-    full = (FULL, "more pixels and samples, about an hour")
-    parser = make_parser("splitsum", __doc__, PAGE, small=small, full=full)
+    parser = make_parser("splitsum", __doc__, PAGE, small=small)
     parser.add_argument(
         "--envmap", metavar="FILE", action="append", default=[], help="another light; repeatable"
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -89,18 +89,6 @@ SMALL = Settings(
     timing_seconds=0.05,
     timing_rounds=1,
 )
-FULL = replace(
-    PAGE,
-    size=128,
-    spp=(1, 4, 16, 64, 256),
-    timed_spp=(1, 4, 16, 64),
-    lattice=1597,
-    batches=16,
-    full_depth_spp=1024,
-    timing_seconds=2.0,
-)
-
-
 SHIPPED = "shipped"
 FULL_DEPTH = 8
 
