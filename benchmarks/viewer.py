@@ -31,6 +31,9 @@ from typing import Any
 
 import psutil
 
+from benchmarks.common.report import plain_parser
+from mi_refgs.io.files import write_json
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 COUNTER = """
@@ -64,19 +67,14 @@ class Viewer:
     """`refgs view` in a process of its own."""
 
     def __init__(self, run: Path, saved: Path) -> None:
-        begin = time.monotonic()
+        begin, pipe = time.monotonic(), subprocess.PIPE
+        command = ["view", str(run), "--port", "0", "-o", str(saved), "--json"]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "mi_refgs", "view", str(run), "--port", "0", "-o", str(saved), "--json"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+            [sys.executable, "-m", "mi_refgs", *command], stdout=pipe, stderr=pipe, text=True
         )
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            if found := re.search(r"http://\S+", line):
-                self.url = found[0]
-                break
-        else:
+        found = (re.search(r"http://\S+", line) for line in self.process.stderr or ())
+        self.url = next((address[0] for address in found if address), "")
+        if not self.url:
             raise SystemExit(f"refgs view {run} did not start")
         self.ready_s = time.monotonic() - begin
 
@@ -227,7 +225,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else "")
+    parser = plain_parser("viewer", __doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--minutes", type=float, default=10.0, help="of random clicks; 0 for none")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each orbit")
@@ -236,10 +234,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("-o", "--output", type=Path)
     args = parser.parse_args()
-    text = json.dumps(measure(args), indent=1)
-    print(text)
+    result = measure(args)
+    print(json.dumps(result, indent=1))
     if args.output is not None:
-        args.output.write_text(text + "\n")
+        write_json(args.output, result)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ each view, PSNR in dB of what each program shows against our image, both display
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -19,11 +18,20 @@ import mi_refgs
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.common.report import plain_parser
 from benchmarks.interchange import programs
+from mi_refgs.evaluation.images import image_array
+from mi_refgs.evaluation.metrics import psnr
+from mi_refgs.formats import write
+from mi_refgs.formats.gaussians import gaussians
+from mi_refgs.reconstruction.provenance import Provenance
+from mi_refgs.render.display import display_image
+from mi_refgs.render.pipeline import SurfelScene, render
+from mi_refgs.shade.shading import Shading
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = plain_parser("interchange", __doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--node", type=Path, required=True)
     parser.add_argument("--views", type=int, nargs="+", default=[0])
@@ -36,13 +44,6 @@ def main() -> None:
 
 def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[str, Any]:
     """What each program makes of the files of a run."""
-    from mi_refgs.formats import write
-    from mi_refgs.formats.gaussians import gaussians
-    from mi_refgs.reconstruction.provenance import Provenance
-    from mi_refgs.render.display import display_image
-    from mi_refgs.render.pipeline import SurfelScene, render
-    from mi_refgs.shade.shading import Shading
-
     made = mi_refgs.load(run)
     trained = made.trained
     shots = Provenance.of(mi_refgs.Run(run)).shots(trained, "test", "train")
@@ -68,15 +69,13 @@ def measured(run: Path, node: Path, views: list[int], names: list[str]) -> dict[
             if "mitsuba" in names:
                 images["volprim_rf_basic"] = programs.in_mitsuba(ply, camera)
             found[shots[index].name] = {
-                title: round(float(-10 * np.log10(np.mean((np.clip(x, 0, 1) - ours) ** 2))), 2)
-                for title, x in images.items()
+                title: round(psnr(np.clip(x, 0, 1), ours), 2) for title, x in images.items()
             }
     return found
 
 
 def _image(planes: Any, camera: Any) -> np.ndarray:
-    flat = np.stack([np.array(plane, dtype=np.float64) for plane in planes], axis=-1)
-    return np.clip(flat, 0, 1).reshape(camera.height, camera.width, 3)
+    return np.clip(image_array(planes, camera.height, camera.width), 0, 1)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
+
+import mitsuba as mi  # isort: skip
+
+from benchmarks.common.view import perspective
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.formats.gltf import EXTENSION
 from mi_refgs.io.images import srgb_from_linear
@@ -110,24 +115,8 @@ def in_mitsuba(ply: Path, camera: Camera, samples: int = 16) -> np.ndarray:
 
     Its integrator blends the colours of the file as they are, and then takes the sRGB curve off.
     """
-    import mitsuba as mi
-
-    sensor = {
-        "type": "perspective",
-        "fov": float(np.degrees(2 * np.arctan(0.5 * camera.width / abs(float(camera.fx[0]))))),
-        "fov_axis": "x",
-        "principal_point_offset_x": float(camera.cx[0]) / camera.width - 0.5,
-        "principal_point_offset_y": float(camera.cy[0]) / camera.height - 0.5,
-        "near_clip": 1e-2,
-        "to_world": mi.ScalarTransform4f(camera.pose()),
-        "film": {
-            "type": "hdrfilm",
-            "width": camera.width,
-            "height": camera.height,
-            "rfilter": {"type": "box"},
-            "pixel_format": "rgb",
-        },
-    }
+    fx, cx, cy = (float(x[0]) for x in (camera.fx, camera.cx, camera.cy))
+    sensor = perspective((camera.width, camera.height), fx, (cx, cy), camera.pose())
     scene = mi.load_dict(
         {
             "type": "scene",

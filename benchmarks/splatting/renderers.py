@@ -9,12 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.common.view import perspective
 from benchmarks.splatting.cases import COLOUR, Workload
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import listening, phase
 from mi_refgs.profiling.profile import Counts, count
-from mi_refgs.reference.splat import PinholeCamera
 from mi_refgs.splat import Camera, Composited, list_by_tile, project, splat
 from mi_refgs.surfels.table import Surfels
 
@@ -123,11 +123,12 @@ class Volprim:
             "sh_coeffs": _tensor((workload.features[:, :COLOUR] - 0.5) / SH_0),
         }
         self.scene = mi.load_dict({"type": "scene", "primitives": ellipsoids})
-        self.sensor = mi.load_dict(_sensor(workload.pinhole))
+        p = workload.pinhole
+        self.sensor = mi.load_dict(perspective((p.width, p.height), p.fx, (p.cx, p.cy), p.to_world))
         self.integrator = mi.load_dict({"type": "volprim_rf_basic", "srgb_primitives": False})
         self.params = mi.traverse(self.scene)
         self.keys = [f"primitives.{name}" for name in ("data", "opacities", "sh_coeffs")]
-        shape = (workload.pinhole.height, workload.pinhole.width, COLOUR)
+        shape = (p.height, p.width, COLOUR)
         self.weights = mi.TensorXf(workload.weights(COLOUR).T.reshape(shape))
         dr.eval(self.weights)
 
@@ -147,16 +148,3 @@ class Volprim:
 
 def _tensor(values: np.ndarray) -> Any:
     return mi.TensorXf(np.ascontiguousarray(values, np.float32))
-
-
-def _sensor(p: PinholeCamera) -> dict[str, Any]:
-    """Mitsuba's camera of the float64 reference's; square pixels, the principal point in the middle."""
-    film = {"type": "hdrfilm", "width": p.width, "height": p.height, "pixel_format": "rgb"}
-    return {
-        "type": "perspective",
-        "fov": float(np.degrees(2 * np.arctan(0.5 * p.width / abs(p.fx)))),
-        "fov_axis": "x",
-        "to_world": mi.ScalarTransform4f(p.to_world.tolist()),
-        "film": film | {"component_format": "float32", "rfilter": {"type": "box"}},
-        "sampler": {"type": "independent", "sample_count": 1},
-    }
