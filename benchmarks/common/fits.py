@@ -11,7 +11,6 @@ from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.data.images import Pixels
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.method import Method
 from mi_refgs.reference.camera import look_at
 
 METHOD = "ref_gaussian"
@@ -45,8 +44,7 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Dataset:
     return ball_data(size, focal, ((rng.normal(size=3), waves) for _ in range(views)))
 
 
-def make_trainer(surfels: int, data: Dataset) -> tuple[Trainer, Method]:
-    """A trainer at the preset `standard` that keeps its number of surfels, and its method."""
+def make_trainer(surfels: int, data: Dataset) -> Trainer:
+    """A trainer at the preset `standard` that keeps its number of surfels."""
     settings = [f"surfels.count={surfels}", f"surfels.max_count={surfels}", "surfels.inside=0", "refine={}"]
-    method = methods.load(METHOD, "standard", settings)
-    return Trainer(method, data), method
+    return Trainer(methods.load(METHOD, "standard", settings), data)

@@ -144,18 +144,15 @@ def radiance(emitter: Any, direction: Any) -> Any:
     return emitter.eval(si)
 
 
-def _visible(occluder: Any, origin: Any, direction: Any) -> Any:
-    return True if occluder is None else ~occluder.ray_test(mi.Ray3f(origin, direction))
-
-
 def predecessor(samples: int) -> int:
     """The Fibonacci number before another."""
     return round(samples / 1.618033988749895)
 
 
-def lattice(i: Any, count: Any, generator: Any) -> Any:
-    """Point i of `count` in the unit square; the generator is the count's predecessor."""
-    return mi.Point2f(mi.Float(i) + 0.5, mi.Float((i * generator) % count) + 0.5) / mi.Float(count)
+def lattice(i: Any, count: Any, generator: Any, shift: Any) -> Any:
+    """Point i of `count` in the unit square, shifted; the generator is the count's predecessor."""
+    u = shift + mi.Point2f(mi.Float(i) + 0.5, mi.Float((i * generator) % count) + 0.5) / mi.Float(count)
+    return u - dr.floor(u)
 
 
 def integrate(
@@ -187,8 +184,10 @@ def integrate(
     origin = every.position + RAY_OFFSET * every.offset
     sums = len(lobe.weights(mi.Vector3f(0, 0, 1)))
 
+    def visible(direction: Any) -> Any:
+        return True if occluder is None else ~occluder.ray_test(mi.Ray3f(origin, direction))
+
     def body(i: Any, *total: Any) -> tuple[Any, ...]:
-        at = lattice(i, count, generator)
         new = list(total)
 
         def add(light: Any, radiance_: Any, density: Any, free: Any) -> None:
@@ -196,25 +195,21 @@ def integrate(
                 share = dr.select(free & (density > 0), weight / density, 0)
                 new[k] = new[k] + radiance_ * share
 
-        light = lobe.sample(_wrap(at + shift[0]))
+        light = lobe.sample(lattice(i, count, generator, shift[0]))
         world = lobe.frame.to_world(light)
         si.wi = -world
         ds = dr.zeros(mi.DirectionSample3f)
         ds.d = world
         density = lobe.pdf(light) + emitter.pdf_direction(si, ds)
-        add(light, radiance(emitter, world), density, _visible(occluder, origin, world))
+        add(light, radiance(emitter, world), density, visible(world))
 
-        ds, ratio = emitter.sample_direction(si, _wrap(at + shift[1]))
+        ds, ratio = emitter.sample_direction(si, lattice(i, count, generator, shift[1]))
         light = lobe.frame.to_local(ds.d)
         density = lobe.pdf(light) + ds.pdf
-        add(light, ratio * ds.pdf, density, (ds.pdf > 0) & _visible(occluder, origin, ds.d))
+        add(light, ratio * ds.pdf, density, (ds.pdf > 0) & visible(ds.d))
         return (i + 1, *new)
 
     start = (mi.UInt32(0), *(dr.zeros(mi.Color3f, dr.width(lane)) for _ in range(sums)))
     _, *total = dr.while_loop(start, lambda i, *_: i < count, body)
     dr.eval(total)
     return [np.array(t, np.float64).T.reshape(batches, points.count, 3) / samples for t in total]
-
-
-def _wrap(u: Any) -> Any:
-    return u - dr.floor(u)

@@ -11,7 +11,6 @@ import numpy as np
 
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.view import Light, Look, Points, first_hits, make_sensor, surface
-from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
@@ -89,11 +88,6 @@ class Setup:
             return dr.select(hit.is_valid(), colour, 0)
 
         return run
-
-
-def shading_points(points: Points, material: dict[str, Any]) -> ShadingPoints:
-    """The points as the product shades them."""
-    return ShadingPoints(points.normal, points.view, **material)
 
 
 def covering(points: np.ndarray, normals: np.ndarray, **material: Any) -> Surfels:

@@ -185,10 +185,10 @@ def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
     of their own; `step_ms` is the wall time of undisturbed steps, less than the sum of the phases because
     kernels fuse across them; `splat_ms` that of the step's splat and its gradients by themselves.
     """
-    trainer, method = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)))
+    trainer = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)))
     result = {}
-    for name, stage in method.stages():
-        if stage.shading.at == "pixel" and method.mesh is not None:
+    for name, stage in trainer.method.stages():
+        if stage.shading.at == "pixel" and trainer.method.mesh is not None:
             trainer.extract_mesh()
         found = profile_stage(trainer, name, steps)
         with trainer.held_in_stage(name) as prepare:

@@ -63,11 +63,10 @@ def _step(count: int, size: int) -> dict[str, Any]:
 
     from benchmarks.common.fits import make_trainer, sphere_data
 
-    rng = np.random.default_rng(0)
-    trainer, method = make_trainer(count, sphere_data(size, 2, rng))
+    trainer = make_trainer(count, sphere_data(size, 2, np.random.default_rng(0)))
     trainer.extract_mesh()
     before = _start()
-    trainer.fit.iteration = method.stages()[-1][1].until - STEPS - 1
+    trainer.fit.iteration = trainer.method.stages()[-1][1].until - STEPS - 1
     times = [1e3 * once(trainer.step) for _ in range(STEPS + 1)]
     whole = peak_bytes()
     found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}

@@ -12,10 +12,11 @@ import numpy as np
 
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.montecarlo import Estimate
-from benchmarks.common.setup import ALBEDO, Setup, path_tracer, shading_points
+from benchmarks.common.setup import ALBEDO, Setup, path_tracer
 from benchmarks.common.view import BUILT_IN, ROOT, Light, Look, Points
 from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
 from mi_refgs.shade.options import ShadingOptions
+from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.split_sum import shade
 
 MESHES = ROOT / "scenes" / "meshes"
@@ -116,7 +117,7 @@ OPTIONS = {
 
 def split_sum(points: Points, material: dict[str, Any], light: Any, option: str = "") -> Any:
     """Outgoing radiance (mi.Color3f) as the product shades it."""
-    return shade(shading_points(points, material), light, OPTIONS[option]).total()
+    return shade(ShadingPoints(points.normal, points.view, **material), light, OPTIONS[option]).total()
 
 
 @dataclass(frozen=True)

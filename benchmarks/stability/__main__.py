@@ -70,18 +70,18 @@ def fit(name: str) -> dict[str, Any]:
 
     Images change after the start, which needs masks.
     """
-    trainer, method = make_trainer(SURFELS, sphere_data(SIZE, VIEWS, np.random.default_rng(0)))
+    trainer = make_trainer(SURFELS, sphere_data(SIZE, VIEWS, np.random.default_rng(0)))
     case = FITS[name]
     if "view" in case:
         views = tuple(replace(view, **case["view"](view)) for view in trainer.data.views)
         data = replace(trainer.data, views=views, is_linear_radiance=views[0].is_linear_radiance)
-        trainer.adopt(FitSetup(method, data), trainer.state())
+        trainer.adopt(FitSetup(trainer.method, data), trainer.state())
     if "light" in case:
         raw = trainer.fit.params[LIGHT].numpy()
         trainer.fit.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))
         trainer.fit.optimiser.reset(LIGHT)
     losses = []
-    for _, stage in method.stages():
+    for _, stage in trainer.method.stages():
         if stage.shading.at == "pixel":
             trainer.extract_mesh()
         for _ in range(STEPS):

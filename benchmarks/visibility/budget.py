@@ -231,9 +231,9 @@ def traced(scene: Any, points: Points, depth: int, directions: int, seed: int) -
     point, index = lane // directions, lane % directions
     rng = mi.PCG32(size=points.count, initstate=mi.UInt64(seed))
     shift = dr.gather(mi.Point2f, mi.Point2f(rng.next_float32(), rng.next_float32()), point)
-    at = shift + mc.lattice(index, mi.UInt32(directions), mi.UInt32(mc.predecessor(directions)))
+    at = mc.lattice(index, mi.UInt32(directions), mi.UInt32(mc.predecessor(directions)), shift)
     every = points.gather(point)
-    direction = mi.Frame3f(every.normal).to_world(mi.warp.square_to_uniform_hemisphere(at - dr.floor(at)))
+    direction = mi.Frame3f(every.normal).to_world(mi.warp.square_to_uniform_hemisphere(at))
     ray = mi.RayDifferential3f(every.position + mc.RAY_OFFSET * every.offset, direction)
     # Without emitters in sight, valid is what hits a surface: the light itself is not indirect light.
     radiance, blocked, _ = path.sample(scene, sampler, ray)

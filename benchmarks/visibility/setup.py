@@ -63,7 +63,7 @@ class Setup(setup.Setup):
 
     def seen(self, points: Points, rule: Rule) -> ShadingPoints:
         """The points with what the rule finds."""
-        at = setup.shading_points(points, self.surface)
+        at = ShadingPoints(points.normal, points.view, **self.surface)
         if not rule.rays:
             return at
         context = TraceContext(self.occluder, self.surfels, self.light, self.origin, -points.view)

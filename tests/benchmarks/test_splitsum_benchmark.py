@@ -23,7 +23,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.reference.light import lobe_average
 from mi_refgs.reference.lobe import split_sum_entry
 from mi_refgs.shade.light import lobe_matrices
-from tests.helpers import run_process
 
 BENCHMARK = "splitsum"
 Row = dict[str, Any]
@@ -319,11 +318,3 @@ def test_other_level_sets_are_filtered() -> None:
         np.testing.assert_allclose(a, b, rtol=1e-5)
     a, b = (x.specular(direction, mi.Float(0.6)).numpy() for x in (few, shipped))
     assert not np.allclose(a, b, rtol=1e-4)
-
-
-def test_missing_light_is_refused(tmp_path: Path) -> None:
-    done = run_process(
-        "-W", "error", "-m", "benchmarks.splitsum", "--small", "--envmap", "nowhere.exr", "-o", tmp_path
-    )
-    assert done.returncode == 2
-    assert "nowhere.exr: light" in done.stderr

@@ -17,7 +17,6 @@ from benchmarks.common.errors import compare
 from benchmarks.common.montecarlo import estimate
 from benchmarks.common.report import where
 from benchmarks.visibility import cases, page
-from benchmarks.visibility.__main__ import main
 from benchmarks.visibility.cases import SMALL, Rule
 from benchmarks.visibility.setup import Setup
 from tests.helpers import ROOT
@@ -163,10 +162,3 @@ def test_mesh_file_is_scaled() -> None:
     concave = cases.make_scene(str(ROOT / "scenes" / "meshes" / "trefoil.ply"), 0)
     assert concave.name == "trefoil" and concave.mesh.volume > 0
     assert np.linalg.norm(concave.mesh.vertices, axis=1).max() == pytest.approx(1)
-
-
-def test_unreadable_mesh_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--small", "--quiet", "--mesh", str(tmp_path / "none.ply"), "-o", str(tmp_path)]
-    assert main(arguments) == 2
-    assert "none.ply" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

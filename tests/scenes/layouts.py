@@ -6,6 +6,7 @@ import json
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,24 +34,21 @@ def model_of(shots: list[Shot], camera: str, values: tuple[float, ...]) -> Model
     return cameras, poses, POINTS, COLOURS
 
 
-def write_text(
-    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
+def _write(
+    contents: Callable[[Model], dict[str, bytes]],
+    ending: str,
+    model: Path,
+    shots: list[Shot],
+    camera: str = MODEL,
+    values: tuple[float, ...] = VALUES,
 ) -> None:
-    """Cameras, images and points as COLMAP writes them as text."""
     model.mkdir(parents=True, exist_ok=True)
-    for name, content in colmap_text(model_of(shots, camera, values)).items():
-        (model / f"{name}.txt").write_bytes(content)
+    for name, content in contents(model_of(shots, camera, values)).items():
+        (model / f"{name}.{ending}").write_bytes(content)
 
 
-def write_binary(
-    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
-) -> None:
-    """The same in COLMAP's binary records."""
-    model.mkdir(parents=True, exist_ok=True)
-    for name, content in colmap_binary(model_of(shots, camera, values)).items():
-        (model / f"{name}.bin").write_bytes(content)
-
-
+write_text = partial(_write, colmap_text, "txt")
+write_binary = partial(_write, colmap_binary, "bin")
 WRITERS = {"txt": write_text, "bin": write_binary}
 
 
