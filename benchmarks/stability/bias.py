@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.common.scenes import discs, facing
 from benchmarks.stability.cases import Array, Case, Raw, camera, filled, plain, sky
 from benchmarks.stability.exact import light_of
-from mi_refgs.reference import image as oracle
+from mi_refgs.reference import image as reference
 from mi_refgs.reference.camera import camera_frame
 from mi_refgs.reference.splat import sorted_rows
 
@@ -78,10 +78,14 @@ def _rules(case: Case) -> Iterator[dict[str, Any]]:
     pixel_sorted = replace(base, order=_by_pixel(base))
     depth = camera_frame(base.raw, base.camera)[0][:, 2]
     by_centre = np.broadcast_to(np.argsort(depth, kind="stable")[:, None], base.order.shape)
-    exact = oracle.render(pixel_sorted)
-    pairs: list[tuple[str, Callable[[], oracle.Image], Callable[[], oracle.Image]]] = [
-        ("sorted by tile → by pixel", lambda: oracle.render(base), lambda: exact),
-        ("sorted by centre → by pixel", lambda: oracle.render(replace(base, order=by_centre)), lambda: exact),
+    exact = reference.render(pixel_sorted)
+    pairs: list[tuple[str, Callable[[], reference.Image], Callable[[], reference.Image]]] = [
+        ("sorted by tile → by pixel", lambda: reference.render(base), lambda: exact),
+        (
+            "sorted by centre → by pixel",
+            lambda: reference.render(replace(base, order=by_centre)),
+            lambda: exact,
+        ),
     ]
     for name, change in (
         ("ALPHA_MIN 1/255 → 0", {"alpha_min": 0.0}),
@@ -90,16 +94,16 @@ def _rules(case: Case) -> Iterator[dict[str, Any]]:
         ("EDGE_ON_COSINE 1e-4 → 0", {"edge_on": 0.0}),
     ):
         other = replace(pixel_sorted, rules=replace(base.rules, **change))
-        pairs.append((name, lambda: exact, lambda other=other: oracle.render(other)))  # type: ignore[misc]
+        pairs.append((name, lambda: exact, lambda other=other: reference.render(other)))  # type: ignore[misc]
     fine = _supersampled(case, light)
     plain_rays = replace(pixel_sorted, rules=replace(base.rules, low_pass=None))
     pairs.append(("low-pass → mean of the pixel", lambda: exact, lambda: fine))
-    pairs.append(("no low-pass → mean of the pixel", lambda: oracle.render(plain_rays), lambda: fine))
+    pairs.append(("no low-pass → mean of the pixel", lambda: reference.render(plain_rays), lambda: fine))
     for name, ours, truth in pairs:
         yield {"scene": case.name, "rule": name} | _difference(ours(), truth())
 
 
-def _difference(ours: oracle.Image, truth: oracle.Image) -> dict[str, float]:
+def _difference(ours: reference.Image, truth: reference.Image) -> dict[str, float]:
     a, b = ours.maps["radiance"], truth.maps["radiance"]
     mean = float(np.mean(np.abs(b)))
     return {
@@ -110,20 +114,20 @@ def _difference(ours: oracle.Image, truth: oracle.Image) -> dict[str, float]:
     }
 
 
-def _scene(case: Case, light: oracle.Light | None) -> oracle.Scene:
+def _scene(case: Case, light: reference.Light | None) -> reference.Scene:
     c = case.camera
     pixels = np.arange(c.width * c.height)
     raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
     order = sorted_rows(raw, c, pixels)
-    return oracle.Scene(raw, c, pixels, order, case.at, case.reflectance, case.diffuse, light)
+    return reference.Scene(raw, c, pixels, order, case.at, case.reflectance, case.diffuse, light)
 
 
-def _by_pixel(scene: oracle.Scene) -> Array:
+def _by_pixel(scene: reference.Scene) -> Array:
     """Order (N, P) by the depth of each pixel's own sample."""
-    return np.argsort(oracle.sample_depth(scene), axis=0, kind="stable")
+    return np.argsort(reference.sample_depth(scene), axis=0, kind="stable")
 
 
-def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Image:
+def _supersampled(case: Case, light: reference.Light | None) -> reference.Image:
     """Means over SAMPLES² rays per pixel, without the low-pass."""
     c = case.camera
     fine = replace(
@@ -134,16 +138,16 @@ def _supersampled(case: Case, light: oracle.Light | None) -> oracle.Image:
     maps: dict[str, list[Array]] = {"radiance": [], "alpha": []}
     for row in range(c.height):  # a row of pixels at a time: memory
         pixels = np.arange(SAMPLES * fine.width) + row * SAMPLES * fine.width
-        scene = oracle.Scene(
+        scene = reference.Scene(
             raw, fine, pixels, np.empty((0, 0), int), case.at, case.reflectance, case.diffuse, light,
-            rules=oracle.Rules(low_pass=None),
+            rules=reference.Rules(low_pass=None),
         )  # fmt: skip
-        image = oracle.render(replace(scene, order=_by_pixel(scene)))
+        image = reference.render(replace(scene, order=_by_pixel(scene)))
         for name, found in maps.items():
             blocks = image.maps[name].reshape(SAMPLES, c.width, SAMPLES, -1)
             found.append(blocks.mean((0, 2)))
     joined = {name: np.concatenate(found) for name, found in maps.items()}
-    return oracle.Image(joined, np.zeros(c.width * c.height, bool), np.empty((0, 0), bool))
+    return reference.Image(joined, np.zeros(c.width * c.height, bool), np.empty((0, 0), bool))
 
 
 def _cut(opacity: float) -> dict[str, float]:
@@ -155,13 +159,13 @@ def _cut(opacity: float) -> dict[str, float]:
     raw["opacity"] = np.array([[np.log(opacity / (1 - opacity))]])
     pixels = np.arange(c.width * c.height)
     order = np.zeros((1, len(pixels)), int)
-    scene = oracle.Scene(raw, c, pixels, order, "surfel", "radiance")
+    scene = reference.Scene(raw, c, pixels, order, "surfel", "radiance")
     weights = {"alpha": np.ones((len(pixels), 1))}
-    gradients = oracle.render(scene, weights).gradients
+    gradients = reference.render(scene, weights).gradients
 
     def total(name: str, step: float) -> float:
         other = replace(scene, raw=raw | {name: raw[name] + step})
-        return float(oracle.render(other).maps["alpha"].sum())
+        return float(reference.render(other).maps["alpha"].sum())
 
     row = {"opacity": opacity}
     for name in ("scale", "opacity"):

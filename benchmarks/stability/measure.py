@@ -20,7 +20,7 @@ from benchmarks.stability.exact import (
 )
 from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.reference import image as oracle
+from mi_refgs.reference import image as reference
 from mi_refgs.reference import surfel
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Request, SurfelScene, render
@@ -165,10 +165,10 @@ def measure(case: Case, floors: bool = True) -> Row:
     pixels = chosen_pixels(case)
     order = product_order(case, pixels) if len(case.raw["position"]) else np.empty((0, len(pixels)), int)
     scene = scene_of(case, pixels, order)
-    truth = oracle.render(scene, band=case.band)
+    truth = reference.render(scene, band=case.band)
     band = truth.band | _flips(case, scene, truth)
     weights = _weights(truth, band)
-    truth = oracle.render(scene, weights)
+    truth = reference.render(scene, weights)
     exact = _gradients(case, scene, truth)
     spread = {n: np.zeros((case.camera.width * case.camera.height, w.shape[1])) for n, w in weights.items()}
     for name, values in weights.items():
@@ -224,7 +224,7 @@ def negligible(exact: dict[str, Array], raw: dict[str, Array]) -> list[str]:
 def _sizes(gradients: dict[str, Array], raw: dict[str, Array]) -> dict[str, float]:
     units: dict[str, Any] = {"position": _extent(raw["position"])}
     length = np.linalg.norm(raw["rotation"], axis=1, keepdims=True)
-    units["rotation"] = np.maximum(length, oracle.QUATERNION_FLOOR)
+    units["rotation"] = np.maximum(length, reference.QUATERNION_FLOOR)
     names = [n for n in GRADIENTS if n in gradients and gradients[n].size]
     return {n: float(np.linalg.norm(units.get(n, 1.0) * gradients[n])) for n in names}
 
@@ -237,14 +237,14 @@ def _extent(position: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((position - position.mean(0)) ** 2, 1)))) or 1.0
 
 
-def _gradients(case: Case, scene: oracle.Scene, truth: oracle.Image) -> dict[str, Array]:
+def _gradients(case: Case, scene: reference.Scene, truth: reference.Image) -> dict[str, Array]:
     gradients = dict(truth.gradients)
     if scene.light is not None:
         gradients["light"] = light_gradient(case.light, scene.light, gradients["light"])
     return gradients
 
 
-def _weights(truth: oracle.Image, band: Array) -> dict[str, Array]:
+def _weights(truth: reference.Image, band: Array) -> dict[str, Array]:
     rng = np.random.default_rng(11)
     weights = {}
     for name in LOSS_MAPS:
@@ -255,7 +255,7 @@ def _weights(truth: oracle.Image, band: Array) -> dict[str, Array]:
     return weights
 
 
-def _flips(case: Case, scene: oracle.Scene, truth: oracle.Image) -> Array:
+def _flips(case: Case, scene: reference.Scene, truth: reference.Image) -> Array:
     """Pixels (P,) at a declared discontinuity: their visibility changes when normal and ray turn by 1e-4 and
     1e-5, or with the offset of rays that a mesh made elsewhere may have."""
     flips = np.zeros(len(scene.pixels), bool)
@@ -279,8 +279,8 @@ def _flips(case: Case, scene: oracle.Scene, truth: oracle.Image) -> Array:
 
 def condition(
     case: Case,
-    scene: oracle.Scene,
-    truth: oracle.Image,
+    scene: reference.Scene,
+    truth: reference.Image,
     exact: dict[str, Array],
     weights: dict[str, Array],
     band: Array,
@@ -304,7 +304,7 @@ def condition(
             camera=replace(scene.camera, to_world=pose),
             light=light,
         )
-        image = oracle.render(moved, weights)
+        image = reference.render(moved, weights)
         images.append(max(map_errors(image.maps, truth.maps, ~band)))
         gradients.append(
             gradient_errors(_gradients(replace(case, light=raw_light), moved, image), exact, scene.raw)
@@ -312,7 +312,7 @@ def condition(
     return max(images), {n: max(g[n] for g in gradients) for n in gradients[0]}
 
 
-def inversion(case: Case, scene: oracle.Scene, truth: oracle.Image) -> float:
+def inversion(case: Case, scene: reference.Scene, truth: reference.Image) -> float:
     """Largest relative difference of depths in the wrong order, among the surfels that a pixel shows."""
     phase = fast_camera(case).tile_offset
     key = surfel.sort_key(scene.raw, scene.camera, scene.pixels, phase)

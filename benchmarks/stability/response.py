@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.stability.cases import Array
 from mi_refgs.fitting import losses
 from mi_refgs.kernels.device import upload
-from mi_refgs.reference import losses as oracle
+from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
 
 SIZE = (11, 9)
@@ -46,7 +46,7 @@ def _curve(name: str, at: float) -> dict[str, Any]:
     value = display.srgb_from_linear(plane)
     dr.backward(dr.sum(value))
     straight = np.float32(x) <= np.float32(JOINT)
-    exact = 12.92 * x if straight else float(oracle.srgb(np.array(x)))
+    exact = 12.92 * x if straight else float(reference.srgb(np.array(x)))
     slope = 12.92 if straight else 1.055 / 2.4 * x ** (1 / 2.4 - 1)
     errors = {"value": _relative(value[0], exact), "slope": _relative(dr.grad(plane)[0], slope)}
     return {"at": name} | errors
@@ -98,10 +98,10 @@ def _loss(name: str, radiance: Array, alpha: Array, target: Array, target_alpha:
     found = np.stack([dr.grad(x).numpy() for x in (*planes, a)], 1).reshape(*SIZE, 4)
 
     def exact(values: Array) -> float:
-        image = oracle.display_image(values[..., :3], values[..., 3], (0.5, 0.5, 0.5))
+        image = reference.display_image(values[..., :3], values[..., 3], (0.5, 0.5, 0.5))
         image = np.where((target >= losses.SATURATED) & (image > target), target, image)
-        value = 0.8 * oracle.l1(image, target) + 0.2 * (1 - oracle.ssim(image, target))
-        return value + 0.2 * oracle.l1(values[..., 3], target_alpha)
+        value = 0.8 * reference.l1(image, target) + 0.2 * (1 - reference.ssim(image, target))
+        return value + 0.2 * reference.l1(values[..., 3], target_alpha)
 
     values = np.concatenate([radiance, alpha[..., None]], axis=-1)
     places = [(r, c) for r in (0, 4, 7) for c in (1, 5)]

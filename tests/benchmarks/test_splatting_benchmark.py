@@ -21,7 +21,7 @@ from benchmarks.stability import measure as stability
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.exact import product_order, scene_of
 from mi_refgs.profiling.profile import Counts
-from mi_refgs.reference import image as oracle
+from mi_refgs.reference import image as reference
 from mi_refgs.reference.camera import rotation_axes
 from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.table import Surfels
@@ -90,7 +90,7 @@ def exact(workload: Workload) -> np.ndarray:
     raw = workload.raw | {"radiance_sh": workload.features[:, :3]}
     case = Case("view", raw, workload.pinhole, sky(), at="surfel", reflectance="radiance")
     pixels = np.arange(workload.pixels)
-    return oracle.render(scene_of(case, pixels, product_order(case, pixels))).shown
+    return reference.render(scene_of(case, pixels, product_order(case, pixels))).shown
 
 
 @pytest.mark.parametrize("make", [opaque, sphere])

@@ -19,15 +19,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [*ROOT.glob("*.md"), ROOT / "scenes" / "README.md", *(ROOT / "docs").rglob("*.md")]
 """Every hand-written page."""
 MADE = {
-    "api.md",
-    "changelog.md",
-    "cli.md",
-    "contributing.md",
-    "exports.md",
-    "methods.md",
-    "plugins.md",
-    "scenes.md",
-    "settings.md",
+    f"{name}.md" for name in "api changelog cli contributing exports methods plugins scenes settings".split()
 }
 """Pages of docs/ that are made while the site is built."""
 

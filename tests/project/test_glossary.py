@@ -164,7 +164,7 @@ def test_files_do_not_use_other_words() -> None:
     ],
 )
 def test_forbidden_words_are_found(source: str, words: list[str], tmp_path: Path) -> None:
-    path = tmp_path / "planted.py"
+    path = tmp_path / "text.py"
     path.write_text(source)
     found = findings(path)
     assert len(found) == len(words), found

@@ -51,18 +51,6 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-@pytest.fixture(scope="module")
-def sdist(built: Path) -> Path:
-    [path] = built.glob("*.tar.gz")
-    return path
-
-
-@pytest.fixture(scope="module")
-def wheel(built: Path) -> Path:
-    [path] = built.glob("*.whl")
-    return path
-
-
 @pytest.fixture(scope="module", params=["*.whl", "*.tar.gz"])
 def environment(
     request: pytest.FixtureRequest, built: Path, tmp_path_factory: pytest.TempPathFactory
@@ -122,8 +110,9 @@ print(type(mi.load_dict({"type": "refgs_bsdf"})).__name__)
     assert run_in(environment, "python", "-W", "error", "-c", code).strip() == "RefGSBSDF"
 
 
-def test_sdist_contains_all_that_checks_need(sdist: Path) -> None:
-    with tarfile.open(sdist) as archive:
+def test_sdist_contains_all_that_checks_need(built: Path) -> None:
+    [path] = built.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"setup.sh", "mkdocs.yml", ".ci/run", "CITATION.cff", "CHANGELOG.md", "pyproject.toml"} <= names
     for folder in ("mi_refgs", "tests", "docs", "benchmarks", "scenes", "variants"):
@@ -135,18 +124,14 @@ def test_sdist_contains_all_that_checks_need(sdist: Path) -> None:
     }
 
 
-@pytest.fixture(scope="module")
-def unpacked(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the wheel's contents."""
-    folder = tmp_path_factory.mktemp("unpacked")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder)
-    return folder
-
-
-def test_wheel_contains_every_module_and_data_file(wheel: Path) -> None:
-    with zipfile.ZipFile(wheel) as archive:
+def test_wheel_contains_the_package_and_nothing_else(built: Path) -> None:
+    """Every module and data file; the command and the plugin are declared."""
+    [path] = built.glob("*.whl")
+    points = configparser.ConfigParser()
+    with zipfile.ZipFile(path) as archive:
         packed = set(archive.namelist())
+        [entries] = (name for name in packed if name.endswith(".dist-info/entry_points.txt"))
+        points.read_string(archive.read(entries).decode())
     expected = {str(path.relative_to(ROOT)) for path in (ROOT / "mi_refgs").rglob("*.py")}
     expected |= {f"mi_refgs/variants/{path.name}" for path in (ROOT / "variants").glob("*.toml")}
     expected |= {
@@ -155,18 +140,8 @@ def test_wheel_contains_every_module_and_data_file(wheel: Path) -> None:
         if path.suffix in {".toml", ".xml", ".ply", ".exr"}
     }
     assert expected | {"mi_refgs/py.typed", "mi_refgs/__init__.pyi"} <= packed
-
-
-def test_wheel_contains_nothing_else(wheel: Path) -> None:
-    with zipfile.ZipFile(wheel) as archive:
-        tops = {name.split("/")[0] for name in archive.namelist()}
+    tops = {name.split("/")[0] for name in packed}
     assert tops == {"mi_refgs", *(top for top in tops if top.endswith(".dist-info"))}
-
-
-def test_wheel_declares_the_command_and_the_plugin(unpacked: Path) -> None:
-    [path] = unpacked.glob("*.dist-info/entry_points.txt")
-    points = configparser.ConfigParser()
-    points.read(path)
     assert points["console_scripts"]["refgs"] == "mi_refgs.cli:main"
     assert points["mitsuba"]["refgs"] == "mi_refgs.plugins.integrator"
 

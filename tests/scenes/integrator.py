@@ -34,23 +34,12 @@ def sky(height: int = 32) -> np.ndarray:
 
 
 def sensor(**changes: Any) -> dict:
-    film = {
-        "type": "hdrfilm",
-        "width": WIDTH,
-        "height": HEIGHT,
-        "pixel_format": "rgb",
-        "rfilter": {"type": "box"},
-    }
-    film |= changes.pop("film", {})
+    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgb"}
+    film |= {"rfilter": {"type": "box"}} | changes.pop("film", {})
     to_world = mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1])
     sampler = {"type": "independent", "sample_count": 1}
-    return {
-        "type": "perspective",
-        "fov": 45,
-        "to_world": to_world,
-        "film": film,
-        "sampler": sampler,
-    } | changes
+    camera = {"type": "perspective", "fov": 45, "to_world": to_world, "film": film, "sampler": sampler}
+    return camera | changes
 
 
 def integrator(raw: dict[str, np.ndarray] | None = None, **changes: object) -> dict:
@@ -102,17 +91,11 @@ def hollow_mesh(folder: Path) -> str:
 
 STEPS = (2e-3, 2e-4)
 """Widths of differences; the better one counts: rounding spoils the small one, curvature the large one."""
-
-
 JUMP = 0.1
 """Part of the root mean square of the differences: where the two sides differ by more, a surfel has crossed
 the cut at α = 1/255, another surfel of its tile, or the kink of a lookup: there is no derivative."""
-
-
 MAX_LEFT_OUT = 0.2
 """Share of the seen pixels in which that may happen; observed up to 2 % at the better step."""
-
-
 TANGENT_TOLERANCE = 5e-3  # relative L2; observed 8e-5 … 3e-3
 
 

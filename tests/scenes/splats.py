@@ -12,7 +12,7 @@ import pytest
 
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.kernels.device import upload
-from mi_refgs.reference import splat as oracle
+from mi_refgs.reference import splat as reference
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat import Camera, Composited, TileLists, splat
 from mi_refgs.surfels.table import Surfels
@@ -27,7 +27,7 @@ PARAMETERS = ("position", "rotation", "scale", "opacity", "features")
 class Scene:
     raw: dict[str, np.ndarray]
     features: np.ndarray
-    camera: oracle.PinholeCamera
+    camera: reference.PinholeCamera
 
     def fast_camera(self) -> Camera:
         c = self.camera
@@ -63,7 +63,7 @@ def make_scene(seed: int) -> Scene:
         normal = normal / np.linalg.norm(normal) + 0.03 * view / np.linalg.norm(view)
         rotation[i] = quaternion_to(normal / np.linalg.norm(normal))
     focal = width / rng.uniform(0.6, 1.2)
-    camera = oracle.PinholeCamera(
+    camera = reference.PinholeCamera(
         width, height, -focal, -focal * rng.uniform(0.9, 1.1), width * rng.uniform(0.3, 0.7),
         height * rng.uniform(0.3, 0.7), to_world,
     )  # fmt: skip
@@ -85,7 +85,7 @@ def fast_maps(scene: Scene) -> Composited:
 
 def check_image(scene: Scene, tolerance: float) -> None:
     """Features, alpha and depth against the float64 reference."""
-    expected, got = oracle.splat(scene.raw, scene.features, scene.camera), fast_maps(scene)
+    expected, got = reference.splat(scene.raw, scene.features, scene.camera), fast_maps(scene)
     keep = outside_band(expected)
     depth_scale = np.abs(scene.raw["position"]).max() + 5
     pairs = [*zip(got.features, np.moveaxis(expected.features, -1, 0), strict=True)]
@@ -94,7 +94,7 @@ def check_image(scene: Scene, tolerance: float) -> None:
         assert np.abs(found.numpy().reshape(keep.shape) - wanted)[keep].max() <= tolerance
 
 
-def outside_band(maps: oracle.Maps) -> np.ndarray:
+def outside_band(maps: reference.Maps) -> np.ndarray:
     """Pixels (H, W) away from the declared discontinuities: nearly all that are covered, or a test of them
     would prove little. Observed: at least 96 %."""
     covered = maps.alpha > 0
@@ -105,7 +105,7 @@ def outside_band(maps: oracle.Maps) -> np.ndarray:
 def loss_weights(scene: Scene, seed: int) -> np.ndarray:
     """Random weights (H, W, 6), zero in the declared band: a step of the differences changes α by up to 3e-4
     of it."""
-    keep = outside_band(oracle.splat(scene.raw, scene.features, scene.camera))
+    keep = outside_band(reference.splat(scene.raw, scene.features, scene.camera))
     weights = np.random.default_rng(seed + 100).normal(size=(*keep.shape, 6))
     return np.where(keep[..., None], weights, 0).astype(np.float32).astype(np.float64)
 
@@ -130,7 +130,7 @@ def fast_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
 def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
     """Derivatives of Σ weights · maps in float64: complex steps of the footprints, sums of compositing."""
     adjoints = np.moveaxis(weights, 2, 0).reshape(6, -1)
-    return oracle.differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
+    return reference.differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
 
 
 def check_gradients(scene: Scene, seed: int, tolerance: float) -> None:
@@ -152,7 +152,7 @@ def check_screen_offset(scene: Scene) -> None:
     maps = splat(scene.surfels(), scene.columns(), scene.fast_camera(), offset)
     dr.backward(dr.sum(maps.alpha * upload(weights)))
     moved = [replace(scene.camera, cx=scene.camera.cx + sign * step) for sign in (1, -1)]
-    sides = [np.sum(weights * oracle.splat(scene.raw, scene.features, camera).alpha) for camera in moved]
+    sides = [np.sum(weights * reference.splat(scene.raw, scene.features, camera).alpha) for camera in moved]
     assert dr.grad(offset).x[0] == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3)
 
 
