@@ -52,12 +52,10 @@ def fits(folder: Path) -> list[Fit]:
     """The fits of a comparison that have a curve, by data set, method and seed."""
     found = []
     for run in sorted((folder / RUNS).glob("*/*/*")):
-        curve = read_log(run / CURVE, CURVE_KEYS)
-        if curve:
-            seconds, psnr = (np.array([point[key] for point in curve]) for key in ("seconds", "psnr"))
+        if curve := read_log(run / CURVE, CURVE_KEYS):
+            seconds, psnr = np.array([(point["seconds"], point["psnr"]) for point in curve]).T
             final = float((read_metrics(Run(run)) or {}).get("psnr", np.nan))
-            data, method, seed = run.parts[-3:]
-            found.append(Fit(folder.name, data, method, seed, seconds, psnr, final))
+            found.append(Fit(folder.name, *run.parts[-3:], seconds, psnr, final))
     return found
 
 
@@ -68,8 +66,8 @@ def seconds_table(found: list[Fit], levels: list[float]) -> str:
     for fit in found:
         times = [fit.reached(level) for level in levels]
         cells = ["–" if seconds is None else f"{seconds:.0f}" for seconds in times]
-        place = [fit.data, fit.method, fit.seed, fit.folder]
-        rows.append([*place, *cells, f"{fit.seconds[-1]:.0f}", f"{fit.final:.2f}"])
+        last = [f"{fit.seconds[-1]:.0f}", f"{fit.final:.2f}"]
+        rows.append([fit.data, fit.method, fit.seed, fit.folder, *cells, *last])
     return table(head, rows)
 
 

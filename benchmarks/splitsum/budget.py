@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.common.errors import Step, decompose, noise_floor
 from benchmarks.common.report import Row
 from benchmarks.common.setup import ALBEDO, covering
-from benchmarks.common.view import Points, rows
+from benchmarks.common.view import rows
 from benchmarks.splitsum.setup import CONVEX, Exact, diffuse, reflectance, split_sum
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.render.pipeline import SurfelScene, render
@@ -77,14 +77,10 @@ def _chain(
         Step(LOBE, around * table + exact),
         Step(SCHLICK, integrals.radiance(metallic).mean),
     ]
-    return steps if setup.name in CONVEX else steps + _concave(setup, roughness, metallic)
-
-
-def _concave(setup: Exact, roughness: float, metallic: float) -> list[Step]:
-    """What the shape itself adds: its shadow, and light that it reflects onto itself."""
-    direct = setup.integrals(roughness, occluded=True).radiance(metallic).mean
-    further = setup.bounces(roughness, metallic)
-    return [Step(SHADOW, direct), Step(BOUNCES, direct + further)]
+    if setup.name not in CONVEX:  # the shape's own shadow, and light that it reflects onto itself
+        direct = setup.integrals(roughness, occluded=True).radiance(metallic).mean
+        steps += [Step(SHADOW, direct), Step(BOUNCES, direct + setup.bounces(roughness, metallic))]
+    return steps
 
 
 SHAPE = "sphere"
@@ -126,10 +122,10 @@ def surfel_budget(setup: Exact) -> dict[str, Any]:
 
     group = mi.Float(band(surfels.to_numpy()["position"][:, 1]).astype(np.float32))
     blended = splat(surfels, [*surfels.frame()[2], group], camera)
-    normal = _at(blended.features[:3], setup.points)
-    odd, alpha = (_at([x], setup.points)[:, 0] for x in (blended.features[3], blended.alpha))
-    covered = alpha > COVERAGE_FLOOR
-    share = np.stack([alpha - odd, odd], axis=-1)
+    maps = np.stack([np.array(x, np.float64) for x in (*blended.features, blended.alpha)], axis=-1)
+    normal, odd, alpha = np.split(maps[setup.points.pixel.numpy()], [3, 4], axis=1)
+    covered = alpha[:, 0] > COVERAGE_FLOOR
+    share = np.concatenate([alpha - odd, odd], axis=1)
 
     facing = np.where(np.sum(normal * rows(setup.points.view), -1, keepdims=True) < 0, -normal, normal)
     by_surfel = _shaded(setup, light, facing)
@@ -153,11 +149,6 @@ def surfel_budget(setup: Exact) -> dict[str, Any]:
         "floor": noise_floor(noise, steps[-1].values[covered]),
         **found,
     }
-
-
-def _at(maps: list[Any], points: Points) -> np.ndarray:
-    """Values (P, K) of K full images at the points."""
-    return np.stack([np.array(x, np.float64) for x in maps], axis=-1)[points.pixel.numpy()]
 
 
 def _shaded(setup: Exact, light: Any, normal: np.ndarray) -> list[np.ndarray]:

@@ -187,22 +187,21 @@ def _sampled(run: Run, setup: Exact, roughness: float, metallic: float) -> None:
     counts = {"path": settings.spp, "monte_carlo": settings.samples}
     if metallic != settings.metallic[len(settings.metallic) // 2]:
         del counts["monte_carlo"]  # only for the plots of speed against error, which show one metal
-    for method, integrator in _samplers().items():
-        for spp in counts.get(method, ()):
-            values = setup.render(integrator, spp, seed + spp)
-            run.add(setup, method, spp, roughness, metallic, values)
-            if (method, spp) == ("path", settings.spp[-1]):
-                score = errors.mean_score(values, setup.integrals(roughness).radiance(metallic))
-                run.scores.append(setup.case(roughness, metallic) | {"score": score})
+    samplers = _samplers()
+    for method, spp in [(name, n) for name, found in counts.items() for n in found]:
+        values = setup.render(samplers[method], spp, seed + spp)
+        run.add(setup, method, spp, roughness, metallic, values)
+        if (method, spp) == ("path", settings.spp[-1]):
+            score = errors.mean_score(values, setup.integrals(roughness).radiance(metallic))
+            run.scores.append(setup.case(roughness, metallic) | {"score": score})
 
 
 def _sampled_calls(setup: Exact) -> Calls:
     """Calls that make the timed images of both."""
     setup.set_material(*TIMED)
+    render = functools.partial(mi.render, setup.scene, sensor=setup.timing_sensor)
     return {
-        (method, spp): functools.partial(
-            mi.render, setup.scene, sensor=setup.timing_sensor, integrator=integrator, spp=spp
-        )
+        (method, spp): functools.partial(render, integrator=integrator, spp=spp)
         for method, integrator in _samplers().items()
         for spp in setup.settings.timed_spp
     }

@@ -119,13 +119,11 @@ def _loss(name: str, radiance: Array, alpha: Array, target: Array, target_alpha:
 def _slopes(exact: Callable[[Array], float], values: Array, place: tuple[int, int]) -> Array:
     """Derivatives (4,) by radiance and alpha of a pixel; at equality the slope of |x| is 0, as central
     differences have it."""
-    out = np.zeros(4)
-    for i in range(4):
+
+    def difference(i: int) -> float:
         step = 1e-6 * max(abs(values[place][i]), 1e-3) if i < 3 else 1e-7
-        sides = []
-        for sign in (1, -1):
-            moved = values.copy()
-            moved[place][i] += sign * step
-            sides.append(exact(moved))
-        out[i] = (sides[0] - sides[1]) / (2 * step)
-    return out
+        moved = np.zeros_like(values)
+        moved[place][i] = step
+        return (exact(values + moved) - exact(values - moved)) / (2 * step)
+
+    return np.array([difference(i) for i in range(4)])

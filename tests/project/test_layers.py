@@ -1,4 +1,4 @@
-"""The rules that keep the package in layers, read off its syntax trees and tried on sources that break them."""
+"""The rules that keep the package in layers, read off its syntax trees and tried on breaches."""
 
 from __future__ import annotations
 
