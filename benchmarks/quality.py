@@ -55,7 +55,8 @@ def fits(folder: Path) -> list[Fit]:
         if curve := read_log(run / CURVE, CURVE_KEYS):
             seconds, psnr = np.array([(point["seconds"], point["psnr"]) for point in curve]).T
             final = float((read_metrics(Run(run)) or {}).get("psnr", np.nan))
-            found.append(Fit(folder.name, *run.parts[-3:], seconds, psnr, final))
+            data, method, seed = run.parts[-3:]
+            found.append(Fit(folder.name, data, method, seed, seconds, psnr, final))
     return found
 
 
