@@ -96,11 +96,6 @@ ALBEDO_RANGE = (0.02, 0.9)  # range of an initial albedo from images: near 0 and
 FAR = 1e4  # distance, in scene extents, at which a direction is looked up in the images
 
 
-def is_open(method: Method, data: Dataset) -> bool:
-    """Whether the images show a background that the method models apart from the object."""
-    return method.surroundings is not None and data.region is not None and not data.has_alpha
-
-
 def initial_parameters(
     method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool
 ) -> dict[str, TensorXf]:

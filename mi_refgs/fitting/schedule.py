@@ -12,7 +12,6 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.initial import is_open
 from mi_refgs.fitting.optim import Group
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method
@@ -38,7 +37,8 @@ class FitSetup:
     @cached_property
     def open_scene(self) -> bool:
         """Whether the images show a background that the method models apart from the object."""
-        return is_open(self.method, self.data)
+        known = self.method.surroundings is not None and self.data.region is not None
+        return known and not self.data.has_alpha
 
     @property
     def exposure(self) -> ExposureOptions | None:

@@ -192,31 +192,32 @@ def validation_psnr(trainer: Trainer, judges: Dataset) -> float:
     return float(np.mean([psnr(image_of(displayed_of(frame, judges), view), view) for frame, view in shown]))
 
 
+def _changes(row: dict[str, Any]) -> list[str]:
+    """What a component changed in its trial: PSNR, time per step and memory; empty if it was not tried."""
+    units = ("psnr", ".2f", "dB"), ("ms", ".1f", "ms"), ("mb", ".1f", "MB")
+    if row["with_it"] is None:
+        return []
+    return [f"{row['with_it'][key] - row['without'][key]:+{form}} {unit}" for key, form, unit in units]
+
+
 def sentence(decision: Decision) -> str:
     """The decision as one sentence."""
     verdict = "stays" if decision.stays else "is left out"
-    if decision.without is None or decision.with_it is None:
-        return f"{decision.component} {verdict}: {decision.reason}"
-    ms, mb = (getattr(decision.with_it, unit) - getattr(decision.without, unit) for unit in ("ms", "mb"))
-    return f"{decision.component} {verdict}: {decision.reason}, {ms:+.1f} ms per step, {mb:+.1f} MB"
+    _, ms, mb = _changes(asdict(decision)) or ["", "", ""]
+    costs = f", {ms} per step, {mb}" if ms else ""
+    return f"{decision.component} {verdict}: {decision.reason}{costs}"
 
 
 def table(decisions: list[dict[str, Any]]) -> str:
     """Format the decisions of a fit as a text table."""
     rows = [("component", "iteration", "gain", "time", "memory", "verdict")]
-    units = (("psnr", 2, "dB"), ("ms", 1, "ms"), ("mb", 1, "MB"))
     for row in decisions:
-        cells = ["", "", ""]
-        if row["with_it"] is not None:
-            change = {key: row["with_it"][key] - row["without"][key] for key, _, _ in units}
-            cells = [f"{change[key]:+.{digits}f} {unit}" for key, digits, unit in units]
         verdict = "stays" if row["stays"] else f"left out ({row['reason']})"
+        cells = _changes(row) or [""] * 3
         rows.append((row["component"], str(row["iteration"]), *cells, verdict))
-    widths = [max(len(row[i]) for row in rows) for i in range(5)]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True)).rstrip()
-        for row in rows
-    )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
+    return "\n".join("  ".join(row).rstrip() for row in padded)
 
 
 def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:

@@ -31,13 +31,25 @@ def images(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def test_l1(images: tuple[np.ndarray, np.ndarray]) -> None:
-    image, target = images
-    check(lambda x: losses.l1(x, planes(target)), lambda x: reference.l1(x, target), image)
-
-
 def d_ssim(image: list[Any], target: list[Any]) -> Any:
     return losses.d_ssim(image, target, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(
+    ("loss", "define", "share"),
+    [
+        (losses.l1, reference.l1, 1.0),
+        (d_ssim, lambda x, target: 1 - reference.ssim(x, target), 0.008),  # its loop over windows is slow
+    ],
+)
+def test_image_losses(
+    loss: Callable[..., Any],
+    define: Callable[..., float],
+    share: float,
+    images: tuple[np.ndarray, np.ndarray],
+) -> None:
+    image, target = images
+    check(lambda x: loss(x, planes(target)), lambda x: define(x, target), image, share)
 
 
 @pytest.mark.parametrize(("loss", "most"), [(losses.l1, 0.0), (d_ssim, 1e-6)])
@@ -96,12 +108,6 @@ def test_floater_brighter_than_white_background_costs(covered: float) -> None:
     dr.backward(loss)
     slope = np.abs(dr.grad(radiance[0]).numpy())
     assert (float(loss[0]) > 0.1 and slope.min() > 0) if not covered else (float(loss[0]) == slope.max() == 0)
-
-
-def test_ssim(images: tuple[np.ndarray, np.ndarray]) -> None:
-    image, target = images
-    share = 0.008  # the definition's loop over windows is slow
-    check(lambda x: d_ssim(x, planes(target)), lambda x: 1 - reference.ssim(x, target), image, share)
 
 
 def test_alpha_loss(rng: np.random.Generator) -> None:

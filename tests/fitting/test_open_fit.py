@@ -16,8 +16,9 @@ from mi_refgs.data.images import ImageFile
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.control import exchanged
-from mi_refgs.fitting.initial import initial_parameters, is_open
+from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.runner import begin, default_method
+from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
@@ -54,7 +55,8 @@ def method(tmp_path_factory: pytest.TempPathFactory) -> Method:
 
 def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None:
     """Small surfels in the region, others outside with sizes that grow with distance; no material columns."""
-    assert is_open(method, data) and not is_open(replace(method, surroundings=None), data)
+    without = replace(method, surroundings=None)
+    assert FitSetup(method, data).open_scene and not FitSetup(without, data).open_scene
     params = initial_parameters(method, data, np.random.default_rng(0), True)
     inner, outer = params["position"].numpy(), params["surroundings/position"].numpy()
     assert np.all(REGION.contains(inner)) and not np.any(REGION.contains(outer))
