@@ -101,6 +101,10 @@ class FilmImage:
         return height, width
 
     @property
+    def _alpha(self) -> bool:
+        return bool(mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha))
+
+    @property
     def _samples(self) -> int:
         return max(1, int(self.spp) or int(self.sensor.sampler().sample_count()))
 
@@ -114,7 +118,7 @@ class FilmImage:
         """Channels of the pixels of a band (mi.Float), pixel by pixel; under AD."""
         camera = band.camera
         frame = supersampled(self.view, camera, self._samples)
-        made = self.channels(frame, camera, mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha))
+        made = self.channels(frame, camera, self._alpha)
         pixels = dr.zeros(mi.Float, camera.width * camera.height)
         return dr.ravel(mi.ArrayXf([band.kept(channel + pixels) for channel in made]))
 
@@ -135,10 +139,10 @@ class FilmImage:
         """
         before = self.film.develop(True)
         height, width = self._size
-        alpha = mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha)
-        count = (4 if alpha else 3) + 1 + len(self.aovs)
+        weight = 4 if self._alpha else 3  # the channel that it divides by
+        count = weight + 1 + len(self.aovs)
         index = dr.arange(mi.UInt32, height * width * count) % count
-        values = dr.select(index == (4 if alpha else 3), mi.Float(1), 0)  # the weight, which it divides by
+        values = dr.select(index == weight, mi.Float(1), 0)
         dr.enable_grad(values)
         image = self._developed(values)
         start, end = (values, image) if mode == dr.ADMode.Forward else (image, values)

@@ -204,7 +204,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         """Raise InputError for shapes that do not fit and for attributes that are required but absent."""
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
         require_known_primitive(self.surfels.raw)
-        self.shading.require_inputs(self.surfels.raw)
+        self.shading.require_inputs(self.surfels.raw, mesh=self.occluder is not None)
         for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
             if not self.surfels.has(name):
                 raise InputError(f"refgs: {name}: the surfels have no such attribute; add it, or do without")

@@ -106,16 +106,13 @@ class BackgroundProperties:
 
     @staticmethod
     def read(props: Any, surfels: Surfels) -> BackgroundProperties:
-        """Read the properties; raises InputError for what does not fit the object's surfels."""
+        """Read the properties; see `require_fit` for surfels that do not fit the object's."""
         behind = read_background(props)
         colour, light = (None, behind) if isinstance(behind, EnvironmentLight) else (behind, None)
         raw = _attributes(props, "surroundings", AROUND)
-        if not raw:
-            return BackgroundProperties(None, colour, light)
         names = (*surfels.primitive.widths, "radiance_sh")
-        found = BackgroundProperties(Surfels({n: raw[n] for n in names if n in raw}), colour, light)
-        found.require_fit(surfels)
-        return found
+        around = Surfels({n: raw[n] for n in names if n in raw}) if raw else None
+        return BackgroundProperties(around, colour, light)
 
     def require_fit(self, surfels: Surfels) -> None:
         """Raise InputError unless these can surround an object of these surfels."""
@@ -181,7 +178,6 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     occlusion = _get(props, "occlusion", mesh is not None and shading.traceable)
     quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
     shading = replace(shading, occlusion=occlusion, **quality)
-    shading.require_inputs(surfels.raw, mesh=mesh is not None)
     return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None
 
 

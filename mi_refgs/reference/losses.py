@@ -70,34 +70,19 @@ def normals_from_depth(
     Steps between two surfaces, which the viewing ray meets at a cosine of at most 0.2, are not valid.
     """
     height, width = depth.shape
-    normals, valid = np.zeros((height, width, 3)), np.zeros((height, width), dtype=bool)
-
-    def point(row: int, column: int) -> Array:
-        return depth[row, column] * np.array([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, 1.0])
-
-    for row in range(1, height - 1):
-        for column in range(1, width - 1):
-            cross = [
-                (row, column),
-                (row, column - 1),
-                (row, column + 1),
-                (row - 1, column),
-                (row + 1, column),
-            ]
-            if min(alpha[place] for place in cross) < 1 / 255:
-                continue
-            normal = np.cross(
-                point(row, column + 1) - point(row, column - 1),
-                point(row + 1, column) - point(row - 1, column),
-            )
-            if np.dot(normal, normal) <= 1e-20:
-                continue
-            ray = np.array([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, 1.0])
-            if abs(np.dot(normal, ray)) <= 0.2 * np.linalg.norm(normal) * np.linalg.norm(ray):
-                continue
-            normal = -normal if np.dot(normal, point(row, column)) > 0 else normal
-            normals[row, column] = world_from_camera @ (normal / np.linalg.norm(normal))
-            valid[row, column] = True
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], axis=-1)
+    point, inner = depth[..., None] * ray, np.s_[1:-1, 1:-1]
+    normal = np.cross(point[1:-1, 2:] - point[1:-1, :-2], point[2:, 1:-1] - point[:-2, 1:-1])
+    length = np.linalg.norm(normal, axis=-1)
+    cosine = np.abs(np.sum(normal * ray[inner], axis=-1))
+    seen = alpha >= 1 / 255
+    seen = seen[inner] & seen[1:-1, :-2] & seen[1:-1, 2:] & seen[:-2, 1:-1] & seen[2:, 1:-1]
+    normals, valid = np.zeros((height, width, 3)), np.zeros((height, width), bool)
+    valid[inner] = seen & (length**2 > 1e-20) & (cosine > 0.2 * length * np.linalg.norm(ray[inner], axis=-1))
+    away = np.sum(normal * point[inner], axis=-1, keepdims=True) > 0
+    unit = np.where(away, -normal, normal) / np.where(length > 0, length, 1)[..., None]
+    normals[inner] = np.where(valid[inner][..., None], unit @ world_from_camera.T, 0)
     return normals, valid
 
 

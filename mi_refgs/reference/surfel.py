@@ -26,14 +26,8 @@ def footprint(raw: dict[str, Array], camera: PinholeCamera, rules: Rules, x: Arr
     ray = ray_slopes(camera, x, y)
     with np.errstate(all="ignore"):
         t = np.sum(p * axes[:, 2], axis=1)[:, None] / (axes[:, 2] @ ray)
-        # Only the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
-        beside = ray[None] - (p / p[:, 2:])[:, :, None]
-        plane = np.zeros_like(t)
-        lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]
-        for i in range(2):
-            along = np.einsum("nk,nkp->np", axes[:, i], beside)
-            pa = np.sum(p * axes[:, i], 1)[:, None]
-            plane = plane + (t * (along - lift * pa) / σ[:, i : i + 1]) ** 2
+        _, across = _from_centre(p, axes, ray)
+        plane = sum((t * across[i] / σ[:, i : i + 1]) ** 2 for i in range(2))
         middle = [f * p[:, i : i + 1] / p[:, 2:] + m for i, (f, m) in enumerate(intrinsics(camera))]
         screen = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
         screen = screen * rules.low_pass if rules.low_pass else np.full_like(screen, np.inf)
@@ -60,13 +54,19 @@ def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner
     ray = ray_slopes(camera, x, y)
     with np.errstate(all="ignore"):
         k = 1 / p[:, 2:]
-        beside = ray[None] - (p * k)[:, :, None]
-        pn = np.sum(p * axes[:, 2], 1)[:, None]
-        lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / pn
-        across = [
-            (np.einsum("nk,nkp->np", axes[:, i], beside) - lift * np.sum(p * axes[:, i], 1)[:, None])
-            / σ[:, i : i + 1]
-            for i in range(2)
-        ]
+        lift, across = _from_centre(p, axes, ray)
+        across = [across[i] / σ[:, i : i + 1] for i in range(2)]
         share = np.minimum(1, c.SORT_REACH * k / np.hypot(*across))
         return 1 / np.maximum(k + share * lift, k / c.SORT_DEPTH_RANGE)
+
+
+def _from_centre(p: Array, axes: Array, ray: Array) -> tuple[Array, list[Array]]:
+    """Where rays (3, P) meet the planes, relative to their centres p, over the depth there.
+
+    Returns the difference (N, P) of 1 / depth to the centre's, and the offsets (N, P) along t_u and t_v. Only
+    the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
+    """
+    beside = ray[None] - (p / p[:, 2:])[:, :, None]
+    lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]
+    along = [np.einsum("nk,nkp->np", axes[:, i], beside) for i in range(2)]
+    return lift, [along[i] - lift * np.sum(p * axes[:, i], 1)[:, None] for i in range(2)]
