@@ -312,19 +312,12 @@ def test_heading_states_image_size(compared: tuple[Path, int]) -> None:
         assert "ball (2 test views of 20 × 20 pixels)" in (compared[0] / name).read_text()
 
 
-def test_other_settings_are_refused(
+def test_other_settings_are_refused_by_the_run_itself(
     compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
 ) -> None:
+    """Without compare.json; with it, see `test_option_that_cannot_change_is_refused`."""
     folder = copied(compared[0], tmp_path / "copy")
-
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
-    refused([*command(ball, folder, variants[1]), "--preset", "standard"], "--preset", "quick", "standard")
-    changed = tmp_path / "other.toml"
-    text = variants[1].read_text().replace("tiny.toml", str(variants[0])).replace("0.5", "0.25")
-    changed.write_text(text)
-    refused(command(ball, folder, changed), "rates.decay", "0.5", "0.25", "config.toml")
-    moved = write_data(tmp_path / "elsewhere" / "ball")
-    refused(command(moved, folder, variants[1]), "dataset.json", str(ball), str(moved))
     (folder / "compare.json").unlink()
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
 

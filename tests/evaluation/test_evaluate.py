@@ -25,7 +25,6 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import read_png
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.ply import write_ply
@@ -122,16 +121,6 @@ def test_timed_frames_have_no_aovs(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("mi_refgs.runs.trained_scene.render", rendered)
     evaluate(run)
     assert asked == [True] * 4 + [False] * (metrics.WARM_UP_FRAMES + metrics.TIMED_FRAMES)
-
-
-def test_export_removes_stale_mesh(run: Run, views: Dataset) -> None:
-    evaluate(run)
-    state = run.load_checkpoint()
-    assert state is not None
-    bare = {key: value for key, value in state.items() if not key.startswith("mesh/")}
-    export(TrainedScene.from_state(run.method(), bare), run.path, views.views[0].camera())
-    assert not (run.path / "mesh.ply").exists()
-    assert not TrainedScene.read(run.path).shading.occlusion
 
 
 def test_panels_show_every_map(trainer: Trainer, views: Dataset) -> None:
