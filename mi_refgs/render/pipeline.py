@@ -230,13 +230,13 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
 
     # Frame.
     blended = buffer.slots
-    blended_terms = {"diffuse": None} | {name: blended[name] for name in asked_terms}
+    blended_terms = RadianceTerms(**{name: blended[name] for name in asked_terms}).filled()
     frame = Frame(
         alpha=buffer.alpha,
         depth=buffer.depth,
         normal=blended.get("normal"),
         radiance=blended["radiance"],
-        terms=RadianceTerms(**blended_terms).filled() if asked & {*TERMS} else None,
+        terms=blended_terms if asked & {*TERMS} else None,
         maps={name: buffer.divided(name) for name in materials},
         background=view.background,
         object_alpha=blended.get(OBJECT, None if view.others else buffer.alpha),

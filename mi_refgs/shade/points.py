@@ -57,7 +57,7 @@ class ShadingPoints:
 class RadianceTerms:
     """Outgoing radiance (mi.Color3f) as terms, None for those that do not exist; the image is their sum."""
 
-    diffuse: Any
+    diffuse: Any = None
     specular: Any = None
     indirect: Any = None
 

@@ -106,35 +106,28 @@ def write_ply(path: str | Path, surfels: Surfels) -> None:
 def encode_ply(surfels: Surfels) -> bytes:
     """The bytes of the PLY file; raises InputError if a value is not finite."""
     surfels.validate()
-    values: dict[str, np.ndarray] = {}
-    for attribute, table in surfels.to_numpy().items():
-        properties = ATTRIBUTES[attribute].properties[: table.shape[1]]
-        if ATTRIBUTES[attribute].harmonics:
-            properties = _sh_properties(properties[0], surfels.sh_degree(attribute))
-        values |= {name: table[:, column] for column, name in enumerate(properties)}
-    names = _file_order(values)
+    tables = surfels.to_numpy()
+    columns: dict[str, np.ndarray] = {}
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    for attribute in _file_order():
+        if attribute in tables:
+            properties = ATTRIBUTES[attribute].properties
+            if ATTRIBUTES[attribute].harmonics:
+                properties = _sh_properties(properties[0], surfels.sh_degree(attribute))
+            # A surfel has two of the three declared scales.
+            found = dict(zip(properties, tables[attribute].T, strict=False))
+            columns |= found
+            names += sorted((name for name in found if name not in names), key=lambda name: (len(name), name))
     rows = np.zeros(surfels.count, dtype=[(name, "<f4") for name in names])
-    for name, column in values.items():
+    for name, column in columns.items():
         rows[name] = column
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {surfels.count}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]
     return "\n".join(header).encode("ascii") + rows.tobytes()
 
 
-def _file_order(values: dict[str, np.ndarray]) -> list[str]:
-    """2DGS's order: position, normal, spherical harmonics by number, opacity, scale, rotation; then ours."""
-
-    def numbered(prefix: str) -> list[str]:
-        found = [name for name in values if name.startswith(prefix)]
-        return sorted(found, key=lambda name: int(name.split("_")[-1]))
-
-    order = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc_"), *numbered("f_rest_"), "opacity"]
-    order += [*numbered("scale_"), *numbered("rot_")]
-    others = [attribute for attribute in ATTRIBUTES.values() if attribute.properties[0] not in (*order, "f")]
-    for attribute in sorted(others, key=lambda attribute: attribute.harmonics):
-        prefix = attribute.properties[0]
-        if attribute.harmonics:
-            order += [*numbered(f"{prefix}_dc_"), *numbered(f"{prefix}_rest_")]
-        else:
-            order += [name for name in attribute.properties if name in values]
-    return order
+def _file_order() -> list[str]:
+    """Attributes in 2DGS's order, then ours, spherical harmonics last."""
+    first = ["position", "radiance_sh", "opacity", "scale", "rotation"]
+    others = (name for name in ATTRIBUTES if name not in first)
+    return [*first, *sorted(others, key=lambda name: ATTRIBUTES[name].harmonics)]

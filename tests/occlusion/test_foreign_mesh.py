@@ -86,7 +86,7 @@ def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, 
     )
     made.set_materials(surfels)
     rows = np.array(made.surface(surfels).rows).reshape(count, 8)
-    # A surfel that is not usable serves no vertex.
+    # No vertex has the materials of a surfel that is not usable.
     broken = surfels.to_numpy()
     broken["position"][7] = np.nan
     made.set_materials(Surfels.from_numpy(broken))

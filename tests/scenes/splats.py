@@ -14,7 +14,8 @@ from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import splat as reference
 from mi_refgs.reference.camera import look_at
-from mi_refgs.splat import Camera, Composited, TileLists, splat
+from mi_refgs.reference.footprint import Rules
+from mi_refgs.splat import Camera, Composited, TileLists, list_by_tile, project, splat
 from mi_refgs.surfels.table import Surfels
 
 MAX_LEFT_OUT = 0.05
@@ -133,6 +134,32 @@ def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
     return reference.differentiate(scene.raw, scene.features, scene.camera, adjoints).gradients
 
 
+def check_reference_slopes(scene: Scene) -> None:
+    """The reference's derivatives are its differences, for the strongest opacity and for a few others."""
+    weights = loss_weights(scene, 1)
+
+    def maps(raw: dict[str, np.ndarray]) -> np.ndarray:
+        found = oracle.splat(raw, scene.features, scene.camera)
+        return np.concatenate([found.features, found.depth[..., None], found.alpha[..., None]], axis=-1)
+
+    truth = oracle.differentiate(
+        scene.raw, scene.features, scene.camera, np.moveaxis(weights, 2, 0).reshape(6, -1)
+    )
+    assert np.abs(truth.maps - maps(scene.raw).reshape(-1, 6)).max() < 1e-12
+    strongest = int(np.argmax(np.abs(truth.gradients["opacity"])))
+    for name, values in scene.raw.items():
+        slopes = truth.gradients[name]
+        for row in (strongest, *range(0, len(values), max(len(values) // 3, 1))):
+            for column in range(values.shape[1]):
+                sides = []
+                for step in (1e-6, -1e-6):
+                    moved = scene.raw | {name: values.copy()}
+                    moved[name][row, column] += step
+                    sides.append(np.sum(weights * maps(moved)))
+                difference = (sides[0] - sides[1]) / 2e-6
+                assert slopes[row, column] == pytest.approx(difference, abs=1e-5 * np.abs(slopes).max()), name
+
+
 def check_gradients(scene: Scene, seed: int, tolerance: float) -> None:
     """Adjoints against float64, and none missing: a derivative that is not 0 never comes back as 0."""
     weights = loss_weights(scene, seed)
@@ -181,19 +208,23 @@ def check_degenerate(scene: Scene, case: str) -> None:
         assert all(np.isfinite(x).all() for x in gradients.values())
 
 
-def listed_pairs(lists: TileLists) -> set[tuple[int, int]]:
-    """Surfel and tile of each pair."""
+def check_lists(scene: Scene, reference: Any, most: float) -> TileLists:
+    """Every surfel-tile pair with a pixel at α ≥ ALPHA_MIN is listed once, and at most `most` times as many.
+
+    `reference`: the module of the footprint in float64. Pairs at the threshold itself may be absent.
+    """
+    camera = scene.fast_camera()
+    lists = list_by_tile(project(scene.surfels(), camera), camera)
     begin, end, surfel = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
-    return {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
-
-
-def needed_pairs(alpha: np.ndarray, camera: Camera, lists: TileLists) -> set[tuple[int, int]]:
-    """Surfel and tile of each footprint (N, H·W) that contributes, without those at the threshold itself."""
+    listed = {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
+    assert len(listed) == lists.pairs, "a pair is listed twice"
     y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
+    alpha = reference.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
+    alpha[reference.culled(scene.raw, scene.camera, Rules())] = 0
     tile = y // camera.tile[1] * camera.tiles[0] + x // camera.tile[0]
-    return {
-        (int(i), int(tile[pixel])) for i, pixel in zip(*np.nonzero(alpha >= ALPHA_MIN * 1.001), strict=True)
-    }
+    needed = {(int(i), int(tile[k])) for i, k in zip(*np.nonzero(alpha >= ALPHA_MIN * 1.001), strict=True)}
+    assert needed <= listed and len(listed) - 20 <= most * max(len(needed), 1)
+    return lists
 
 
 def gradient_errors(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:

@@ -19,7 +19,6 @@ from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import rotation_axes
 from mi_refgs.reference.footprint import Rules
 from mi_refgs.render.pipeline import Request, Shading, SurfelScene, render
-from mi_refgs.splat import list_by_tile, project
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
@@ -29,14 +28,12 @@ from tests.scenes.splats import (
     check_degenerate,
     check_gradients,
     check_image,
+    check_lists,
+    check_reference_slopes,
     check_screen_offset,
     check_transpose,
-    exact_gradients,
     fast_maps,
-    listed_pairs,
-    loss_weights,
     make_scene,
-    needed_pairs,
 )
 from tests.scenes.tiny import train_command, write_data, write_method
 
@@ -91,22 +88,8 @@ def test_reference_footprints_match_textbook_matrices() -> None:
     assert compared >= 10
 
 
-@pytest.mark.parametrize("name", ["position", "rotation", "scale", "opacity"])
-def test_the_oracles_derivatives_are_its_differences(name: str) -> None:
-    scene = gaussians(8)
-    weights = loss_weights(scene, 8)
-    slopes, step = exact_gradients(scene, weights)[name], 1e-6
-    columns = [(row, k) for row in range(len(slopes)) for k in range(slopes.shape[1])]
-    for row, k in columns[:: max(len(columns) // 12, 1)]:
-        sides = []
-        for sign in (1, -1):
-            raw = {channel: values.copy() for channel, values in scene.raw.items()}
-            raw[name][row, k] += sign * step
-            maps = oracle.splat(raw, scene.features, scene.camera)
-            values = np.concatenate([maps.features, maps.depth[..., None], maps.alpha[..., None]], axis=-1)
-            sides.append(np.sum(values * weights))
-        difference = (sides[0] - sides[1]) / (2 * step)
-        assert slopes[row, k] == pytest.approx(difference, abs=2e-5 * max(np.abs(slopes).max(), 1))
+def test_the_oracles_derivatives_are_its_differences() -> None:
+    check_reference_slopes(gaussians(8))
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -136,13 +119,7 @@ def test_screen_offset_receives_the_gradient_of_a_translation() -> None:
 @pytest.mark.parametrize("seed", range(0, 20, 3))
 def test_tile_lists_hold_what_contributes_and_little_else(seed: int) -> None:
     scene = gaussians(seed)
-    camera = scene.fast_camera()
-    lists = list_by_tile(project(scene.surfels(), camera), camera)
-    y, x = (v.ravel() + 0.5 for v in np.mgrid[0 : camera.height, 0 : camera.width])
-    alpha = exact.footprint(scene.raw, scene.camera, Rules(), x, y).alpha
-    alpha[exact.culled(scene.raw, scene.camera, Rules())] = 0
-    listed, needed = listed_pairs(lists), needed_pairs(alpha, camera, lists)
-    assert needed <= listed and len(listed) <= 1.25 * len(needed) + 20
+    lists = check_lists(scene, exact, most=1.25)
     begin, end, row = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
     depth = exact.sort_key(scene.raw, scene.camera, np.zeros(1, int), (0, 0))[:, 0]
     for first, last in zip(begin, end, strict=True):
