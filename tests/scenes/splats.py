@@ -139,10 +139,10 @@ def check_reference_slopes(scene: Scene) -> None:
     weights = loss_weights(scene, 1)
 
     def maps(raw: dict[str, np.ndarray]) -> np.ndarray:
-        found = oracle.splat(raw, scene.features, scene.camera)
+        found = reference.splat(raw, scene.features, scene.camera)
         return np.concatenate([found.features, found.depth[..., None], found.alpha[..., None]], axis=-1)
 
-    truth = oracle.differentiate(
+    truth = reference.differentiate(
         scene.raw, scene.features, scene.camera, np.moveaxis(weights, 2, 0).reshape(6, -1)
     )
     assert np.abs(truth.maps - maps(scene.raw).reshape(-1, 6)).max() < 1e-12
@@ -208,10 +208,10 @@ def check_degenerate(scene: Scene, case: str) -> None:
         assert all(np.isfinite(x).all() for x in gradients.values())
 
 
-def check_lists(scene: Scene, reference: Any, most: float) -> TileLists:
+def check_lists(scene: Scene, primitive: Any, most: float) -> TileLists:
     """Every surfel-tile pair with a pixel at α ≥ ALPHA_MIN is listed once, and at most `most` times as many.
 
-    `reference`: the module of the footprint in float64. Pairs at the threshold itself may be absent.
+    `primitive`: the module of the footprint in float64. Pairs at the threshold itself may be absent.
     """
     camera = scene.fast_camera()
     lists = list_by_tile(project(scene.surfels(), camera), camera)
@@ -219,8 +219,8 @@ def check_lists(scene: Scene, reference: Any, most: float) -> TileLists:
     listed = {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
     assert len(listed) == lists.pairs, "a pair is listed twice"
     y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
-    alpha = reference.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
-    alpha[reference.culled(scene.raw, scene.camera, Rules())] = 0
+    alpha = primitive.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
+    alpha[primitive.culled(scene.raw, scene.camera, Rules())] = 0
     tile = y // camera.tile[1] * camera.tiles[0] + x // camera.tile[0]
     needed = {(int(i), int(tile[k])) for i, k in zip(*np.nonzero(alpha >= ALPHA_MIN * 1.001), strict=True)}
     assert needed <= listed and len(listed) - 20 <= most * max(len(needed), 1)
