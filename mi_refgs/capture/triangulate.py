@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.capture import colmap
+from mi_refgs.data.colmap import MAX_ERROR, MIN_POINTS, MIN_VIEWS
 from mi_refgs.data.dataset import Dataset, PointCloud, fitting_downscale, read_dataset
 from mi_refgs.data.poses import world_to_camera
 from mi_refgs.data.view import View
@@ -32,10 +33,7 @@ LEAST_SIDE = 96  # shortest side, pixels, of images in which features are detect
 CLOSE, APART = 6, range(8, 24, 4)
 """Each view is matched with its CLOSE nearest views and with some farther ones, whose wider baselines give
 more accurate points. On 43 hand-held images 303 pairs give as many points as all 903."""
-MIN_LENGTH, MIN_POINTS = 3, 100
-"""Smallest track length, and number of points below which a track of two is enough."""
-MAX_ERROR, MIN_ANGLE = 2.0, 1.5
-"""Largest mean reprojection error of a point, pixels, and smallest angle between its rays, degrees."""
+MIN_ANGLE = 1.5  # smallest angle between the rays of a point, degrees
 
 
 def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> PointCloud | None:
@@ -44,7 +42,7 @@ def with_points(data: Dataset, folder: Path, tell: Callable[[str], None]) -> Poi
     None for images with alpha, which have a visual hull, and if none are found. Points are kept in `folder`
     for an interrupted start. `tell` is called with messages.
     """
-    enough = len(data.views) >= MIN_LENGTH and min(min(v.width, v.height) for v in data.views) >= LEAST_SIDE
+    enough = len(data.views) >= MIN_VIEWS and min(min(v.width, v.height) for v in data.views) >= LEAST_SIDE
     if data.points is not None or not enough or data.has_alpha:
         return data.points
     kept, key = folder / POINTS_FILE, _key(data)
@@ -137,8 +135,8 @@ def _cloud(model: Any) -> PointCloud | None:
         rays = points[i].xyz - np.array([centre[element.image_id] for element in points[i].track.elements])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         good[i] = np.min(rays @ rays.T) <= np.cos(np.radians(MIN_ANGLE))
-    if np.count_nonzero(good & (length >= MIN_LENGTH)) >= MIN_POINTS:
-        good &= length >= MIN_LENGTH
+    if np.count_nonzero(good & (length >= MIN_VIEWS)) >= MIN_POINTS:
+        good &= length >= MIN_VIEWS
     if not good.any():
         return None
     position = np.array([points[i].xyz for i in np.flatnonzero(good)])

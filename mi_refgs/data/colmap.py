@@ -27,7 +27,7 @@ ENDINGS = ("bin", "txt")
 MIN_VIEWS, MAX_ERROR = 3, 2.0
 """Track length and reprojection error, pixels, of points that are used: a single wrong match puts a point of
 two images anywhere on a line, and larger errors mean such a match."""
-MIN_POINTS = 100  # number of points below which none is left out
+MIN_POINTS = 100  # number of reliable points below which others are used, too
 
 
 class ColmapReader:
