@@ -59,6 +59,11 @@ class Provenance:
         """Whether the data set is known and exists."""
         return self.data is not None and self.data.is_dir()
 
+    @property
+    def is_moved(self) -> bool:
+        """Whether edits placed something elsewhere, so that the object may be outside of `region`."""
+        return any({"move", "duplicate", "join"} & edit.keys() for edit in self.edits)
+
     def views(self, split: str, decode: bool = True) -> Dataset:
         """Read a split of the data set; raises InputError for one that is unknown, missing or unreadable."""
         if self.data is None or not self.has_data:
@@ -102,5 +107,7 @@ class Provenance:
         if count < 1:
             raise InputError(f"turntable: {count} is out of range; give a number of cameras from 1")
         cameras = [shot.camera for shot in self.shots(trained, "test")]
-        region = None if trained.surroundings is None else self.region
-        return turntable_cameras(trained, cameras, count, region)
+        if trained.surroundings is None:
+            return turntable_cameras(trained, cameras, count)
+        surfels = replace(trained, mesh=None)  # the mesh contains the background, too
+        return turntable_cameras(surfels, cameras, count, None if self.is_moved else self.region)

@@ -100,8 +100,10 @@ def relight(
     cameras, kind = [shot.camera for shot in provenance.shots(fitted, "test")], "test"
     if turntable:
         region = provenance.region if views is None else views.region
-        region = None if fitted.surroundings is None else region
-        cameras, kind = turntable_cameras(scene, cameras, turntable, region), "turntable"
+        region = None if fitted.surroundings is None or provenance.is_moved else region
+        # The mesh of an open scene contains its background, too.
+        bare = scene if fitted.surroundings is None else replace(scene, mesh=None)
+        cameras, kind = turntable_cameras(bare, cameras, turntable, region), "turntable"
 
     # The folder.
     name = light.path.stem if truth_folder is None else light.path.parent.name

@@ -16,6 +16,7 @@ import pytest
 import mi_refgs
 from mi_refgs import Camera, InputError, NewLight, Reconstruction
 from mi_refgs.cli import main
+from mi_refgs.data.region import Region
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.methods.read import assignments, load_resolved
@@ -23,7 +24,7 @@ from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.runs.run import Run
 from tests.helpers import refused
 from tests.scenes.integrator import sky
-from tests.scenes.known import SIZE
+from tests.scenes.known import CENTRES, SIZE, with_background
 from tests.scenes.tiny import SETTINGS
 
 
@@ -108,6 +109,16 @@ def test_cameras_without_data_set_surround_the_object(balls: Reconstruction, tmp
     spread = np.ptp([camera.pose()[:3, 3] for camera in lost.turntable(4)], axis=0)
     assert spread[2] < 1e-6 and spread[0] > 1
     refused(lost.views, "gone is gone; use cameras")
+
+
+def test_turntable_of_an_open_scene_follows_a_moved_object(balls: Reconstruction) -> None:
+    """Around the region of interest, unless an edit moved the object out of it."""
+    source = replace(balls.provenance, region=Region((0.0, 0.0, 0.0), 1.0))
+    whole = replace(balls.changed(with_background(balls.trained)), provenance=source)
+    moved = whole.edit(move=(5, 0, 0))
+    for changed, x in ((whole, 0), (whole.edit(set=["roughness=1"]), 0), (moved, 5 + CENTRES[0][0])):
+        centre = np.mean([camera.pose()[:2, 3] for camera in changed.turntable(4)], axis=0)
+        np.testing.assert_allclose(centre, (x, 0), atol=0.05)
 
 
 # ---------------- Mitsuba ----------------
@@ -262,3 +273,4 @@ def test_load_requires_a_supported_variant(balls: Reconstruction) -> None:
     mi.set_variant("scalar_rgb")
     with pytest.raises(InputError, match=r"mi_refgs.load: variant: .* call mi.set_variant\('llvm_ad_rgb'\)"):
         mi_refgs.load(balls.folder or "")
+    mi.set_variant("llvm_ad_rgb")  # for fixtures of the next file
