@@ -208,11 +208,3 @@ def test_method_for_photographs_is_default_without_alpha(
     assert "without alpha" in said.pop()
     monkeypatch.undo()
     assert default_method(write_data(tmp_path, views=3, truth=False), say=said.append) is None and not said
-
-
-@pytest.mark.parametrize(
-    "setting", ["count=0", "degree=4", "scattered=1.5", "size=0", "prune_extent=-1", "reach=0", "height=10"]
-)
-def test_surroundings_that_cannot_be_made(setting: str) -> None:
-    with pytest.raises(Exception, match=f"surroundings.{setting.partition('=')[0]}: .*; give"):
-        methods.load("ref_gaussian", "quick", [f"surroundings.{setting}"])

@@ -225,12 +225,6 @@ def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> Non
     refused(lambda: methods.load(str(path)), "own.toml", *words)
 
 
-@pytest.mark.parametrize("assignment", ["losses.ssim=1", "loss", "iterations.x=1"])
-def test_bad_assignments_are_named(assignment: str) -> None:
-    with pytest.raises(InputError, match=r"--set|unknown key"):
-        methods.load("ref_gaussian", "quick", [assignment])
-
-
 def test_unknown_names_list_the_known_ones() -> None:
     with pytest.raises(InputError, match="ref_gaussian"):
         methods.load("no_such_method")
@@ -303,6 +297,10 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
             methods.for_purpose(word)
 
 
+SURROUNDINGS = dict(count=0, degree=4, scattered=1.5, size=0, prune_extent=-1, reach=0, height=10)
+"""Values out of range."""
+
+
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
@@ -312,9 +310,16 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
         ("surfels.from_images=['metallic']", "metallic"),
         ("surfels.attributes=['metallic', 'roughness']", "albedo"),
         ("refine.relocate={when={start=0, until=9, every=3}, grow=-0.1}", r"relocate\.grow: -0\.1"),
+        ("losses.ssim=1", "--set: unknown key 'losses'"),
+        ("loss", "--set: loss: expected key=value"),
+        ("iterations.x=1", "--set: iterations.x: 'iterations' is not a table"),
+        *(
+            (f"surroundings.{key}={value}", rf"surroundings\.{key}: .*; give")
+            for key, value in SURROUNDINGS.items()
+        ),
     ],
 )
-def test_bad_settings_of_relighting_are_named(assignment: str, words: str) -> None:
+def test_bad_settings_are_named(assignment: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         methods.load("relighting", "quick", [assignment])
 
