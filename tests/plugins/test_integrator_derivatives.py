@@ -14,8 +14,6 @@ from tests.scenes.integrator import (
     check_derivatives,
     image,
     lit_scene,
-    plane_mesh,
-    raw_channels,
     scene,
     sky,
 )
@@ -25,17 +23,6 @@ from tests.scenes.integrator import (
 def test_derivatives_with_irradiance_and_supersampling(key: str) -> None:
     of = scene(diffuse="irradiance", aovs="nn:normal,d:depth,a:albedo")
     check_derivatives(of, f"integrator.{key}", spp=4)
-
-
-def test_indirect_light_trains_from_zero(tmp_path: Path) -> None:
-    raw = raw_channels()
-    raw["indirect_sh"] *= 0
-    of = scene(raw=raw, mesh=plane_mesh(tmp_path))
-    params = mi.traverse(of)
-    leaf = params["integrator.indirect_sh"]
-    dr.enable_grad(leaf)
-    dr.backward(dr.sum(mi.render(of, params), axis=None))
-    assert np.abs(dr.grad(leaf).numpy()).max() > 1e-3
 
 
 @pytest.mark.parametrize("columns", [64, 48], ids=["as it is", "resampled"])

@@ -94,16 +94,6 @@ def test_principal_point_moves_the_image() -> None:
     assert min(shifts) < 2e-5
 
 
-def test_film_writes_and_luminance_films_work(tmp_path: Path) -> None:
-    of = scene()
-    result = image(of)
-    of.sensors()[0].film().write(str(tmp_path / "out.exr"))
-    written = np.array(mi.Bitmap(str(tmp_path / "out.exr")))
-    np.testing.assert_allclose(written, result, atol=2e-3)  # float16 film
-    grey = image(scene(sensor(film={"pixel_format": "luminance"})))
-    np.testing.assert_allclose(grey[..., 0], result @ [0.212671, 0.71516, 0.072169], atol=1e-4)
-
-
 @pytest.mark.parametrize("kind", ["thinlens", "orthographic", "batch"])
 def test_other_sensors_are_refused(kind: str) -> None:
     camera = sensor(type=kind)

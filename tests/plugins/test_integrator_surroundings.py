@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.cli import main
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import read_exr_image
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
@@ -107,20 +104,10 @@ def test_run_folder_contains_surroundings_and_background_until_removed(tmp_path:
     assert TrainedScene.read(tmp_path).surroundings is None
 
 
-def test_object_only_is_rendered_on_transparency(tmp_path: Path, capsys: Any) -> None:
-    made = fitted()
-    export(made, tmp_path, camera())
-    for name, more in (("all", []), ("alone", ["--object"])):
-        assert main(["render", str(tmp_path), "-o", str(tmp_path / f"{name}.exr"), *more]) == 0
-    capsys.readouterr()
-    whole, alone = (read_exr_image(tmp_path / f"{name}.exr") for name in ("all", "alone"))
-    np.testing.assert_array_equal(whole[..., 3], 1)
-    frame = replace(made, surroundings=None).renderer()(camera())
-    np.testing.assert_allclose(alone[..., 3].ravel(), frame.alpha.numpy(), atol=1e-4)
-    np.testing.assert_allclose(alone[..., :3].reshape(-1, 3), frame.radiance.numpy().T, atol=1e-4)
+def test_object_only_needs_surfels(tmp_path: Path) -> None:
     (tmp_path / "plain.xml").write_text('<scene version="3.0.0"><sensor type="perspective"/></scene>')
-    assert main(["render", str(tmp_path / "plain.xml"), "-o", str(tmp_path / "x.exr"), "--object"]) == 2
-    assert "--object: the scene has no `refgs`" in capsys.readouterr().err
+    command = ["render", tmp_path / "plain.xml", "-o", tmp_path / "x.exr", "--object"]
+    refused(command, "--object: the scene has no `refgs`")
 
 
 def test_surroundings_of_another_primitive_in_a_run(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Split-sum table: published values, brute-force quadrature, derivatives, and the cache."""
+"""Split-sum table: brute-force quadrature, derivatives, and the cache."""
 
 from __future__ import annotations
 
@@ -12,18 +12,6 @@ import pytest
 from mi_refgs.reference.light import table_lookup
 from mi_refgs.reference.lobe import split_sum_entry
 from mi_refgs.shade import brdf
-
-# (N·V, r): (A, B), by Monte Carlo integration with 1 million samples.
-KNOWN = {
-    (0.1, 0.2): (0.4592, 0.4697),
-    (0.3, 0.5): (0.7725, 0.0654),
-    (0.5, 0.1): (0.9683, 0.0314),
-    (0.5, 0.5): (0.8349, 0.0223),
-    (0.7, 0.8): (0.5801, 0.0020),
-    (0.9, 0.3): (0.9893, 0.0001),
-    (0.2, 0.9): (0.6776, 0.0198),
-    (0.95, 1.0): (0.3168, 0.0001),
-}
 
 
 def test_a_lookup_needs_one_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,16 +38,10 @@ def lookup(n_dot_v: float, roughness: float) -> tuple[float, float]:
     return a[0], b[0]
 
 
-@pytest.mark.parametrize("pair", KNOWN)
-def test_known_values_through_the_lookup(pair: tuple[float, float]) -> None:
-    np.testing.assert_allclose(lookup(*pair), KNOWN[pair], atol=5e-4)
-
-
-@pytest.mark.parametrize(
-    "pair", [(0.05, 0.06), (0.15, 0.3), (0.35, 0.15), (0.6, 0.95), (0.8, 0.45), (1.0, 0.7)]
-)
-def test_against_brute_force(pair: tuple[float, float]) -> None:
-    np.testing.assert_allclose(lookup(*pair), split_sum_entry(*pair), atol=5e-4)
+@pytest.mark.parametrize("n_dot_v", [0.05, 0.15, 0.35, 0.6, 0.9, 1.0])
+@pytest.mark.parametrize("roughness", [0.06, 0.15, 0.5, 0.95, 1.0])
+def test_against_brute_force(n_dot_v: float, roughness: float) -> None:
+    np.testing.assert_allclose(lookup(n_dot_v, roughness), split_sum_entry(n_dot_v, roughness), atol=5e-4)
 
 
 def test_smooth_surface_mirrors_with_schlick() -> None:

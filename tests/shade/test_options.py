@@ -46,6 +46,7 @@ def test_shading_survives_json() -> None:
         ("diffuse", ("lambert",)),
         ("dominant", (1,)),
         ("multiscatter", ("true",)),
+        ("directions", (0, 65)),
         ("traced_bounces", (None, -1, True)),
         ("visibility_rays", (0, 2.0, True)),
     ],

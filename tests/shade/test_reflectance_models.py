@@ -15,15 +15,11 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import models
-from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import ConstantLight, RotatedLight
-from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
-from mi_refgs.shade.reflectance import MODELS, TraceContext
+from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.shading import Shading, shade
-from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import check_slopes, unit, vector
 from tests.scenes.shading_points import N, exact_light, exact_terms, points_of, shading_values
@@ -256,43 +252,6 @@ def test_model_of_mirrors_does_not_pay_for_filter() -> None:
         assert launches("mirror") + 4 <= launches("gaussian_shader")
 
 
-# ---------------- images ----------------
-
-
-def table(*channels: str, count: int = 60) -> Surfels:
-    """Surfels on the unit sphere, with random materials and nearly opaque."""
-    rng = np.random.default_rng(2)
-    raw = {name: 0.4 * rng.normal(size=(count, ATTRIBUTES[name].width(2))) for name in channels}
-    raw |= {"position": unit(rng.normal(size=(count, 3))), "rotation": rng.normal(size=(count, 4))}
-    raw |= {"scale": np.full((count, 2), -1.2), "opacity": np.full((count, 1), 2.0)}
-    return Surfels.from_numpy(raw)
-
-
-@pytest.mark.parametrize("name", ["mirror", "gaussian_shader", "monte_carlo"])
-def test_every_channel_of_image_gets_its_gradient(name: str) -> None:
-    """And the channel that is missing is named."""
-    model, light = MODELS[name], EnvironmentLight.from_radiance(MAP)
-    dr.enable_grad(light.raw)
-    extra = ("indirect_sh",) if name == "monte_carlo" else ()
-    surfels = table(*model.required_attributes(ShadingOptions()), *extra)
-    surfels.enable_grad()
-    pose = np.eye(4)
-    pose[2, 3] = -4
-    camera = Camera.from_pose(24, 24, 30.0, 30.0, 12, 12, pose)
-    shading = Shading(model.shaded_at[0], name)
-    scene = SurfelScene(surfels, shading, shading.light_of(light))
-    frame = render(scene, camera, Request(scene.all_aovs))
-    assert frame.terms is not None
-    np.testing.assert_allclose(frame.terms.total().numpy(), frame.radiance.numpy(), atol=1e-5)
-    dr.backward(dr.sum(frame.radiance.x * frame.radiance.y + frame.radiance.z))
-    for channel, tensor in (surfels.raw | {"light": light.raw}).items():
-        gradient = dr.grad(tensor).numpy()
-        assert np.isfinite(gradient).all() and gradient.any(), channel
-    for missing in model.required_attributes(ShadingOptions()):
-        with pytest.raises(InputError, match=missing):
-            shading.require_inputs([other for other in surfels.raw if other != missing])
-
-
 def test_hemisphere_is_blocked_where_mesh_stands() -> None:
     """Points before a large wall get light from the other side alone."""
     n = 5
@@ -301,7 +260,7 @@ def test_hemisphere_is_blocked_where_mesh_stands() -> None:
     normal = vector(np.tile([0, 1.0, 0], (n, 1)))
     place = mi.Point3f(vector(np.linspace(0, 0.5, n)[:, None] * [1.0, 0, 0]))
     points = ShadingPoints(normal, normal, position=place)
-    context = TraceContext(occluder, table(), None, mi.Point3f(0, 9, 0), -normal)
+    context = TraceContext(occluder, Surfels({}), None, mi.Point3f(0, 9, 0), -normal)
     shading = CASES["monte_carlo, occluded"][0]
     free = np.array(shading.model.trace(points, context, shading).free)
     directions = models.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))
@@ -316,10 +275,6 @@ def test_what_models_refuse() -> None:
         Shading("pixel", "gaussian_shader")
     with pytest.raises(InputError, match="'lambert' is unknown; use split_sum or"):
         Shading(reflectance="lambert")
-    with pytest.raises(InputError, match="directions: needs reflectance = monte_carlo"):
-        Shading(directions=8)
-    with pytest.raises(InputError, match="directions: 65 is not allowed; use a whole number 1 … 64"):
-        ShadingOptions(directions=65)
     with pytest.raises(InputError, match="occlusion"):
         Shading("surfel", "gaussian_shader", occlusion=True)
     points = points_of(shading_values(np.random.default_rng(0), MATERIALS))

@@ -53,16 +53,6 @@ def test_degree_one_signs() -> None:
     np.testing.assert_allclose(basis_of(np.eye(3), 1)[:, 1:], expected, atol=1e-7)
 
 
-def test_orthonormal() -> None:
-    z, weight = np.polynomial.legendre.leggauss(8)
-    φ = (np.arange(16) + 0.5) * (2 * np.pi / 16)
-    zz, pp = (a.ravel() for a in np.meshgrid(z, φ, indexing="ij"))
-    r = np.sqrt(1 - zz * zz)
-    y = basis_of(np.stack([r * np.cos(pp), r * np.sin(pp), zz], 1))
-    gram = (y * (np.repeat(weight, 16) * 2 * np.pi / 16)[:, None]).T @ y
-    np.testing.assert_allclose(gram, np.eye(16), atol=1e-5)
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_derivatives_of_eval(degree: int, rng: np.random.Generator) -> None:
     n, count = 40, (degree + 1) ** 2
