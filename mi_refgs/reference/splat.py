@@ -117,15 +117,6 @@ class Blend:
         return gradients, self.weight @ δsums[:, :-2]
 
 
-@dataclass(frozen=True)
-class Exact:
-    """Maps (P, K + 2) — features, depth, alpha — of a whole image, and derivatives of Σ weights · maps."""
-
-    maps: Array
-    gradients: dict[str, Array]  # as the raw channels, and "features" (N, K)
-    shown: Array  # (N, P): whether a row contributes to a pixel
-
-
 def splat(raw: dict[str, Array], features: Array, camera: PinholeCamera, band: float = 1e-3) -> Maps:
     """Render raw channels with features (N, K); `band` is the relative width of the declared band."""
     blend, shape = _whole_image(raw, camera), (camera.height, camera.width)
@@ -134,15 +125,11 @@ def splat(raw: dict[str, Array], features: Array, camera: PinholeCamera, band: f
 
 
 def differentiate(
-    raw: dict[str, Array], features: Array, camera: PinholeCamera, weights: Array, order: Array | None = None
-) -> Exact:
-    """Maps, and gradients for adjoints `weights` (K + 2, P) of them.
-
-    `order` (N, P) replaces the order by `sort_key`: rows from front to back.
-    """
-    blend = _whole_image(raw, camera, order)
-    gradients, δfeatures = blend.adjoint(features, weights.T)
-    return Exact(blend.sums(features), gradients | {"features": δfeatures}, blend.weight > 0)
+    raw: dict[str, Array], features: Array, camera: PinholeCamera, weights: Array
+) -> dict[str, Array]:
+    """Gradients of Σ weights · maps, for `weights` (K + 2, P): as the raw channels, and "features" (N, K)."""
+    gradients, δfeatures = _whole_image(raw, camera).adjoint(features, weights.T)
+    return gradients | {"features": δfeatures}
 
 
 def sorted_rows(
@@ -152,10 +139,10 @@ def sorted_rows(
     return np.argsort(primitive_of(raw).sort_key(raw, camera, pixels, corner), axis=0, kind="stable")
 
 
-def _whole_image(raw: dict[str, Array], camera: PinholeCamera, order: Array | None = None) -> Blend:
+def _whole_image(raw: dict[str, Array], camera: PinholeCamera) -> Blend:
     pixels = np.arange(camera.width * camera.height)
-    order = sorted_rows(raw, camera, pixels) if order is None else order
-    return Blend.of(raw, camera, order, pixels % camera.width + 0.5, pixels // camera.width + 0.5, Rules())
+    x, y = pixels % camera.width + 0.5, pixels // camera.width + 0.5
+    return Blend.of(raw, camera, sorted_rows(raw, camera, pixels), x, y, Rules())
 
 
 def _unsort(values: Array, order: Array) -> Array:
