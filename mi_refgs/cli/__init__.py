@@ -100,7 +100,7 @@ def command_class(name: str) -> tuple[type[Any], str]:
 
 
 def parse(argv: Sequence[str]) -> Any:
-    """Parse a command line without `refgs`; returns a `Command`.
+    """Parse a command line without `refgs`; returns an object of its class (command.py).
 
     Raises InputError for bad input, SystemExit after `COMMAND --help`.
     """

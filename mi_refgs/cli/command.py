@@ -1,7 +1,7 @@
 """What commands share: options, results, and the set-up of Mitsuba.
 
 A command is a frozen dataclass whose fields are its options (tyro reads names, types, defaults and the
-strings below them), with a method `run` that returns a `Result`.
+strings below them; one is `common`, a `Common`), with a method `run` that returns a `Result`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -110,7 +110,7 @@ class Rendering(Common):
         mi.set_log_level(mi.LogLevel.Warn)
 
 
-# ---------- Commands and results ----------
+# ---------- Results ----------
 
 
 @dataclass(frozen=True)
@@ -120,17 +120,6 @@ class Result:
     data: dict[str, Any]
     text: str
     code: int = 0
-
-
-class Command(Protocol):
-    """A parsed command line."""
-
-    @property
-    def common(self) -> Common:
-        """The options of every command."""
-
-    def run(self) -> Result:
-        """Do it."""
 
 
 class UnusableError(Exception):

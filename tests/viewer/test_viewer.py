@@ -273,7 +273,7 @@ def test_a_supersampled_image_is_the_mean_of_its_samples_and_restarts_after_a_ch
     loop.change()
     loop.steps(8, 1)  # ends between two samples
     assert LARGE < loop.seen[-1].progress < DONE
-    loop.change()
+    loop.display(exposure=0.0)
     loop.plain.grey = 0.5
     loop.steps(1, 1)
     assert last() == (COARSE, encoded(0.5))
