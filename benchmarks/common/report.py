@@ -106,11 +106,11 @@ def plain_parser(name: str, description: str | None) -> argparse.ArgumentParser:
 
 
 def make_parser(
-    name: str, description: str | None, page: Any = None, **sizes: tuple[Any, str]
+    name: str, description: str | None, page: Any = None, small: Any = None
 ) -> argparse.ArgumentParser:
-    """With the options that all pages have, and a flag for each other size than that of the page.
+    """With the options that all pages have; `options.settings` are `page`, or with --small `small`.
 
-    `sizes`: settings and help. `options.settings` are the chosen ones. Sets Mitsuba's variant.
+    Sets Mitsuba's variant.
     """
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
@@ -119,9 +119,9 @@ def make_parser(
     parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write page and images of this earlier run")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    group = parser.add_mutually_exclusive_group()
-    for flag, (settings, text) in sizes.items():
-        group.add_argument(f"--{flag}", action="store_const", dest="settings", const=settings, help=text)
+    if small is not None:
+        text = "a coarse instance, below a minute"
+        parser.add_argument("--small", action="store_const", dest="settings", const=small, help=text)
     return parser
 
 

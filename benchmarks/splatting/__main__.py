@@ -21,8 +21,7 @@ from benchmarks.splatting.page import page, plot
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, and write the reports; exit code 2 for bad input."""
-    small = (SMALL, "a coarse instance, below a minute")
-    parser = make_parser("splatting", __doc__, PAGE, small=small)
+    parser = make_parser("splatting", __doc__, PAGE, SMALL)
     parser.add_argument(
         "--scene", metavar="RUN", action="append", default=[], help="run folder of a fit; repeatable"
     )

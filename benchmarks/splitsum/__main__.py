@@ -22,8 +22,7 @@ from benchmarks.splitsum.setup import CONVEX, PAGE, SMALL
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, and write the reports; exit code 2 for bad input."""
-    small = (SMALL, "a coarse instance, below a minute")
-    parser = make_parser("splitsum", __doc__, PAGE, small=small)
+    parser = make_parser("splitsum", __doc__, PAGE, SMALL)
     parser.add_argument(
         "--envmap", metavar="FILE", action="append", default=[], help="another light; repeatable"
     )

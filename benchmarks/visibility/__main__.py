@@ -21,7 +21,7 @@ from benchmarks.visibility.page import page, plot
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure, and write the reports; exit code 2 for bad input."""
-    parser = make_parser("visibility", __doc__, PAGE, small=(SMALL, "a coarse instance, below a minute"))
+    parser = make_parser("visibility", __doc__, PAGE, SMALL)
     parser.add_argument("--mesh", metavar="FILE", action="append", default=[], help="a mesh; repeatable")
     options = parser.parse_args(arguments)
     settings = replace(options.settings, meshes=tuple(options.mesh))

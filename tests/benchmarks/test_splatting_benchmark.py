@@ -13,10 +13,12 @@ import pytest
 
 from benchmarks.common.report import where
 from benchmarks.common.timing import milliseconds
+from benchmarks.memory import __main__ as memory
 from benchmarks.splatting import measure, page
 from benchmarks.splatting.__main__ import main
 from benchmarks.splatting.cases import Workload, sphere
 from benchmarks.splatting.renderers import Ours, Volprim
+from benchmarks.stability import __main__ as stability_page
 from benchmarks.stability import measure as stability
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.exact import product_order, scene_of
@@ -80,6 +82,13 @@ def test_bad_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["--small", "--quiet", "--scene", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
     assert "config.toml" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", [main, memory.main, stability_page.main])
+def test_help_is_printed(command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        command(["--help"])
+    assert "--json FILE" in capsys.readouterr().out
 
 
 # ---------- Counts ----------
