@@ -61,10 +61,13 @@ def assignments(given: Assignments) -> tuple[Assignment, ...]:
             name: [value] if isinstance(value, str) or not isinstance(value, Iterable) else [*value]
             for name, value in given.items()
         }
-        given = [
-            f"{name}={','.join(part if isinstance(part, str) else repr(float(part)) for part in parts)}"
-            for name, parts in lists.items()
-        ]
+        try:
+            given = [
+                f"{name}={','.join(part if isinstance(part, str) else repr(float(part)) for part in parts)}"
+                for name, parts in lists.items()
+            ]
+        except (ValueError, TypeError) as error:
+            raise InputError(f"--set: {abbreviated(lists)}: {error}; give numbers or expressions") from error
     return tuple(Assignment.parse(text) for text in ([given] if isinstance(given, str) else given))
 
 
@@ -77,14 +80,18 @@ def placement_of(
     The pivot is the mean of the positions, weighted by opacity, before the change. The translation includes
     that of a duplicate.
     """
-    if not SCALES[0] <= change.scale <= SCALES[1]:
-        raise InputError(f"--scale: {change.scale:g} is out of range; give {SCALES[0]:g} to {SCALES[1]:g}")
+    try:
+        scale = float(change.scale)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"--scale: {abbreviated(change.scale)}: no number; give one") from error
+    if not SCALES[0] <= scale <= SCALES[1]:
+        raise InputError(f"--scale: {scale:g} is out of range; give {SCALES[0]:g} to {SCALES[1]:g}")
     options = (("--move", change.move), ("--duplicate", change.duplicate))
     shift = sum((finite(name, x, 3) for name, x in options if x is not None), np.zeros(3))
     # Not the median, which does not rotate with the surfels: a rotation and its inverse would shift them.
     weight = sigmoid(raw["opacity"][:, 0]) + TINY
     pivot = np.average(raw["position"].astype(np.float64), axis=0, weights=weight)
-    return Placement(pivot, shift, _rotation(change.rotate), float(change.scale))
+    return Placement(pivot, shift, _rotation(change.rotate), scale)
 
 
 def _rotation(given: Rotate | None) -> Rotation:

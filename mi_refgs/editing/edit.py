@@ -51,7 +51,7 @@ def edit(
     known = EditOptions.__annotations__
     for name in options.keys() - known:
         raise InputError(f"edit: {name}: unknown option; use some of {', '.join(known)}")
-    given: dict[str, Any] = {**options}
+    given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     selection = Selection(**{f.name: given.pop(f.name) for f in fields(Selection) if f.name in given})
     given["set"] = tuple(assignment.text for assignment in assignments(given.get("set", ())))
     change = Change(**given)
