@@ -53,6 +53,7 @@ class Survey:
             cameras = f"{near:.3g} to {far:.3g} units from {_triple(self.centre)}"
         if self.region is not None:
             region = f"{self.region['radius']:.3g} units around {_triple(self.region['centre'])}"
+        truth = [*self.truth, "environment map"] if self.environment else self.truth
         items = {
             "data set": self.folder,
             "layout": self.layout,
@@ -63,8 +64,7 @@ class Survey:
             "cameras": cameras,
             "points": f"{self.points} to start from" if self.points else "none",
             "region": region,
-            "true light": "yes" if self.environment else "no",
-            "true maps": ", ".join(self.truth) or "none",
+            "ground truth": ", ".join(truth) or "none",
         }
         lines = [f"{name:<13}{value}" for name, value in items.items()]
         return "\n".join([*lines, *(f"NOTE: {note}" for note in self.missing)])

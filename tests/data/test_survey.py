@@ -35,7 +35,7 @@ def test_survey_of_complete_data_set(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert found.truth == ("normal",) and found.environment and not found.points and found.region is None
     assert found.missing == ("only 5 training views; expect surfaces that fit no others",)
     text = said(capsys, str(data))
-    for part in ("5 train, 2 test", "20 × 20", "true maps    normal", "NOTE: only 5 training views"):
+    for part in ("5 train, 2 test", "20 × 20", "ground truth normal", "NOTE: only 5 training views"):
         assert part in text
     printed = json.loads(said(capsys, str(data), "--json"))
     assert printed == json.loads(json.dumps(found.to_dict()))
