@@ -264,7 +264,9 @@ def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: 
     trainer = Trainer(dataclasses.replace(with_deferred(method, options), refine=methods.Refine()), ball())
     step_to(trainer, 22)  # into the deferred stage, with a mesh
     launches, _, misses = dr.detail.launch_stats()
+    at_vertices = trainer.fit.occluder.vertex_surfels
     step_to(trainer, 25)
+    assert trainer.fit.occluder.vertex_surfels is at_vertices  # found once per mesh
     after, _, misses_after = dr.detail.launch_stats()
     assert misses_after == misses
     assert (after - launches) / 3 < most
