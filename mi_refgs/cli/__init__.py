@@ -146,13 +146,20 @@ def _sentence(box: str) -> str:
 
 
 def _current(name: str, options: Sequence[str]) -> Iterator[str]:
-    """Replace old names of options, with a warning."""
-    for text in options:
+    """Replace old names of options, and old forms of two, with a warning."""
+    for text, following in zip(options, [*options[1:], "--"], strict=True):
         option, equals, value = text.partition("=")
         new = RENAMED.get(name, {}).get(option)
         if new is not None:
             print(f"refgs: warning: {option} is now {new}; the old name will be removed", file=sys.stderr)
-        yield text if new is None else f"{new}{equals}{value}"
+        if new == "--watch":  # --view [PORT]
+            yield new
+            yield from ["--port", value] if equals else ["--port"] if following.isdigit() else []
+        elif (name, text) == ("compare", "--cluster") and following.startswith("-"):
+            print("refgs: warning: --cluster is now --cluster local", file=sys.stderr)
+            yield from (text, "local")
+        else:
+            yield text if new is None else f"{new}{equals}{value}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

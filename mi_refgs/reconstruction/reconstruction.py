@@ -59,7 +59,7 @@ class Reconstruction:
         light, mesh, around = self.trained.light, self.trained.mesh, self.trained.surroundings
         parts = [
             counted(self.trained.surfels.count, self.trained.surfels.primitive.name),
-            f"channels = {', '.join(self.trained.surfels.raw)}",
+            f"attributes = {', '.join(self.trained.surfels.raw)}",
             f"light = {None if light is None else f'{light.height} × {2 * light.height}'}",
             f"mesh = {None if mesh is None else f'{len(mesh.faces)} triangles'}",
             *([] if around is None else [f"surroundings = {around.surfels.count}"]),

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refgs.cli import RENAMED, demo, main
+from mi_refgs.cli import RENAMED, demo, main, parse
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.plan import sized
 from mi_refgs.fitting.runner import load_method
@@ -63,6 +63,12 @@ def test_old_names_of_options_work_with_a_warning(data: Path, capsys: pytest.Cap
     for command, renamed in RENAMED.items():
         options = {*command_options(command)}
         assert {*renamed.values()} <= options and not {*renamed} & options
+    for old in (["--view", "8099"], ["--view=8099"]):
+        train = parse(["train", "data", "-o", "run", *old])
+        assert train.watch and train.port == 8099
+    assert parse(["train", "data", "-o", "run", "--view", "--resume"]).watch
+    assert parse(["compare", "data", "--cluster", "-o", "out"]).cluster == "local"
+    assert parse(["compare", "data", "--cluster", "local", "-o", "out"]).cluster == "local"
 
 
 def test_help_lists_purposes_and_presets(capsys: pytest.CaptureFixture[str]) -> None:
