@@ -138,10 +138,9 @@ def _fit(
 ) -> Trainer:
     """Train to the last iteration and write the artefacts, with the run locked."""
     data, output, resumed = views.path, run.path, run.exists()
-    if resumed:
-        _record_data(run, data, progress)
     trainer = begin(method, views, run, progress.say, find_points, progress.warn)
     if resumed:
+        _record_data(run, data, progress)  # what cannot be resumed with it has been refused
         progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
 
     progress.begin(trainer)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -104,14 +105,24 @@ class FitSetup:
             found[BACKGROUND] = (2 * around.height, 3)
         return found if self.method.light is None else found | {LIGHT: (2 * self.method.light.height, 3)}
 
-    def require_own(self, state: Mapping[str, np.ndarray]) -> None:
-        """Raise InputError if the method or the kind of images has changed since the state was written."""
+    def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
+        """Raise InputError if the method or the kind of images has changed since the state was written.
+
+        `run` is the folder that the state was written to, for the message.
+        """
         expected, views = self.shapes(), len(self.data.views)
+        config = "config.toml" if run is None else str(run / "config.toml")
         found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
+        if self.method.surroundings is not None and self.open_scene != (BACKGROUND in found):
+            before, now = ("without", "with") if BACKGROUND in found else ("with", "without")
+            raise InputError(
+                f"{self.data.path}: images {now} alpha, but {run or 'the run'} was fitted to images {before} "
+                "alpha; resume with the data set that the run began with, or choose another -o"
+            )
         for name in expected.keys() | found.keys():
             if found.get(name) != expected.get(name):
                 raise InputError(
-                    f"config.toml: {name}: the checkpoint has {found.get(name, 'none')}, the method "
+                    f"{config}: {name}: the checkpoint has {found.get(name, 'none')}, the method "
                     f"{expected.get(name, 'none')}; undo the change, or start another run"
                 )
         gains = state.get(f"{PARAMS}{GAIN}")

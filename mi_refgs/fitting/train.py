@@ -108,6 +108,7 @@ class Trainer:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from the content of a checkpoint; raises InputError if it is not one of the method."""
+        self.setup.require_own(state, None if self.run is None else self.run.path)
         self.fit = FitState.from_arrays(self.setup, state)
         self.health.checked = self.fit.iteration
 

@@ -27,6 +27,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.scenes.highlight import require_same_state, step_to
 from tests.scenes.tiny import METHOD, REGION, write_data, write_open_data
 
@@ -170,6 +171,22 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
     (run.path / "dataset.json").write_text(json.dumps({"path": str(folder), "region": {"radius": 1}}))
     with pytest.raises(InputError, match=r"dataset\.json: centre, radius"):
         views_of_run(run, method, "test")
+
+
+def test_resume_with_images_of_the_other_kind_changes_nothing(
+    data: Dataset, method: Method, tmp_path: Path
+) -> None:
+    """Images with alpha for an open run, and the reverse: the message names both folders and the cause."""
+    closed = read_dataset(write_data(tmp_path / "alpha", truth=False), "train")
+    for name, own, other, words in (
+        ("open", data, closed, "images with alpha, but {} was fitted to images without"),
+        ("closed", closed, data, "images without alpha, but {} was fitted to images with"),
+    ):
+        run = Run(tmp_path / name)
+        run.save_checkpoint(0, begin(method, own, run).state())
+        before = (run.path / "dataset.json").read_bytes()
+        refused(["train", other.path, "-o", run.path, "--resume"], f"{other.path}: ", words.format(run.path))
+        assert (run.path / "dataset.json").read_bytes() == before
 
 
 def test_fit_of_open_scene_improves(data: Dataset, method: Method) -> None:
