@@ -101,8 +101,13 @@ def load(
 
 
 def load_resolved(path: Path) -> Method:
-    """Read the resolved `config.toml` of a run, unscaled."""
-    return _built(_read(path), str(path))
+    """Read the resolved `config.toml` of a run, unscaled.
+
+    Its losses are all that the run has; a file of version 0.1, whose weights are numbers, may lack later ones.
+    """
+    losses = _parsed(path).get("loss")
+    complete = isinstance(losses, dict) and all(isinstance(loss, dict) for loss in losses.values())
+    return build(Method, _read(path), str(path)) if complete else _built(_read(path), str(path))
 
 
 def _built(table: dict[str, Any], where: str) -> Method:
@@ -165,17 +170,22 @@ def _find(name: str, where: str, folder: Path) -> Path:
     return path
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _parsed(path: Path) -> dict[str, Any]:
+    """The content of a file as it is."""
     try:
         text = path.read_text(encoding="utf-8")
         if len(text) > MAX_TEXT or max(map(len, text.splitlines()), default=0) > MAX_LINE:
             raise ValueError("too long")
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except (ValueError, RecursionError) as error:  # TOML, UTF-8, long numbers; deep nesting
         raise InputError(f"{path}: not valid TOML ({error}); correct that line") from error
-    table = _modernised(table)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The content of a file with the keys of today."""
+    table = _modernised(_parsed(path))
     with contextlib.suppress(AttributeError, KeyError, TypeError):  # what has another form is refused later
         for component in table["select"]["component"].values():
             component["change"] = _modernised(component.get("change", {}))

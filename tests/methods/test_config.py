@@ -37,6 +37,14 @@ def test_shipped_methods_load_and_read_back(variant: str, preset: str, tmp_path:
     assert methods.load_resolved(path) == method
 
 
+@pytest.mark.parametrize("losses", [{}, {"normal": methods.LossWeight(0.5)}])
+def test_a_loss_that_a_run_lacks_stays_absent(losses: dict[str, methods.LossWeight], tmp_path: Path) -> None:
+    method = dataclasses.replace(methods.load("ref_gaussian"), loss=losses)
+    path = tmp_path / "config.toml"
+    path.write_text(methods.dump(method))
+    assert methods.load_resolved(path) == method
+
+
 def test_presets_scale_the_whole_schedule() -> None:
     quick, standard = methods.load("ref_gaussian", "quick"), methods.load("ref_gaussian", "standard")
     factor = standard.iterations / quick.iterations
