@@ -6,6 +6,7 @@ No other module opens a TOML file, and none contains a method's name.
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -287,9 +288,21 @@ def assignments(settings: Mapping[str, object] | Sequence[str]) -> list[str]:
     if not isinstance(settings, Mapping):
         return [*settings]
     try:
-        return [f"{key}={tomli_w.dumps({'_': value})[len('_ = ') : -1]}" for key, value in settings.items()]
+        return [f"{key}={_inline(value)}" for key, value in settings.items()]
     except TypeError as error:
-        raise InputError(f"settings: {error}; give numbers, texts, booleans, or lists of them") from error
+        raise InputError(
+            f"settings: {error}; give numbers, texts, booleans, or lists and tables of them"
+        ) from error
+
+
+def _inline(value: object) -> str:
+    """A value as TOML in one line; raises TypeError for one that TOML does not have."""
+    if isinstance(value, Mapping):
+        pairs = [f"{json.dumps(str(key), ensure_ascii=False)} = {_inline(x)}" for key, x in value.items()]
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_inline, value))}]"
+    return tomli_w.dumps({"_": value})[len("_ = ") : -1]
 
 
 def _assign(table: dict[str, Any], assignment: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import mi_refgs
-from mi_refgs import Camera, InputError, NewLight, Reconstruction
+from mi_refgs import Camera, InputError, NewLight, Reconstruction, methods
 from mi_refgs.cli import main
 from mi_refgs.data.region import Region
 from mi_refgs.fitting.train import Trainer
@@ -230,9 +230,12 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
 
 
 def test_settings_become_toml_assignments() -> None:
-    found = assignments({"a": 1, "b.c": 0.5, "d": True, "e": "x", "f": [1, 2]})
-    assert found == ["a=1", "b.c=0.5", "d=true", 'e="x"', "f=[\n    1,\n    2,\n]"]
+    found = assignments({"a": 1, "b.c": 0.5, "d": True, "e": "x", "f": [1, 2], "g": {"h": [{"i": 1}]}})
+    assert found == ["a=1", "b.c=0.5", "d=true", 'e="x"', "f=[1, 2]", 'g={"h" = [{"i" = 1}]}']
     assert assignments(["a=1"]) == ["a=1"]
+    changes = assignments({"loss.normal": {"weight": 0.1, "rise": 3}, "data.coarse": ({"until": 9},)})
+    made = methods.load("ref_gaussian", "quick", changes)
+    assert made.loss["normal"] == methods.LossWeight(0.1, rise=3) and made.data.coarse[0].until == 9
 
 
 # ---------------- refusals ----------------
