@@ -8,6 +8,10 @@ class InputError(ValueError):
     """
 
 
+class UnknownNameError(InputError):
+    """A registry has nothing of this name."""
+
+
 class SceneError(InputError):
     """A scene lacks what a request needs. Where a run is read, its folder precedes the message."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
-from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.errors import InputError, UnknownNameError, abbreviated
 
 
 class Named(Protocol):
@@ -48,9 +48,9 @@ class Registry(Mapping[str, T], Generic[T]):
         del self._items[name]
 
     def find(self, name: str, field: str) -> T:
-        """Return an item by name; raises InputError that starts with `field` and lists the names."""
+        """Return an item by name; raises UnknownNameError that starts with `field` and lists the names."""
         if name not in self._items:
-            raise InputError(f"{field}: {abbreviated(name)} is unknown; use {' or '.join(self._items)}")
+            raise UnknownNameError(f"{field}: {abbreviated(name)} is unknown; use {' or '.join(self._items)}")
         return self._items[name]
 
     def __getitem__(self, name: str) -> T:

@@ -20,6 +20,7 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 
 
@@ -51,6 +52,10 @@ _DIGITS = 64
 
 class DamagedError(Exception):
     """The file is no checkpoint of ours, or not all of one; the message says what is wrong with it."""
+
+
+class UnregisteredError(DamagedError):
+    """The file is whole, but has an attribute that this process does not know; the message names it."""
 
 
 def encode(state: Mapping[str, np.ndarray]) -> bytes:
@@ -99,6 +104,12 @@ def part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
 def check(state: Mapping[str, np.ndarray]) -> None:
     """Raise DamagedError unless every array that a fit goes on from is there, finite and of its shape."""
     params = part(state, PARAMS)
+    names = [*channels_of(params), *channels_of(params, AROUND)]
+    if unknown := [name for name in names if name not in ATTRIBUTES]:
+        raise UnregisteredError(
+            f"surfels: {unknown[0]}: the attribute is not registered here; register it as when the run was "
+            "fitted, and repeat the command"
+        )
     try:
         table = Surfels(channels_of(params))
         geometry = table.primitive.widths

@@ -143,12 +143,15 @@ class Run:
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:
         """The newest undamaged checkpoint, or None if there is none yet; names damaged ones on stderr.
 
-        Raises InputError if all are damaged: a fit is never restarted unasked.
+        Raises InputError if all are damaged: a fit is never restarted unasked; and for an attribute that is
+        not registered.
         """
         damaged = []
         for path in reversed(self.checkpoints()):
             try:
                 return checkpoint.read(path)
+            except checkpoint.UnregisteredError as error:
+                raise InputError(f"{path}: {error}") from error
             except checkpoint.DamagedError as error:
                 damaged.append(f"{path}: damaged ({error})")
                 print(f"refgs: warning: {damaged[-1]}; trying the one before", file=sys.stderr)

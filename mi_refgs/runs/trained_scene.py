@@ -11,7 +11,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.io.files import read_json
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
@@ -26,6 +26,7 @@ from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
+from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 
@@ -89,12 +90,16 @@ class TrainedScene:
         try:
             content = read_json(note)
             shading = Shading.from_json(content["shading"])
+            for name in shading.required_attributes:
+                attribute(name)  # is registered
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
             pruned = content.get("pruned")
             if pruned is not None:
                 pruned = Pruned(int(pruned["surfels"]), float(pruned["limit"]), float(pruned["psnr"]))
             if iteration < 0 or not 0 <= seconds < math.inf:
                 raise ValueError("iteration or seconds out of range")
+        except UnknownNameError as error:
+            raise InputError(f"{note}: {error}; or register it, as when the run was fitted") from error
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InputError(
                 f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"

@@ -22,6 +22,7 @@ from mi_refgs.surfels import attributes
 from mi_refgs.surfels.attributes import Attribute
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.scenes.integrator import check_derivatives, image, raw_channels, scene
 from tests.scenes.tiny import train_command, write_data
 
@@ -63,8 +64,10 @@ def phong() -> Iterator[None]:
     attributes.register(SHININESS)
     reflectance.register(Phong())
     yield
-    reflectance.unregister("phong")
-    attributes.ATTRIBUTES.unregister("shininess")
+    if "phong" in reflectance.MODELS:
+        reflectance.unregister("phong")
+    if "shininess" in attributes.ATTRIBUTES:
+        attributes.ATTRIBUTES.unregister("shininess")
 
 
 def raw() -> dict[str, np.ndarray]:
@@ -105,3 +108,12 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     assert np.isfinite(moved).all() and np.ptp(moved) > 0
     rendered = mi.render(mi.load_file(str(tmp_path / "run" / "scene.xml")), spp=1).numpy()
     assert np.isfinite(rendered).all() and rendered.max() > 0.1
+    # Without what it needs, the run is whole, and nothing is to be written or removed.
+    reflectance.unregister("phong")
+    command = ["train", data, "-o", tmp_path / "run", "--resume"]
+    view = ["render", tmp_path / "run", "-o", tmp_path / "view.exr"]
+    assert "export" not in refused(view, "model.json", "'phong' is unknown", "register it")
+    reflectance.register(Phong())
+    attributes.ATTRIBUTES.unregister("shininess")
+    assert "export" not in refused(view, "model.json", "'shininess' is unknown", "register it")
+    assert "damaged" not in refused(command, "0000006.npz: surfels: shininess", "register it")
