@@ -104,7 +104,7 @@ def load(
 def load_resolved(path: Path) -> Method:
     """Read the resolved `config.toml` of a run, unscaled.
 
-    Its losses are all that the run has; a file of version 0.1, whose weights are numbers, may lack later ones.
+    A run has the losses in its file and no others; a file of 0.1, with numbers as weights, may lack some.
     """
     losses = _parsed(path).get("loss")
     complete = isinstance(losses, dict) and all(isinstance(loss, dict) for loss in losses.values())
