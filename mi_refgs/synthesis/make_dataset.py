@@ -67,7 +67,7 @@ def make_dataset(
     scene: str | Path,
     out: str | Path,
     *,
-    relight: Sequence[str | Path] = (),
+    relight: str | Path | Sequence[str | Path] = (),
     colmap: str | Path | None = None,
     overwrite: bool = False,
     progress: bool = True,
@@ -80,7 +80,8 @@ def make_dataset(
     pixel filter is a box, and emitters are hidden from the camera (alpha 0).
 
     `options`: those of `DatasetOptions`, such as `views`, `size`, `spp`.
-    `relight`: maps under which the test views are traced again, each in a folder of its name without suffix.
+    `relight`: maps (or one) under which the test views are traced again, each in a folder of its name without
+    suffix.
     `colmap`: folder for the same data set as COLMAP's text files (`write_colmap`).
     `overwrite`: remove the views in the folder.
 
@@ -96,8 +97,9 @@ def make_dataset(
     known = [field.name for field in fields(DatasetOptions)]
     for name in options.keys() - known:
         raise InputError(f"make_dataset: {name}: unknown option; use some of {', '.join(known)}")
-    given = DatasetOptions(**options)
-    settings, others = given.record(scene), [LightFile.of(Path(path)) for path in relight]
+    given = DatasetOptions(**options).checked(scene)
+    lights = [relight] if isinstance(relight, str | Path) else relight
+    settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
     if given.objects and others:
         raise InputError(f"{scene}: --relight: an open scene keeps its emitters; leave it out, or --shapes")
 

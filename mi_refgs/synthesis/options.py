@@ -7,6 +7,7 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,12 +16,16 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Suppress, arg
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import require_file
 
 optional = partial(arg, help_behavior_hint="")
 Count = Annotated[int, arg(metavar="N")]
 Range = tuple[float, float]
+NUMPY = np.ndarray | np.generic
+REAL = float | int
+OPTIONS = {"spp": "--samples", "test_views": "--test-views", "max_depth": "--max-depth"}
+"""Options of `refgs dataset` of another name than the field."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,9 +75,39 @@ class DatasetOptions:
             return self.views
         return max(1, self.views // 4) if self.test_views is None else self.test_views
 
+    def checked(self, scene: Path) -> DatasetOptions:
+        """These options as plain Python values; raises InputError for one of a wrong type or out of range."""
+        plain = {name: x.tolist() if isinstance(x, NUMPY) else x for name, x in vars(self).items()}
+
+        def need(field: str, kind: Any, good: Callable[..., bool], remedy: str, count: int = 1) -> None:
+            value = plain[field]
+            parts = tuple(value) if isinstance(value, list | tuple) else (value,)
+            if len(parts) != count or not all(isinstance(x, kind) for x in parts) or not good(*parts):
+                option = f"{field} ({OPTIONS[field]})" if field in OPTIONS else field
+                raise InputError(f"{scene}: {option}: {abbreviated(value)} is out of range; {remedy}")
+            plain[field] = parts if count > 1 else parts[0]
+
+        for field in ("views", "spp", "max_depth", *(["test_views"] if self.test_views is not None else [])):
+            need(field, int, lambda number: number >= 1, "give a whole number of at least 1")
+        for field in ("seed", "environment_height"):
+            need(field, int, lambda number: number >= 0, "give a whole number of at least 0")
+        sides = 2 if isinstance(plain["size"], list | tuple) else 1
+        remedy = "give pixels per side, or width and height"
+        need("size", int, lambda *numbers: min(numbers) >= 1, remedy, sides)
+        remedy = "give two angles in degrees, -90 < low < high < 90"
+        need("elevation", REAL, lambda low, high: -90 < low < high < 90, remedy, 2)
+        need("fov", REAL, lambda angle: 0 < angle < 170, "give degrees between 0 and 170")
+        need("fill", REAL, lambda fraction: 0 < fraction <= 1, "give a fraction between 0 and 1")
+        if self.distance is not None:
+            remedy = "give two lengths, 0 < NEAR <= FAR"
+            need("distance", REAL, lambda near, far: 0 < near <= far < np.inf, remedy, 2)
+        if isinstance(self.objects, str):
+            plain["objects"] = (self.objects,)
+        return DatasetOptions(**plain)
+
     def record(self, scene: Path) -> dict[str, Any]:
-        """The content of dataset.json. Raises InputError for a scene or light that cannot be read, and for an
-        option that is out of range.
+        """The content of dataset.json, of `checked` options; raises InputError for a scene or light that
+        cannot be read.
         """
         light = None if self.light is None else LightFile.of(Path(self.light))
         width, height = self.resolution
@@ -86,22 +121,7 @@ class DatasetOptions:
             "light_sha256": "" if light is None else light.sha256,
             "distance": self.distance or (0, 0),
         }
-
-        def need(good: Any, field: str, remedy: str) -> None:
-            if not good:
-                raise InputError(f"{scene}: {field}: {values[field]} is out of range; {remedy}")
-
-        for field in ("views", "test_views", "size", "spp", "max_depth"):
-            need(values[field] >= 1, field, "give a number of at least 1")
-        low, high = self.elevation
-        need(-90 < low < high < 90, "elevation", "give two angles in degrees, -90 < low < high < 90")
-        need(0 < self.fov < 170, "fov", "give degrees between 0 and 170")
-        need(0 < self.fill <= 1, "fill", "give a fraction between 0 and 1")
-        need(self.seed >= 0, "seed", "give a number of at least 0")
-        need(height >= 1, "height", "give a number of at least 1")
-        near, far = self.distance or (1, 1)
-        need(0 < near <= far < np.inf, "distance", "give two lengths, 0 < NEAR <= FAR")
-        content: dict[str, Any] = json.loads(json.dumps(values, default=lambda array: array.tolist()))
+        content: dict[str, Any] = json.loads(json.dumps(values))  # tuples become lists
         return content
 
 

@@ -238,14 +238,36 @@ def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(split.image(pose, 5).mean(), whole.mean(), rtol=0.02)
 
 
-WRONG = {"views": 0, "spp": 0, "elevation": (50, 20), "fov": 200, "fill": 0, "seed": -1}
+WRONG = {
+    "views": [0, 2.5, None],
+    "spp": [0, None],
+    "test_views": [0],
+    "elevation": [(50, 20), 30, (10, None)],
+    "fov": [200, "wide"],
+    "fill": [0],
+    "seed": [-1, 0.5],
+    "environment_height": [-3],
+    "size": [0, 16.5, (16, 8, 4), "16x8"],
+    "distance": [3, (3, 2)],
+}
 
 
-@pytest.mark.parametrize(("field", "value"), WRONG.items())
+@pytest.mark.parametrize(("field", "value"), [(field, value) for field in WRONG for value in WRONG[field]])
 def test_settings_out_of_range(made: Path, tmp_path: Path, field: str, value: Any) -> None:
     make = partial(make_dataset, made.parent / "ball.xml", tmp_path / "out", **OPTIONS | {field: value})
-    refused(make, f"ball.xml: {field}: ", "out of range")
+    option = {"spp": " (--samples)", "test_views": " (--test-views)"}.get(field, "")
+    refused(make, f"ball.xml: {field}{option}: {value!r} is out of range; give ")
     assert not (tmp_path / "out").exists()
+
+
+def test_settings_may_be_numpy_numbers_and_single_names() -> None:
+    options = DatasetOptions(
+        views=np.int64(3),  # type: ignore[arg-type]
+        size=np.array([16, 8]),  # type: ignore[arg-type]
+        fov=np.float32(30),  # type: ignore[arg-type]
+        objects="ball",  # type: ignore[arg-type]
+    ).checked(Path("ball.xml"))
+    assert options == DatasetOptions(views=3, size=(16, 8), fov=30, objects=("ball",))
 
 
 @pytest.mark.parametrize(
@@ -330,7 +352,7 @@ def test_adding_lights_traces_no_other_views(relit: Path, made: Path, traced: li
     folder, before = made.parent, files(relit)
     inherited = {k: v for k, v in files(made).items() if k not in ("dataset.json", RECORD)}
     assert before.items() >= inherited.items()
-    again = make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=[folder / "warm.exr"])
+    again = make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=str(folder / "warm.exr"))
     assert not traced and files(again) == before  # the other light stays, too
     make_dataset(folder / "ball.xml", relit, **OPTIONS)
     assert not traced and files(relit) == before
