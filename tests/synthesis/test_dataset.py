@@ -238,7 +238,7 @@ def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(split.image(pose, 5).mean(), whole.mean(), rtol=0.02)
 
 
-WRONG = {
+WRONG: dict[str, list[Any]] = {
     "views": [0, 2.5, None],
     "spp": [0, None],
     "test_views": [0],
