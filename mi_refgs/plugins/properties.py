@@ -174,10 +174,13 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     diffuse = _choice(props, "diffuse", Shading.default_diffuse(reflectance, surfels.raw), DIFFUSE)
     at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
-    shading = Shading(at, reflectance, diffuse)
-    occlusion = _get(props, "occlusion", mesh is not None and shading.traceable)
-    quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
-    shading = replace(shading, occlusion=occlusion, **quality)
+    try:
+        shading = Shading(at, reflectance, diffuse)
+        occlusion = _get(props, "occlusion", mesh is not None and shading.traceable)
+        quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
+        shading = replace(shading, occlusion=occlusion, **quality)
+    except InputError as error:  # the plugin's name of `at`
+        raise InputError(str(error).replace("needs at =", "needs shade_at =")) from error
     return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None
 
 

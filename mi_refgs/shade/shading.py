@@ -28,11 +28,11 @@ class Shading(ShadingOptions):
         rules = [
             (
                 self.shaded_at not in model.shaded_at,
-                f"reflectance: {self.reflectance} needs shade_at = {model.shaded_at[0]}; set it",
+                f"reflectance: {self.reflectance} needs at = {model.shaded_at[0]}; set it",
             ),
             (
                 self.occlusion and not self.traceable,
-                f"occlusion: needs shade_at = pixel and reflectance = {mirrors}; set these",
+                f"occlusion: needs at = pixel and reflectance = {mirrors}; set these",
             ),
             (
                 self.ambient_rays > 0 and self.diffuse != "irradiance",
@@ -44,7 +44,7 @@ class Shading(ShadingOptions):
             ),
             (
                 self.antialias and self.shaded_at != "pixel",
-                "antialias: needs shade_at = pixel; set it, or leave it out",
+                "antialias: needs at = pixel; set it, or leave it out",
             ),
         ]
         for name in chosen:

@@ -128,4 +128,4 @@ def test_one_sample_comes_closer_to_many() -> None:
 
 
 def test_antialias_requires_deferred_shading() -> None:
-    refused(lambda: Shading("surfel", antialias=True), "antialias: needs shade_at = pixel")
+    refused(lambda: Shading("surfel", antialias=True), "antialias: needs at = pixel")

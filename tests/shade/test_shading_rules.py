@@ -59,6 +59,10 @@ IMPOSSIBLE = {
         "at = 'surfel'\ntraced_bounces = 1\n[mesh]",
         ["stage.only", "traced_bounces: needs reflectance = split_sum"],
     ),
+    "a model of surfels shaded per pixel": (
+        f"[surfels]\nattributes = ['albedo', 'roughness']\n{LIGHT}{STAGE}reflectance = 'monte_carlo'",
+        ["stage.only", "monte_carlo needs at = surfel; set it"],
+    ),
     "materials reset that are none": (
         f"[surfels]\nattributes = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nrestart = ['metallic']",
         ["stage.only", "restart", "metallic"],
@@ -86,8 +90,8 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"at": "surfel", "occlusion": True}, "occlusion: needs shade_at = pixel"),
-        ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs shade_at = pixel"),
+        ({"at": "surfel", "occlusion": True}, "occlusion: needs at = pixel"),
+        ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs at = pixel"),
         ({"reflectance": "radiance", "dominant": True}, "dominant: needs reflectance"),
         ({"visibility_rays": 4}, "visibility_rays, traced_bounces, ambient_rays: need occlusion"),
         ({"diffuse": "sh", "ambient_rays": 9}, "need diffuse = irradiance"),
