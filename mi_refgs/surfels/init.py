@@ -61,8 +61,8 @@ def from_points(
     if largest is not None:
         bound = np.asarray(largest)
         if bound.shape not in ((), (count,)) or not np.all(bound > 0):
-            wanted = f"one positive bound per point, {(count,)}"
-            raise InputError(f"surfels: largest: {abbreviated(bound)} of shape {bound.shape}; give {wanted}")
+            found = f"{abbreviated(bound)} of shape {bound.shape}"
+            raise InputError(f"surfels: largest: {found}; give one positive bound per point, {(count,)}")
         spacing = np.minimum(spacing, bound)
     raw |= kind.start(spacing, quaternions(normals, count, rng))
     if fixed := [name for name in initial if name in raw]:
