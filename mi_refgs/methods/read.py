@@ -186,29 +186,57 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     """The content of a file with the keys of today."""
-    table = _modernised(_parsed(path))
-    with contextlib.suppress(AttributeError, KeyError, TypeError):  # what has another form is refused later
-        for component in table["select"]["component"].values():
-            component["change"] = _modernised(component.get("change", {}))
+    return _modernised(_parsed(path), str(path))
+
+
+def _modernised(table: dict[str, Any], where: str) -> dict[str, Any]:
+    """Tables with the keys of today, those in components too; each weight of a loss becomes a table.
+
+    Raises InputError that begins with `where` for a key that is there by its earlier name too.
+    """
+    loss = table.get("loss")
+    if isinstance(loss, dict):
+        table = table | {"loss": _weights_as_tables(loss)}
+    for old, new in RENAMED.items():
+        *parents, last = old.split(".")
+        inner = _at(table, parents)
+        if isinstance(inner, dict) and last in inner:
+            if not old.startswith(f"{new}.") and _at(table, new.split(".")) is not None:
+                raise InputError(f"{where}: {old}: is called {new} now, which is there too; remove {old}")
+            table = _merge(table, _nested(new.split("."), inner.pop(last)))
+    components = _at(table, ["select", "component"])
+    for component in components.values() if isinstance(components, dict) else ():
+        if isinstance(component, dict) and isinstance(component.get("change"), dict):
+            component["change"] = _modernised(component["change"], where)
     return table
 
 
-def _modernised(table: dict[str, Any]) -> dict[str, Any]:
-    """The content of a file with the keys of today; each weight of a loss becomes a table."""
-    loss = table.get("loss")
-    if isinstance(loss, dict):
-        weights = {key: x for key, x in loss.items() if f"loss.{key}" not in RENAMED and _is_number(x)}
-        table = table | {"loss": loss | {key: {"weight": weight} for key, weight in weights.items()}}
-    for old, new in RENAMED.items():
-        *parents, last = old.split(".")
-        inner: Any = table
-        for parent in parents:
-            inner = inner.get(parent) if isinstance(inner, dict) else None
-        if isinstance(inner, dict) and last in inner:
-            moved = inner.pop(last)
-            for key in reversed(new.split(".")):
-                moved = {key: moved}
-            table = _merge(table, moved)
+def _weights_as_tables(losses: dict[str, Any]) -> dict[str, Any]:
+    """Losses, also under the earlier key `registered`, with a table for each number that is a weight."""
+    found: dict[str, Any] = {}
+    for key, value in losses.items():
+        if key == "registered" and isinstance(value, dict):
+            value = _weights_as_tables(value)
+        elif _is_number(value) and f"loss.{key}" not in RENAMED:
+            value = {"weight": value}
+        found[key] = value
+    return found
+
+
+def _at(table: dict[str, Any], keys: Sequence[str]) -> Any:
+    """The value of a dotted key, given in parts; None if it is not there."""
+    value: Any = table
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
+
+
+def _nested(keys: Sequence[str], value: Any) -> dict[str, Any]:
+    """Tables with one value, at a dotted key that is given in parts."""
+    *parents, last = keys
+    table = {last: value}
+    for key in reversed(parents):
+        table = {key: table}
     return table
 
 
@@ -263,7 +291,10 @@ def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _keys(dotted: str) -> list[str]:
-    """The parts of a dotted key, old ones by their new names."""
+    """The parts of a dotted key, old ones by their new names, in the changes of a component too."""
+    head, separator, change = dotted.partition(".change.")
+    if separator:
+        return [*_keys(head), "change", *_keys(change)]
     for old, new in RENAMED.items():
         if dotted == old or dotted.startswith(f"{old}."):
             dotted = new + dotted[len(old) :]
@@ -313,9 +344,15 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text
-    *parents, last = _keys(key.strip())
-    if parents == ["loss"] and _is_number(value):
-        parents, last = ["loss", last], "weight"
+    key = key.strip()
+    *parents, last = _keys(key)
+    given = _at(_modernised(_nested(key.split("."), value), "--set"), [*parents, last])
+    if _is_number(value) and isinstance(given, dict):  # the weight of a loss; the rest of its table stays
+        parents, last = [*parents, last], "weight"
+    elif key == "loss.registered" and isinstance(given, dict):  # beside the other losses
+        value = _merge(table["loss"], given)
+    else:
+        value = given
     for parent in parents:
         inner = table.setdefault(parent, {})
         if not isinstance(inner, dict):

@@ -224,6 +224,10 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
             ["refine: reset", "'every' above 0"],
         ),
         (f"{STAGE}[data]\ncoarse = [{{until = 5, block = 1}}]", ["data.coarse.block: 1", "2 or more"]),
+        (
+            f"{STAGE}[surfels]\nchannels = ['albedo']\nattributes = ['tint']",
+            ["surfels.channels: is called surfels.attributes now", "remove surfels.channels"],
+        ),
         (f"{STAGE}[light]\nevery = 0", ["light.every: 0", "1 or more"]),
     ],
 )
@@ -357,6 +361,43 @@ def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
     assert own.surfels.from_images == ("albedo",) and "scale" not in own.rates.attribute
     assert own.loss["normal"] == methods.LossWeight(0.2, rise=200)
     assert own.loss["rough"] == methods.LossWeight(0.5, until=9)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "today"),
+    [
+        ("loss={normal=0.1}", "loss={normal={weight=0.1}}"),
+        ("loss={normal=0.1, normal_rise=9}", "loss={normal={weight=0.1, rise=9}}"),
+        ("loss.registered={rough=0.5}", "loss.rough={weight=0.5}"),
+        ("loss.registered.rough=0.5", "loss.rough={weight=0.5}"),
+        ("rates={channel={scale=0.1}}", "rates={attribute={scale=0.1}}"),
+        (
+            "surfels={count=9, channels=['albedo','radiance_sh','metallic','roughness','indirect_sh']}",
+            "surfels={count=9, attributes=['albedo','radiance_sh','metallic','roughness','indirect_sh']}",
+        ),
+        (
+            "select.term.degree_1.change.loss.normal=0.7",
+            "select.component.degree_1.change.loss.normal.weight=0.7",
+        ),
+        (
+            "select.component.degree_1.change={rates={channel={scale=0.1}}}",
+            "select.component.degree_1.change={rates={attribute={scale=0.1}}}",
+        ),
+        (
+            "select.component.degree_1.change.rates.channel.scale=0.1",
+            "select.component.degree_1.change.rates.attribute.scale=0.1",
+        ),
+    ],
+)
+def test_assigned_tables_may_have_earlier_keys(assignment: str, today: str) -> None:
+    old, new = (methods.load("auto", "quick", [text]) for text in (assignment, today))
+    assert dataclasses.replace(old, assignments=new.assignments) == new
+
+
+def test_a_weight_under_the_earlier_key_registered_may_be_a_number(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text('extends = "ref_gaussian"\n[loss.registered]\nrough = 0.5\n')
+    loss = methods.load(str(tmp_path / "own.toml")).loss
+    assert loss == methods.load("ref_gaussian").loss | {"rough": methods.LossWeight(0.5)}
 
 
 def test_a_stage_sets_every_shading_option() -> None:
