@@ -379,6 +379,15 @@ def _require_consistent(method: Method, where: str) -> None:
         for name, stage in method.stages()
         for one, factor in stage.rates.items()
     ]
+    for name, loss in method.loss.items():
+        most = 1 if name == "ssim" else math.inf  # 1 - ssim is the weight of L1
+        wanted = "0 or more" if most > 1 else "a fraction from 0 to 1"
+        ranges.append((f"loss.{name}.weight", loss.weight, 0 <= loss.weight <= most, wanted))
+        ranges += [
+            (f"loss.{name}.{key}", count, count >= 0, "0 or more")
+            for key in ("start", "rise", "until")
+            if (count := getattr(loss, key)) is not None
+        ]
     blocks = (images.block for images in method.data.coarse)
     ranges += [("data.coarse.block", block, block >= 2, "2 or more") for block in blocks]
     if light is not None:
