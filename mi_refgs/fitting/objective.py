@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.targets import Target
 from mi_refgs.methods.method import LossWeight, Method
+from mi_refgs.methods.read import RENAMED
 from mi_refgs.registry import Registry
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed
@@ -66,7 +68,17 @@ class Loss:
     attributes: tuple[str, ...] = ()  # of surfels, that it reads
 
 
-LOSSES = Registry[Loss]("loss")  # the registered losses, in the order in which they are summed
+def _check_name(loss: Loss) -> None:
+    """Raise InputError for a name that a method file cannot weigh, or that means something else there."""
+    bare = re.fullmatch("[A-Za-z0-9_-]+", loss.name)
+    if not bare or loss.name == "ssim" or f"loss.{loss.name}" in RENAMED:
+        raise InputError(
+            f"loss: '{loss.name}' is in use in [loss], or has characters besides letters, digits, _ and -; "
+            "choose another name"
+        )
+
+
+LOSSES = Registry[Loss]("loss", _check_name)  # the registered losses, in the order in which they are summed
 register = LOSSES.register
 """Add a loss, which method files can weigh from then on."""
 
