@@ -137,10 +137,12 @@ class ImageFile:
             if not linear:
                 band = band.astype(np.float32) / np.float32(255)
             if mask is not None:
-                covered = mask[rows, : width * block, None]
-                covered = covered * band[..., 3:] if band.shape[-1] == 4 else covered
-                band = np.concatenate([band[..., :3], covered], axis=-1)
-            if band.shape[-1] == 4 and (mask is not None or not linear):
+                shown = mask[rows, : width * block, None]
+                covered = shown * band[..., 3:] if band.shape[-1] == 4 else shown
+                # Colour of an EXR file is premultiplied by its own alpha already.
+                colour = band[..., :3] * shown if linear else band[..., :3]
+                band = np.concatenate([colour, covered], axis=-1)
+            if band.shape[-1] == 4 and not linear:
                 band[..., :3] *= band[..., 3:]
             bands.append(box_downscale(band, block))
         return np.concatenate(bands)

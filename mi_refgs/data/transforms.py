@@ -31,7 +31,7 @@ from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import inside, is_file, read_json, require_file
-from mi_refgs.io.images import ENDINGS, has_alpha, image_size, linear_from_srgb, with_ending
+from mi_refgs.io.images import ENDINGS, image_size, linear_from_srgb, with_ending
 from mi_refgs.io.ply import read_vertices
 
 SUFFIXES = (*ENDINGS, ".exr")
@@ -243,10 +243,9 @@ def read_points(path: Path) -> PointCloud | None:
 def _view(frame: Frame, options: ReadOptions) -> View:
     """The view of a frame, with its ground truth."""
     file = _image(frame, options.images)
-    mask = None
-    if options.images != "exr":
-        mask = frame.path("mask_path") or (None if has_alpha(file) else beside(file, ALPHA))
-    image = ImageFile.of(file, options.downscale, None if mask is None else Mask(mask))
+    image = ImageFile.of(file, options.downscale)
+    mask = frame.path("mask_path") or (None if image.has_alpha() else beside(file, ALPHA))
+    image = replace(image, mask=None if mask is None else Mask(mask))
     view, straight = make_view(
         image,
         options,

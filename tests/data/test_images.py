@@ -84,7 +84,10 @@ def test_image_of_many_bands_equals_whole_image(tmp_path: Path) -> None:
 
 
 def test_mask_becomes_alpha(tmp_path: Path) -> None:
-    """Colour outside of the mask does not bleed in when pixels are averaged; own alpha multiplies."""
+    """Colour outside of the mask does not bleed in when pixels are averaged; own alpha multiplies.
+
+    Colour of an EXR file is premultiplied by its own alpha, but not by the mask.
+    """
     covered = np.zeros((8, 8))
     covered[:, 3:] = 1
     colour = np.where(covered[..., None] > 0, [0.2, 0.4, 0.6], [1.0, 0.0, 1.0])
@@ -103,8 +106,13 @@ def test_mask_becomes_alpha(tmp_path: Path) -> None:
     assert alpha is not None
     np.testing.assert_allclose(alpha, np.tile([0, 0.2, 0.4, 0], (4, 1)), atol=1e-6)
     np.testing.assert_allclose(image[:, 2], np.tile([0.08, 0.16, 0.24], (4, 1)), atol=1e-6)
-    write_png(tmp_path / "m.png", np.ones((6, 4, 3)))
     mask = Mask(tmp_path / "m.png")
+    for stem, premultiplied in (("a", colour), ("b", np.concatenate([colour * own, own], axis=-1))):
+        write_exr(tmp_path / f"{stem}.exr", premultiplied)
+        linear, encoded = (read(tmp_path / f"{stem}.{kind}", 2, mask) for kind in ("exr", "png"))
+        np.testing.assert_allclose(linear[0], encoded[0], atol=1e-3)
+        np.testing.assert_allclose(np.asarray(linear[1]), np.asarray(encoded[1]), atol=1e-3)
+    write_png(tmp_path / "m.png", np.ones((6, 4, 3)))
     refused(lambda: read(tmp_path / "a.png", 1, mask), "m.png: mask: 4 × 6 pixels, but a.png has 8 × 8")
 
 

@@ -16,7 +16,8 @@ from PIL import Image
 from mi_refgs.data.array_pickle import read_arrays
 from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
-from mi_refgs.io.images import linear_from_srgb, write_png
+from mi_refgs.io.exr import write_exr
+from mi_refgs.io.images import linear_from_srgb, read_png, write_png
 from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import (
@@ -113,6 +114,11 @@ def test_masks_become_alpha(write: Callable[[Path], Path], tmp_path: Path) -> No
     view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
     assert not view.image[:18].any() and view.image[18:].max() > 0.9  # not of the copies
+    if write is write_nerfstudio:
+        for path in (data / "images").glob("*.png"):
+            write_exr(path.with_suffix(".exr"), read_png(path)[..., :3])
+        linear = read_dataset(data, "train", downscale=2, images="exr").views[0].load()
+        np.testing.assert_array_equal(linear.alpha, view.alpha)
     (data / "masks/b.png").unlink()
     refused(lambda: read_dataset(data, "train"), "masks/b.png", "missing")
 
