@@ -247,11 +247,19 @@ def read_dataset(
         cameras_only = replace(options, truth=False, decode=False)
         return views if split == "train" else reader_of(path).read(path, "train", cameras_only).views
 
-    # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored.
+    # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored, but not that of masks.
     if _opaque(views) and (split == "train" or _opaque(training())):
+        own = sum(map(_own_alpha, views))
+        note = "images have alpha, but no pixel is transparent: alpha is ignored"
+        if own < len(views):
+            note = f"alpha of {own} of {len(views)} images is ignored: no pixel is transparent"
+        notes = (*notes, note)
         ignored = (replace(v, pixels=v.pixels.without_alpha()) if _own_alpha(v) else v for v in views)
         views = tuple(ignored)
-        notes = (*notes, "images have alpha, but no pixel is transparent: alpha is ignored")
+    without = [view.name for view in views if not view.has_alpha]
+    if 0 < len(without) < len(views):
+        which = f"{len(without)} of {len(views)} images, such as '{without[0]}'"
+        notes = (*notes, f"no alpha and no mask for {which}; give all images masks, or none")
 
     # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training()) if split == "train" or _may_be_far(views) else np.zeros(3)

@@ -145,8 +145,8 @@ def _unusual(found: Survey, train: Dataset) -> list[str]:
             notes.append("no region of interest: give one in region.json")
         if not found.points:
             notes.append("no points to start from")
-    if found.alpha == "some":
-        notes.append("some images have alpha, others have none; give all of them masks, or none")
+    if found.alpha == "some" and len({view.has_alpha for view in train.views}) == 1:  # else noted already
+        notes.append("only images of one split have alpha; give all images masks, or none")
     return notes
 
 

@@ -181,6 +181,26 @@ def test_one_opaque_image_among_others_keeps_alpha(tmp_path: Path) -> None:
         assert read_dataset(data, split).has_alpha
 
 
+def test_images_without_masks_among_others_are_noted(tmp_path: Path) -> None:
+    """Of seven images, two are opaque RGBA without a mask: a fit is told, and doctor says it once."""
+    data = make_opaque(write_data(tmp_path / "ball", views=7, truth=False))
+    for i in range(2, 7):
+        path = data / f"train/r_{i}.png"
+        write_png(path.with_name(f"{path.stem}_alpha.png"), np.eye(20)[..., None].repeat(3, axis=-1))
+        write_png(path, read_png(path)[..., :3])
+    ignored, lacking = read_dataset(data, "train").notes
+    assert ignored == "alpha of 2 of 7 images is ignored: no pixel is transparent"
+    remedy = "give all images masks, or none"
+    assert lacking == f"no alpha and no mask for 2 of 7 images, such as 'train/r_0'; {remedy}"
+    assert [note for note in survey(data).missing if remedy in note] == [lacking]
+    for path in data.glob("*/r_?.png"):
+        write_png(path, np.ones((20, 20, 3)))
+    for i in range(7):
+        write_png(data / f"train/r_{i}_alpha.png", np.eye(20)[..., None].repeat(3, axis=-1))
+    noted = [note for note in survey(data).missing if remedy in note]
+    assert noted == [f"only images of one split have alpha; {remedy}"]
+
+
 # ---------------- cache ----------------
 
 
