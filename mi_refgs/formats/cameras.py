@@ -97,17 +97,18 @@ def read_cameras(path: Path) -> list[Camera]:
 
 
 def _camera(frame: Frame) -> Camera:
-    if lens := [key for key in (*COEFFICIENTS, "is_fisheye") if frame.given.get(key)]:
-        raise InputError(f"{frame.field(lens[0])}: no pinhole; undistort the images, and give those cameras")
+    if frame.lens() is not None:
+        field = next((key for key in (*COEFFICIENTS, "is_fisheye") if frame.given.get(key)), "camera_model")
+        raise InputError(f"{frame.field(field)}: no pinhole; undistort the images, and give those cameras")
     width, height = (frame.number(key) or 0.0 for key in ("w", "h"))
-    if min(width, height) < 1 or max(width, height) > SIZE_MAX:
+    if not all(1 <= side <= SIZE_MAX and side.is_integer() for side in (width, height)):
         raise InputError(
             f"{frame.field('w')}: {width:g} × {height:g} is no size of an image; correct w and h"
         )
     fx, fy = frame.focal_lengths(width, height)
-    cx, cy = (frame.number(key) for key in ("cx", "cy"))
+    cx, cy = (frame.number(key, positive=True) for key in ("cx", "cy"))
     return Camera.from_pose(
-        *(round(width), round(height), -fx, -fy),
+        *(int(width), int(height), -fx, -fy),
         width / 2 if cx is None else cx,
         height / 2 if cy is None else cy,
         frame.to_world(),
