@@ -281,9 +281,16 @@ def _image(frame: Frame, images: str) -> Path:
     if images == "exr":
         found = frame.path("exr_path") or with_ending(stem, (".exr",))
         return found or stem.with_name(f"{stem.name}.exr")
-    file = path if is_file(path) else with_ending(stem) or stem.with_name(stem.name + ENDINGS[0])
+    file = path if is_file(path) else with_ending(stem)
+    if file is None:
+        file = stem.with_name(stem.name + ENDINGS[0])
+        linear = frame.path("exr_path") or with_ending(stem, (".exr",))
+        if linear is not None and is_file(linear):
+            raise InputError(
+                f"{file}: images: missing, but there is {linear.name}; give data.images=exr to read EXR files"
+            )
     if file.suffix.lower() == ".exr":
-        raise InputError(f"{file}: images: the image is an EXR file; read this data set as 'exr'")
+        raise InputError(f"{file}: images: an EXR file; give data.images=exr to read EXR files")
     return file
 
 

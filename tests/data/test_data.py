@@ -250,6 +250,11 @@ def truncate(folder: Path) -> None:
     file.write_bytes(file.read_bytes()[:60])
 
 
+def only_exr(folder: Path) -> None:
+    for path in folder.glob("*/*.png"):
+        path.unlink()
+
+
 @pytest.mark.parametrize(
     ("damage", "options", "words"),
     [
@@ -267,6 +272,7 @@ def truncate(folder: Path) -> None:
         (edit(lambda c: c["frames"].insert(0, 3)), {}, ["frames[0]", "not an object"]),
         (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),
         (edit(lambda c: c["frames"][1].update(file_path="train/none")), {}, ["none.png", "missing"]),
+        (only_exr, {}, ["r_0.png: images: missing", "r_0.exr", "data.images=exr"]),
         (edit(lambda c: c["frames"][1].pop("transform_matrix")), {}, ["frames[1].transform_matrix", "4 × 4"]),
         (edit(lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3]])), {}, ["frames[1]", "4 × 4"]),
         (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, 1, 2))), {}, ["scale"]),
