@@ -62,9 +62,18 @@ class View:
     def load(self) -> View:
         """The view with its image decoded, from the data set's cache if it is there; itself if it is loaded.
 
-        Raises InputError for a file that cannot be read.
+        Raises InputError for a file that cannot be read, and for pixels whose shape is not that of the view.
         """
-        return replace(self, pixels=self.pixels.read()) if isinstance(self.pixels, ImageSource) else self
+        if isinstance(self.pixels, ImageSource):
+            return replace(self, pixels=self.pixels.read()).load()
+        for name, pixels, channels in (("image", self.pixels.image, (3,)), ("alpha", self.pixels.alpha, ())):
+            shape = (self.height, self.width, *channels)
+            if pixels is not None and np.shape(pixels) != shape:
+                raise InputError(
+                    f"{self.name}: pixels: {name} has shape {np.shape(pixels)}; give {shape}, as the "
+                    "view's width and height say"
+                )
+        return self
 
     @property
     def has_alpha(self) -> bool:

@@ -392,3 +392,17 @@ def test_view_of_arrays_is_loaded() -> None:
     assert view.load() is view and view.has_alpha and view.alpha is not None
     other = dataclasses.replace(view, pixels=Pixels(view.image * 0.5))
     assert not other.has_alpha and np.array_equal(other.image, view.image * 0.5)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (Pixels(np.ones((2, 3))), "image has shape (2, 3)"),
+        (Pixels(np.ones((3, 2, 3))), "image has shape (3, 2, 3)"),
+        (Pixels(np.ones((2, 3, 4))), "image has shape (2, 3, 4)"),
+        (Pixels(np.ones((2, 3, 3)), np.ones((2, 3, 1))), "alpha has shape (2, 3, 1)"),
+    ],
+)
+def test_pixels_of_another_shape_than_the_view_are_refused(pixels: Pixels, message: str) -> None:
+    view = View("a", 3, 2, 3, 3, 1.5, 1, np.eye(4), pixels)
+    refused(lambda: Target.of(view, np.ones(3)), "a: pixels: ", message, "give (2, 3")
