@@ -76,13 +76,17 @@ def load(
 ) -> Method:
     """Read a method by name or TOML path, with some of its components, scaled to a preset.
 
-    `assignments` are `key=value`, applied last and not scaled. Raises InputError that names the file and the
-    key for anything unknown or of the wrong type.
+    `assignments` are `key=value`, applied last and not scaled, except that the changes of a component are in
+    the iterations of the file. Raises InputError that names the file and the key for anything unknown or of
+    the wrong type.
     """
     if preset not in PRESETS:
         raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
     path, chosen = _find(name, "--method", Path()), PRESETS[preset]
     table = _extended(path, [])
+    of_select = [text for text in assignments or () if _keys(text.partition("=")[0].strip())[0] == "select"]
+    for assignment in of_select if components else ():
+        _assign(table, assignment)
     for component in components:
         table = _with_component(table, component, path)
     method = _built(table, str(path))

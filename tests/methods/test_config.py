@@ -403,6 +403,16 @@ def test_a_weight_under_the_earlier_key_registered_may_be_a_number(tmp_path: Pat
     assert loss == methods.load("ref_gaussian").loss | {"rough": methods.LossWeight(0.5)}
 
 
+@pytest.mark.parametrize("change", [".loss.normal=0.7", "={loss={normal=0.7}}"])
+def test_a_component_has_its_assigned_changes(tmp_path: Path, change: str) -> None:
+    """They reach the trial, and a run of it is resumed by the same assignment."""
+    assigned = [f"select.component.light_64.change{change}"]
+    made = methods.load("auto", "quick", assigned, ["light_64"])
+    assert made.loss["normal"].weight == 0.7 != methods.load("auto", "quick", assigned).loss["normal"].weight
+    (tmp_path / "config.toml").write_text(methods.dump(made))
+    assert not methods.differences(methods.load_resolved(tmp_path / "config.toml"), made)
+
+
 def test_a_stage_sets_every_shading_option() -> None:
     options = ["dominant=true", "multiscatter=true", "light_levels=3", "visibility_rays=4", "antialias=true"]
     method = methods.load("ref_gaussian", "quick", [f"stage.deferred.{option}" for option in options])
