@@ -147,7 +147,7 @@ def _sentence(box: str) -> str:
 
 def _current(name: str, options: Sequence[str]) -> Iterator[str]:
     """Replace old names of options, and old forms of two, with a warning."""
-    for text, following in zip(options, [*options[1:], "--"], strict=True):
+    for text, following in zip(options, [*options, "--"][1:], strict=True):
         option, equals, value = text.partition("=")
         new = RENAMED.get(name, {}).get(option)
         if new is not None:

@@ -66,7 +66,7 @@ def test_old_names_of_options_work_with_a_warning(data: Path, capsys: pytest.Cap
     for old in (["--view", "8099"], ["--view=8099"]):
         train = parse(["train", "data", "-o", "run", *old])
         assert train.watch and train.port == 8099
-    assert parse(["train", "data", "-o", "run", "--view", "--resume"]).watch
+    assert parse(["train", "data", "-o", "run", "--view", "--resume"]).watch and parse(["doctor"])
     assert parse(["compare", "data", "--cluster", "-o", "out"]).cluster == "local"
     assert parse(["compare", "data", "--cluster", "local", "-o", "out"]).cluster == "local"
 
