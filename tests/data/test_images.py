@@ -182,7 +182,7 @@ def test_one_opaque_image_among_others_keeps_alpha(tmp_path: Path) -> None:
 
 
 def test_images_without_masks_among_others_are_noted(tmp_path: Path) -> None:
-    """Of seven images, two are opaque RGBA without a mask: a fit is told, and doctor says it once."""
+    """Two of seven images are opaque RGBA without a mask: a fit is told, and doctor says it once."""
     data = make_opaque(write_data(tmp_path / "ball", views=7, truth=False))
     for i in range(2, 7):
         path = data / f"train/r_{i}.png"
