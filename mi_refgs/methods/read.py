@@ -110,9 +110,11 @@ def load_resolved(path: Path) -> Method:
 
     A run has the losses in its file and no others; a file of 0.1, with numbers as weights, may lack some.
     """
-    losses = _parsed(path).get("loss")
+    parsed = _parsed(path)
+    losses = parsed.get("loss")
     complete = isinstance(losses, dict) and all(isinstance(loss, dict) for loss in losses.values())
-    return build(Method, _read(path), str(path)) if complete else _built(_read(path), str(path))
+    table = _modernised(parsed, str(path))
+    return build(Method, table, str(path)) if complete else _built(table, str(path))
 
 
 def _built(table: dict[str, Any], where: str) -> Method:

@@ -158,7 +158,7 @@ class Plain(ViewerScene):
         self.during: Callable[[], None] = lambda: None  # called in each draw
 
     def frame(self, sample: SampleRequest) -> Frame:
-        raise NotImplementedError
+        raise AssertionError("`draw` of this scene renders no frame")
 
     def draw(self, sample: SampleRequest) -> SampleResult:
         self.samples.append(sample)
