@@ -250,7 +250,7 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
     scene, camera, shading = view.scene, view.camera, view.scene.shading
     # G-buffer: the model's attributes and the requested ones.
     slots = {"normal": view.points.normal} | view.points.attributes
-    slots |= {name: value for name, value in scene.surfels.values(view.asked).items() if name not in slots}
+    slots |= scene.surfels.values(view.asked - slots.keys())
     others = {AROUND: view.others["radiance"]} if view.others else {}
     buffer = view.blend(slots | view.presence, others)
     values = {name: buffer.divided(name) for name in slots if name != "normal"}

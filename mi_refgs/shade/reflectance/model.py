@@ -52,7 +52,7 @@ class Reflectance:
 
     @property
     def honours(self) -> tuple[str, ...]:
-        """QUALITY options that have an effect: `options`, and the levels of a light that is prefiltered."""
+        """QUALITY options that have an effect: `honoured`, and the levels of a light that is prefiltered."""
         return (*self.honoured, "light_levels") if self.light == "filtered" else self.honoured
 
     def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
