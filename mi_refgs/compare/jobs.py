@@ -129,6 +129,11 @@ def plan(
     return jobs
 
 
+def settings_of(folder: Path) -> dict[str, Any]:
+    """Return the settings of the comparison in a folder; none if there is no comparison."""
+    return read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+
+
 def output_folder(folder: Path) -> OutputFolder:
     """Return the folder of a comparison with its files beside the runs."""
     files = (SETTINGS, TABLE, TABLE_TEXT, PAGE, f"{PICTURES}/*_psnr.png", f"{PICTURES}/*_crops.png")
@@ -143,7 +148,7 @@ def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequenc
     output_folder(folder).require_free()
     for job in planned:
         job.write()
-    before = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    before = settings_of(folder)
     about = {
         "data": list(dict.fromkeys([*before.get("data", []), *(job.data for job in planned)])),
         "variants": list(dict.fromkeys([*before.get("variants", []), *(job.name for job in planned)])),

@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.compare.jobs import FAILED, SETTINGS, Job, finished, jobs_in, require_one_size
+from mi_refgs.compare.jobs import FAILED, Job, finished, jobs_in, require_one_size, settings_of
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.evaluation.scores import SCORES, Score
@@ -83,7 +83,7 @@ def table_of(folder: Path) -> Table:
 
     Raises InputError for runs on one data set that were measured on images of different sizes.
     """
-    about = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    about = settings_of(folder)
 
     def order(job: Job) -> tuple[Any, ...]:
         """Data sets and methods in the order in which they were given; others last."""

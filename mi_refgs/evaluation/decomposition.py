@@ -160,7 +160,7 @@ def panels(measured: MeasuredView, scale: np.ndarray) -> dict[str, np.ndarray]:
         pairs["normals"] = [*shown]
     for name in NAMES:
         if name in maps:
-            ours = maps[name].reshape(*rendered.alpha.shape, -1) * (scale if name == "albedo" else 1.0)
+            ours = maps[name] * (scale if name == "albedo" else 1.0)
             pairs[name] = [material_colours(ours, rendered.alpha)]
             if name in view.materials:
                 true = view.materials[name]

@@ -76,9 +76,7 @@ def panels(rendered: RenderedView, view: View) -> dict[str, np.ndarray]:
     found["normals"] = normal_colours(rendered.normal, rendered.alpha)
     for name in (*(name for name, attribute in ATTRIBUTES.items() if attribute.aov), "visibility"):
         if name in rendered.maps:
-            values = rendered.maps[name]
-            values = values if values.ndim == 3 else values[..., None]
-            found[name] = material_colours(values, rendered.alpha)
+            found[name] = material_colours(rendered.maps[name], rendered.alpha)
     return {title: np.clip(image, 0, 1) for title, image in found.items()}
 
 
@@ -88,7 +86,8 @@ def normal_colours(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def material_colours(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert a linear colour (H, W, 3) or a number (H, W, 1) per pixel to colours over white."""
+    """Convert a linear colour (H, W, 3) or a number, (H, W) or (H, W, 1), per pixel to colours over white."""
+    values = values.reshape(*alpha.shape, -1)
     colours = srgb_from_linear(values) if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
     return on_white(colours, alpha)
 

@@ -134,7 +134,7 @@ def names() -> list[str]:
 
 def for_purpose(purpose: str) -> str:
     """The shipped method with this `about.purpose`; raises InputError if there is none."""
-    found = {_read(path).get("about", {}).get("purpose"): path.stem for path in _shipped()}
+    found = {_parsed(path).get("about", {}).get("purpose"): path.stem for path in _shipped()}
     if not purpose or purpose not in found:
         known = ", ".join(sorted(filter(None, found)))
         raise InputError(f"--for: {purpose}: no method is for that; use one of {known}, or choose a --method")

@@ -82,7 +82,7 @@ class Provenance:
         for split in splits:
             views = originals = read_views(self.method, self.data, split, truth=False, decode=False).views
             if (self.method.data.downscale or 1) > 1:  # image files are those on disk
-                whole = replace(self.method, data=replace(self.method.data, downscale=1))
+                whole = self.method.downscaled(1)
                 originals = read_views(whole, self.data, split, truth=False, decode=False).views
             for view, original in zip(views, originals, strict=True):
                 shots.append(Shot(view.name, split, view.camera(), self._relative(original.file)))
