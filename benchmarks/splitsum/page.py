@@ -52,10 +52,15 @@ def view_bins(result: dict[str, Any]) -> list[str]:
     return sorted(names, key=lambda name: float(name.partition("-")[0]))
 
 
-def trust(result: dict[str, Any], light: str, roughness: float, view: str = "all") -> Row | None:
-    """The split sum's row of the largest relMSE, over shapes and metals, for the finest light."""
+def finest(result: dict[str, Any], light: str, roughness: float, view: str = "all") -> list[Row]:
+    """The split sum's rows of the convex shapes and all metals, for the finest light."""
     chosen = {"method": "split_sum", "setting": best_height(result), "n_dot_v": view}
-    rows = where(result["rows"], light=light, roughness=roughness, shape=convex(result), **chosen)
+    return where(result["rows"], light=light, roughness=roughness, shape=convex(result), **chosen)
+
+
+def trust(result: dict[str, Any], light: str, roughness: float, view: str = "all") -> Row | None:
+    """The row of the largest relMSE, over shapes and metals, for the finest light."""
+    rows = finest(result, light, roughness, view)
     return max(rows, key=lambda row: float(row["relmse"]), default=None)
 
 
@@ -134,10 +139,7 @@ def _by_roughness(
 
 def _bias(result: dict[str, Any], light: str, roughness: float) -> Row:
     """The convex shape and metal of the largest bias, for the finest light."""
-    chosen = {"method": "split_sum", "setting": best_height(result), "n_dot_v": "all"}
-    shapes = convex(result)
-    rows = where(result["rows"], light=light, roughness=roughness, shape=shapes, **chosen)
-    return max(rows, key=lambda row: abs(float(row["bias"])))
+    return max(finest(result, light, roughness), key=lambda row: abs(float(row["bias"])))
 
 
 def _price(result: dict[str, Any]) -> str:

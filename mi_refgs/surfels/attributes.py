@@ -30,7 +30,7 @@ PROBABILITY_MARGIN = 1e-6
 """Least distance of initial values from 0 and 1, where the logit is infinite."""
 
 Activation = Literal["identity", "quaternion", "exp", "sigmoid", "harmonics"]
-"""Activation of a raw value. "quaternion": normalised (x, y, z, w); "sigmoid": logistic; "harmonics": raw
+"""Activation of a raw value. "quaternion": normalised (x, y, z, w); "sigmoid": logistic; `harmonics`: raw
 values are SH coefficients of a colour, column = 3 coefficient + rgb."""
 
 

@@ -145,11 +145,12 @@ def scene_hash(scene: Path) -> str:
     """SHA-256 of a scene's XML and the files in it; raises InputError if it is missing or no XML."""
     if not scene.is_file():
         raise InputError(f"{scene}: scene: missing; give the path of a Mitsuba XML file")
+    content = scene.read_bytes()
     try:
-        root = ElementTree.fromstring(scene.read_bytes())
+        root = ElementTree.fromstring(content)
     except ElementTree.ParseError as error:
         raise InputError(f"{scene}: scene: not XML ({error}); give a Mitsuba scene") from error
-    digest = hashlib.sha256(scene.read_bytes())
+    digest = hashlib.sha256(content)
     names = [e.get("value") for e in root.iter("string") if e.get("name") == "filename"]
     for name in [*names, *(e.get("filename") for e in root.iter("include"))]:
         file = scene.parent / (name or "")

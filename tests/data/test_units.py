@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
@@ -19,7 +18,7 @@ from mi_refgs.data.survey import require_several_sides, survey
 from mi_refgs.fitting.initial import initial_surfels
 from mi_refgs.fitting.optim import Adam, Group
 from mi_refgs.fitting.schedule import FitSetup
-from mi_refgs.occlusion.mesh import Mesh, write_mesh
+from mi_refgs.occlusion.mesh import write_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.depth_normals import normals_from_depth
@@ -29,7 +28,7 @@ from mi_refgs.surfels.init import neighbour_scale
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes import layouts
-from tests.scenes.integrator import image, raw_channels, scene, sensor
+from tests.scenes.integrator import image, raw_channels, scene, sensor, wall
 from tests.scenes.tiny import write_data
 
 SCALES = (1e-6, 3e-3, 1e3, 1e6)
@@ -43,14 +42,6 @@ def scaled(raw: dict[str, np.ndarray], scale: float) -> dict[str, np.ndarray]:
     """Raw channels of the scene in another unit."""
     scale_log = (raw["scale"].astype(np.float64) + np.log(scale)).astype(np.float32)
     return raw | {"position": raw["position"] * np.float32(scale), "scale": scale_log}
-
-
-def wall(scale: float) -> Mesh:
-    """A box that some of the reflections meet."""
-    box = trimesh.creation.box((0.2, 8, 8))
-    box.apply_translation((-2.5, 4, 0))
-    vertices = (box.vertices * scale).astype(np.float32)
-    return Mesh(vertices, box.faces.astype(np.uint32), 0.05 * scale)
 
 
 @pytest.mark.parametrize("scale", SCALES)

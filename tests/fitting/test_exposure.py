@@ -27,7 +27,7 @@ from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
-from tests.fitting.image_checks import BACKGROUND, HEIGHT, STEP, WIDTH, planes, shown, view_of
+from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, gradient, planes, shown, view_of
 from tests.helpers import with_pixels
 from tests.scenes.highlight import SIZE, ball, require_same_state, run_folder, small_method, step_to
 
@@ -94,9 +94,7 @@ def test_exposure_of_step_and_its_derivative(
     frame = Frame(upload(alpha), upload(alpha), mi.Vector3f(0, 0, 1), mi.Color3f(*planes(radiance)))
     loss, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), {}, 1)
     assert float(loss[0]) == pytest.approx(define(log), abs=3e-6)
-    expected = np.array(
-        [(define(log + STEP * axis) - define(log - STEP * axis)) / (2 * STEP) for axis in np.eye(3)]
-    )
+    expected = gradient(define, log)
     dr.backward(loss, dr.ADFlag.ClearInterior)
     found = np.array([float(dr.grad(leaf)[0]) for leaf in leaves])
     np.testing.assert_allclose(found, expected, rtol=2e-4)

@@ -69,12 +69,18 @@ def image(of: mi.Scene, **arguments: object) -> np.ndarray:
     return mi.render(of, **arguments).numpy()
 
 
+def wall(scale: float = 1) -> Mesh:
+    """A wall behind the sphere's right half, seen in its reflections; `scale`: of the unit of length."""
+    box = trimesh.creation.box((0.2, 8, 8))
+    box.apply_translation((-2.5, 4, 0))
+    vertices = (box.vertices * scale).astype(np.float32)
+    return Mesh(vertices, box.faces.astype(np.uint32), 0.05 * scale)
+
+
 def plane_mesh(folder: Path) -> str:
-    """A wall behind the sphere's right half, seen in its reflections."""
-    mesh = trimesh.creation.box((0.2, 8, 8))
-    mesh.apply_translation((-2.5, 4, 0))
+    """The file of `wall`."""
     path = folder / "mesh.ply"
-    write_mesh(path, Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), 0.05))
+    write_mesh(path, wall())
     return str(path)
 
 
