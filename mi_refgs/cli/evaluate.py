@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mi_refgs.cli.command import Flag, OtherData, Rendering, Result, RunFolder, Samples
-from mi_refgs.evaluation.scores import SCORES
+from mi_refgs.evaluation.scores import PIXEL_CLASSES, SCORES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,4 +45,15 @@ def table(result: dict[str, Any]) -> str:
             lines.append(f"{score.title:<27}{form.format(value)}{suffix}")
         elif score.reason:
             lines.append(f"{score.title:<27}none: {result[f'{score.reason}_reason']}")
+    if result["error_budget"]:
+        lines += budget_table(result["error_budget"])
     return "\n".join(lines)
+
+
+def budget_table(budget: dict[str, dict[str, Any]]) -> list[str]:
+    """Return the lines of a table of `error_budget`: share of the pixels and of the error per class."""
+    lines = [f"{'error budget':<30}{'pixels':>8}{'squared error':>16}{'normal error':>15}"]
+    for name, row in budget.items():
+        angle = "" if row["normal_mae_deg"] is None else f"{row['normal_mae_deg']:>14.1f}°"
+        lines.append(f"  {PIXEL_CLASSES[name]:<28}{row['pixels']:>8.1%}{row['squared_error']:>16.1%}{angle}")
+    return lines

@@ -18,6 +18,7 @@ from mi_refgs.data.region import region_pixels
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics
+from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
@@ -55,6 +56,8 @@ def evaluate(
     `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
     `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
     `…_concave`                    pixels where the true surface is concave (`evaluation.surface`)
+    `error_budget`                 shares of the squared error per class of pixels, pooled over the views
+                                   (`evaluation.error_budget`)
     `psnr_gain`                    after one gain per channel and view (`data.exposure.fitted_gain`), which
                                    compares methods on images of different exposure
     `exposure`                     what the fit decided about its own exposure compensation
@@ -92,6 +95,7 @@ def evaluate(
         _means(measured.per_view)
         | light_scores
         | measured.errors.result()
+        | measured.budget.result()
         | surface_scores(fitted.mesh, surface, views.views)
     )
     cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
@@ -132,6 +136,7 @@ class Measured:
 
     per_view: list[dict[str, Any]] = field(default_factory=list)
     errors: decomposition.Decomposition = field(default_factory=decomposition.Decomposition)
+    budget: ErrorBudget = field(default_factory=ErrorBudget)
     panels: list[dict[str, np.ndarray]] = field(default_factory=list)  # rows of SHEET
     materials: list[decomposition.MeasuredView] = field(default_factory=list)  # rows of DECOMPOSITION
 
@@ -162,12 +167,13 @@ def _measure(
         scores |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
         measured.per_view.append(scores)
 
-        # Errors of materials and of concave pixels.
+        # Errors of materials, of concave pixels and per class of pixels.
         concave = None if surface is None else surface.concave(view)
         materials = decomposition.MeasuredView(
             rendered, material_maps(view.camera(), rendered), view, concave
         )
         measured.errors.add(materials)
+        measured.budget.add(rendered, view, classify(view, surface))
 
         # Images.
         write_png(images[index], rendered.image)

@@ -45,3 +45,13 @@ SCORES = (
     Score("samples", "samples per pixel", "{}"),
     Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True, higher=False),
 )
+
+PIXEL_CLASSES = {
+    "silhouette": "silhouette, within 2 px",
+    "crease": "crease or depth edge",
+    "mirror_blocked": "smooth, mirror ray blocked",
+    "mirror_free": "smooth, mirror ray free",
+    "smooth": "smooth",  # where the data set has no true surface to trace mirror rays against
+    "background": "background",
+}
+"""Classes of pixels in `error_budget`: key in metrics.json → name in the table of `refgs eval`."""

@@ -173,3 +173,5 @@ def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path)
         ("env_psnr", "no environment.exr"),
     ):
         assert result[key] is None and reason in result[f"{key.partition('_')[0]}_reason"], key
+    assert result["error_budget"] is None and "depth and normals" in result["error_budget_reason"]
+    assert "error budget" not in table(result)
