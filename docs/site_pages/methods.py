@@ -24,7 +24,9 @@ def page() -> str:
         "your own; [settings](settings.md) lists the keys, and `--set key=value` changes one for a run. "
         "Each file says how it deviates from the original.",
         "## Presets",
-        "A preset scales the schedule of any method to its own number of iterations.",
+        "A preset scales the schedule of any method to its own number of iterations. `--preset "
+        "ITERATIONS:SURFELS`, such as `1000:20000`, does so for other numbers, with at most so many surfels, "
+        "three quarters of them at the start, and images of any size.",
         table(
             [
                 "preset",

@@ -50,7 +50,10 @@ MethodName = Annotated[
 ]
 Preset = Annotated[
     str | None,
-    optional("{quick,standard,paper}", help=f"length of the fit (default: {DEFAULT_PRESET})"),
+    optional(
+        "{quick,standard,paper}|N:N",
+        help=f"length of the fit, or its ITERATIONS:SURFELS (default: {DEFAULT_PRESET})",
+    ),
 ]
 Words = Annotated[tuple[str, ...], optional("NAME …")]
 """A list, separated by spaces or commas."""

@@ -10,6 +10,7 @@ from mi_refgs.methods.read import (
     load,
     load_resolved,
     names,
+    preset_of,
 )
 from mi_refgs.methods.window import Window
 
@@ -29,4 +30,5 @@ __all__ = [
     "load",
     "load_resolved",
     "names",
+    "preset_of",
 ]

@@ -8,6 +8,8 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
+import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -66,6 +68,23 @@ PRESETS = {
     "standard": Preset(4_000, 25_000, 40_000, 256 * 256, 30.0),
     "paper": Preset(50_000, 30_000, 100_000, 800 * 800),
 }
+START_FRACTION = 0.75
+"""Initial surfels over the largest number of surfels where a preset is ITERATIONS:SURFELS, as in `quick`."""
+
+
+def preset_of(text: str) -> Preset:
+    """Return the preset of a name, or of ITERATIONS:SURFELS, the largest number of surfels: "1000:20000".
+
+    The latter has no limits of pixels and minutes. Raises InputError for any other text.
+    """
+    if text in PRESETS:
+        return PRESETS[text]
+    counts = [int(part) if re.fullmatch(r"[1-9]\d{0,8}", part) else 0 for part in text.split(":")]
+    if len(counts) != 2 or not all(counts):
+        names = ", ".join(PRESETS)
+        raise InputError(f"--preset: {text}: unknown; use one of {names}, or ITERATIONS:SURFELS")
+    iterations, surfels = counts
+    return Preset(iterations, max(round(START_FRACTION * surfels), 1), surfels, sys.maxsize)
 
 
 def load(
@@ -74,15 +93,13 @@ def load(
     assignments: Sequence[str] | None = None,
     components: Sequence[str] = (),
 ) -> Method:
-    """Read a method by name or TOML path, with some of its components, scaled to a preset.
+    """Read a method by name or TOML path, with some of its components, scaled to a preset (see `preset_of`).
 
     `assignments` are `key=value`, applied last and not scaled, except that the changes of a component are in
     the iterations of the file. Raises InputError that names the file and the key for anything unknown or of
     the wrong type.
     """
-    if preset not in PRESETS:
-        raise InputError(f"--preset: {preset}: unknown; use one of {', '.join(PRESETS)}")
-    path, chosen = _find(name, "--method", Path()), PRESETS[preset]
+    path, chosen = _find(name, "--method", Path()), preset_of(preset)
     table = _extended(path, [])
     of_select = [text for text in assignments or () if _keys(text.partition("=")[0].strip())[0] == "select"]
     for assignment in of_select if components else ():

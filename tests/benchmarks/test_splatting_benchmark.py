@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks.common.report import where
 from benchmarks.common.timing import milliseconds
+from benchmarks.frontier import __main__ as frontier
 from benchmarks.memory import __main__ as memory
 from benchmarks.splatting import measure, page
 from benchmarks.splatting.__main__ import main
@@ -84,7 +85,7 @@ def test_bad_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("command", [main, memory.main, stability_page.main])
+@pytest.mark.parametrize("command", [main, memory.main, stability_page.main, frontier.main])
 def test_help_is_printed(command: Any, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         command(["--help"])

@@ -54,6 +54,26 @@ def test_presets_scale_the_whole_schedule() -> None:
     assert standard.refine.densify.until == pytest.approx(quick.refine.densify.until * factor, abs=factor)
 
 
+def test_a_preset_of_numbers_scales_as_a_named_one() -> None:
+    """With the numbers of `quick`, the method is that of `quick`; other ones survive a reload by its name."""
+    quick = methods.PRESETS["quick"]
+    assert quick.surfels == 0.75 * quick.max_surfels
+    named, numbers = (
+        dataclasses.replace(methods.load("ref_gaussian", preset), preset="")
+        for preset in ("quick", f"{quick.iterations}:{quick.max_surfels}")
+    )
+    assert named == numbers
+    short = methods.load("auto", "500:1000")
+    assert (short.iterations, short.surfels.count, short.surfels.max_count) == (500, 750, 1000)
+    assert methods.load(short.file, short.preset, short.assignments) == short
+
+
+@pytest.mark.parametrize("preset", ["", "fast", "500", "500:", "0:10", "5e2:10", "1:2:3", "-5:10"])
+def test_other_presets_are_refused(preset: str) -> None:
+    with pytest.raises(InputError, match="--preset"):
+        methods.load("ref_gaussian", preset)
+
+
 def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
     path = tmp_path / "long.toml"
     path.write_text(
