@@ -27,7 +27,7 @@ import drjit as dr  # isort: skip
 from benchmarks.common.report import Row, machine, make_parser, write_reports
 from benchmarks.common.view import ROOT
 from benchmarks.frontier.cells import Axes, Cell, Store
-from benchmarks.frontier.fit import measure, rehearse
+from benchmarks.frontier.fit import measure
 from benchmarks.frontier.page import page, plot
 from mi_refgs import __version__, methods
 from mi_refgs.errors import InputError
@@ -101,13 +101,14 @@ def run(cells: Iterable[Cell], store: Store, say: Any) -> tuple[list[Row], list[
     """Measure the cells that are not stored; returns the rows of all, and the cells without a result."""
     rows: list[Row] = []
     failed: list[Row] = []
-    rehearsed: set[tuple[str, str]] = set()
+    rehearsed: set[Cell] = set()
     for cell in cells:
         row = store.read(cell)
         if row is None:
-            if (cell.data, cell.method) not in rehearsed:
-                rehearsed.add((cell.data, cell.method))
-                rehearse(cell)
+            rehearsal = cell.rehearsal()
+            if rehearsal not in rehearsed:
+                rehearsed.add(rehearsal)
+                measure(rehearsal)
             row = measure(cell)
             if "failed" in row:
                 failed.append({"cell": cell.title, **row})

@@ -31,11 +31,6 @@ from mi_refgs.runs.views import read_views
 
 HOLDOUT = 8
 """Every so many training views, the first included, are validation views: not fitted, but scored."""
-REHEARSAL = "100:1000"
-"""Iterations and surfels of the fit that compiles a method's kernels before its first cell is timed.
-
-*chair* at 200²: 147 kernels; 60 iterations leave 21 of them to the first cell, 3 to 6 s of CPU time.
-"""
 
 
 def measure(cell: Cell, seconds: float | None = None) -> Row:
@@ -44,11 +39,6 @@ def measure(cell: Cell, seconds: float | None = None) -> Row:
         return in_fresh_process("benchmarks.frontier.fit", json.dumps(asdict(cell)), seconds=seconds)
     except SubprocessError as error:
         return {"failed": f"its process ended early ({error})"}
-
-
-def rehearse(cell: Cell) -> None:
-    """Fit a few steps in a fresh process: Dr.Jit stores compiled kernels on disk, and cells load them."""
-    measure(replace(cell, preset=REHEARSAL, downscale=cell.resolved().data.downscale))
 
 
 def fitted(cell: Cell) -> Row:

@@ -135,7 +135,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     judged = [(name, verdict) for name in names for verdict in verdicts(by_name[name])]
     on_front = [one for _, one in judged if one.rival is None or not one.rival.dominates(one.preset)]
     return {
-        "verdict": f"{len(on_front)} of {len(judged)} presets are on the front (one per data set and method)",
+        "verdict": f"{len(on_front)} of {len(judged)} fits with a preset are on the Pareto front",
         "cpu_range": f"{number(min(row['cpu_seconds'] for row in rows), 2)} to "
         f"{number(max(row['cpu_seconds'] for row in rows), 2)} CPU seconds",
         "seeds": _seeds(fewest),
@@ -155,7 +155,7 @@ def _seeds(fewest: int) -> str:
     """Sentence about what differences mean."""
     if fewest < 2:
         return (
-            f"**One seed only** was run of some settings: their differences below {CLEAR} dB are not clear, "
+            f"One seed only was run of some settings: their differences below {CLEAR} dB are not clear, "
             "and which of two such settings is on the front may be chance."
         )
     return (
@@ -234,6 +234,8 @@ MARKERS = "osD^vP"
 
 def plot(result: dict[str, Any], folder: Path) -> Path:
     """Write frontier.png: one panel per data set, one line per setting over its iterations."""
+    from matplotlib import ticker
+
     names = list(dict.fromkeys(row["data"] for row in result["rows"]))
     columns = min(len(names), 3)
     figure, axes = figures.new(-(-len(names) // columns), columns, 4.2, 3.4)
@@ -258,6 +260,9 @@ def plot(result: dict[str, Any], folder: Path) -> Path:
         ax.step(x, y, where="post", color="#bbbbbb", lw=3, zorder=0, label="Pareto front")
         size = _pixels(settings[0].rows, "full_width", "full_height")
         ax.set(xscale="log", xlabel="CPU s", ylabel="PSNR, dB")
+        ax.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+        ax.xaxis.set_minor_locator(ticker.NullLocator())
         ax.set_title(f"{name}, {size} pixels", fontsize=9)
     figures.legend(figure, axes.flat[: len(names)], "Validation PSNR against CPU time", columns)
     return figures.save(figure, folder / "frontier.png")

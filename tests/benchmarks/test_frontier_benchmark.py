@@ -74,20 +74,19 @@ class Measured:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.presets: list[str] = []
-        self.rehearsed = 0
+        self.rehearsed: list[Cell] = []
         self.fails: Callable[[Cell], Row | None] = lambda cell: None
         monkeypatch.setattr(frontier, "measure", self.measure)
-        monkeypatch.setattr(frontier, "rehearse", self.rehearse)
 
     def measure(self, cell: Cell) -> Row:
+        if cell.preset == cells.REHEARSAL:
+            self.rehearsed.append(cell)
+            return {}
         if (failure := self.fails(cell)) is not None:
             return failure
         self.presets.append(cell.preset)
         made = row(None, 10.0 + len(self.presets), 20.0)
         return {name: made[name] for name in cells.RESULTS}
-
-    def rehearse(self, cell: Cell) -> None:
-        self.rehearsed += 1
 
 
 @pytest.fixture
@@ -114,9 +113,17 @@ def test_an_interrupted_run_continues(measured: Measured, command: list[str], tm
     assert frontier.main(command) == 0
     assert measured.presets == ["4:50", "4:100", "quick"]
     assert frontier.main(command) == 0 and len(measured.presets) == 3
-    assert measured.rehearsed == 2  # once per run that measures anything
+    assert len(measured.rehearsed) == 2  # once per run that measures anything
     rows = json.loads((tmp_path / "out" / "frontier.json").read_text())["rows"]
     assert [found["cpu_seconds"] for found in rows] == [11, 12, 13]
+
+
+def test_kernels_are_compiled_before_cells_are_timed(measured: Measured, command: list[str]) -> None:
+    """Once per size of images and number of samples; the preset has those of the first."""
+    assert frontier.main([*command, "--downscale", "1", "2", "--samples", "1", "4", "--seeds", "0", "1"]) == 0
+    found = [(cell.downscale, cell.samples) for cell in measured.rehearsed]
+    assert found == [(1, 1), (1, 4), (2, 1), (2, 4)]
+    assert len(measured.presets) == 2 * (2 * 2 * 2 + 1)
 
 
 @pytest.mark.parametrize("damage", ['{"identity": ', '{"identity": {}, "row": {}}'])
@@ -334,7 +341,7 @@ def test_page_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert frontier.main(["--json", str(stored), "-o", str(tmp_path / "out")]) == 0
     text = (tmp_path / "out" / "frontier.md").read_text()
     assert not re.search(r"\{\{|\}\}|\bnan\b|\binf\b|\bNone\b", text)
-    assert "2 of 4 presets are on the front" in text and "One seed only" in text
+    assert "2 of 4 fits with a preset are on the Pareto front" in text and "One seed only" in text
     assert text.count("validation views of 20 × 30 pixels, 7 fitted views") == 2
     tables = [part for part in text.split("\n\n") if part.startswith("| ")]
     assert len(tables) == 3 and all("| 10 × 15 |" in line for t in tables for line in t.splitlines()[2:])
