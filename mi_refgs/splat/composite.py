@@ -77,7 +77,7 @@ def composite_compact(lists: TileLists, depth: bool) -> Composited:
     chosen = Lanes.filled(lists)
     lanes = Lanes.of(lists, chosen)
     transmittance, sums = _forward(lists, lanes, lists.features + depth)
-    values = [[*of_block, 1 - T] for of_block, T in zip(sums, transmittance, strict=True)]
+    values = [[*of_pixel, 1 - T] for of_pixel, T in zip(sums, transmittance, strict=True)]
     maps = CompactedPixels.scattered(values, dr.width(chosen))
     pixels = CompactedPixels.of(lists.camera, chosen, lanes)
     return Composited(maps[: lists.features], maps[-2] if depth else None, maps[-1], pixels)
@@ -89,7 +89,7 @@ def _values(lists: TileLists, row: list[Float], z: Float) -> list[Float]:
 
 
 def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], list[list[Float]]]:
-    """Transmittance and the first `maps` maps, per block of the lanes."""
+    """Transmittance and the first `maps` maps, per pixel of the lanes."""
 
     def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row = lists.rows.fetch(surfel, some)
@@ -108,10 +108,10 @@ def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], li
 
 
 def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[list[Float]]) -> PackedRows:
-    """Adjoint of the rows, for adjoints δ of the maps and the maps themselves, per block of the lanes."""
+    """Adjoint of the rows, for adjoints δ of the maps and the maps themselves, per pixel of the lanes."""
     behind = [
-        sum((a * b for a, b in zip(of_block, total, strict=True)), start=mi.Float(0))
-        for of_block, total in zip(δ, out, strict=True)
+        sum((a * b for a, b in zip(of_pixel, total, strict=True)), start=mi.Float(0))
+        for of_pixel, total in zip(δ, out, strict=True)
     ]
     δrows = PackedRows.zeros(lists.rows.count, lists.rows.width)
 
@@ -149,7 +149,7 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
 
 
 def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:
-    """Tangents of the maps, per block of the lanes, for tangents of the rows."""
+    """Tangents of the maps, per pixel of the lanes, for tangents of the rows."""
 
     def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
         row, drow = lists.rows.fetch(surfel, some), drows.fetch(surfel, some)

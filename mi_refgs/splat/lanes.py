@@ -1,18 +1,16 @@
 """SIMD lanes over an image, and their common walk along the lists of tiles.
 
-A tile is the smallest area that has a list of surfels. It is divided into LANE_PIXELS_PER_AXIS² blocks, and a
-lane has the pixel at one place of every block. Here a tile of 8 × 4 pixels, its 2 × 2 blocks of 4 × 2 pixels,
-and its 8 lanes a … h:
+A tile is the smallest area that has a list of surfels. A lane has a square of LANE_PIXELS_PER_AXIS² pixels of
+it. Here a tile of 8 × 4 pixels and its 8 lanes a … h:
 
-    a b c d | a b c d        A lane keeps the states of its pixels side by side: it reads the row of a surfel,
-    e f g h | e f g h        and adds to its gradient, once for all of them. With one pixel per lane, that is
-    --------+--------        most of the work.
-    a b c d | a b c d
-    e f g h | e f g h
+    a a b b c c d d          A lane keeps the states of its pixels side by side: it reads the row of a surfel,
+    a a b b c c d d          and adds to its gradient, once for all of them. With one pixel per lane, that is
+    e e f f g g h h          most of the work. A square lane, and a SIMD vector of them, covers a compact area
+    e e f f g g h h          even where the vector has fewer lanes than the tile: it ends sooner.
 
 A patch of PATCH_EDGE² pixels, one tile or several, fills a SIMD vector with its lanes (here 2 tiles, one
 above the other: 16 lanes). The vector ends with the last pixel of its tiles. Lanes are in the order of
-patches, then tiles of the patch, then places in the block, each row by row.
+patches, then tiles of the patch, then squares of the tile, each row by row.
 """
 
 from __future__ import annotations
@@ -31,9 +29,10 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
 from mi_refgs.types import Bool, Float, Point2f, UInt32
 
-BLOCKS = LANE_PIXELS_PER_AXIS**2
+SIDE = LANE_PIXELS_PER_AXIS
+LANE_PIXELS = SIDE**2
 """Pixels of a lane."""
-PATCH_LANES = PATCH_EDGE**2 // BLOCKS
+PATCH_LANES = PATCH_EDGE**2 // LANE_PIXELS
 """Lanes of a patch."""
 NOWHERE = 0xFFFFFFFF
 """Slot of a patch that was not chosen."""
@@ -47,8 +46,8 @@ class Grid:
 
     @property
     def lanes(self) -> tuple[int, int]:
-        """Lanes of a tile along each axis, as many as pixels of a block."""
-        return self.camera.tile[0] // LANE_PIXELS_PER_AXIS, self.camera.tile[1] // LANE_PIXELS_PER_AXIS
+        """Lanes of a tile along each axis."""
+        return self.camera.tile[0] // SIDE, self.camera.tile[1] // SIDE
 
     @property
     def tiles(self) -> tuple[int, int]:
@@ -68,11 +67,11 @@ class Grid:
 
 @dataclass(frozen=True)
 class Lanes:
-    """L lanes, and their pixel in each block of their tile."""
+    """L lanes and their pixels."""
 
-    pixel: list[Point2f]  # BLOCKS × (L,): centre
-    raster: list[UInt32]  # BLOCKS × (L,): index in the image
-    inside: list[Bool]  # BLOCKS × (L,): whether it is in the image
+    pixel: list[Point2f]  # LANE_PIXELS × (L,): centre
+    raster: list[UInt32]  # LANE_PIXELS × (L,): index in the image
+    inside: list[Bool]  # LANE_PIXELS × (L,): whether it is in the image
     begin: UInt32  # (L,): first pair of the tile
     end: UInt32  # (L,): one past its last pair
 
@@ -81,7 +80,7 @@ class Lanes:
         """The lanes of all patches, or of those `chosen`."""
         camera, grid = lists.camera, Grid(lists.camera)
         (lanes_x, lanes_y), (side_x, side_y), (tiles_x, tiles_y) = grid.lanes, grid.tiles, camera.tiles
-        # Patch, tile in the patch, place in the block.
+        # Patch, tile in the patch, square in the tile.
         count = grid.patches if chosen is None else dr.width(chosen)
         lane = dr.arange(mi.UInt32, count * PATCH_LANES)
         patch, lane = lane // PATCH_LANES, lane % PATCH_LANES
@@ -93,10 +92,9 @@ class Lanes:
         there = (tile_x < tiles_x) & (tile_y < tiles_y)
         tile = tile_y * tiles_x + tile_x
         # Pixels. Those before the image wrap round to huge numbers, and are not inside either.
-        corner_x = tile_x * camera.tile[0] + lane % lanes_x - camera.tile_offset[0]
-        corner_y = tile_y * camera.tile[1] + lane // lanes_x - camera.tile_offset[1]
-        blocks = range(LANE_PIXELS_PER_AXIS)
-        pixels = [(corner_x + x * lanes_x, corner_y + y * lanes_y) for y in blocks for x in blocks]
+        corner_x = tile_x * camera.tile[0] + lane % lanes_x * SIDE - camera.tile_offset[0]
+        corner_y = tile_y * camera.tile[1] + lane // lanes_x * SIDE - camera.tile_offset[1]
+        pixels = [(corner_x + x, corner_y + y) for y in range(SIDE) for x in range(SIDE)]
         return Lanes(
             [mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in pixels],
             [y * camera.width + x for x, y in pixels],
@@ -113,14 +111,14 @@ class Lanes:
         return dr.compress(dr.block_reduce(dr.ReduceOp.Or, listed, PATCH_LANES) > 0)
 
     def each(self, *values: list[Any]) -> Any:
-        """Iterate over the blocks: pixel, raster index, inside, and further lists of one value per block."""
+        """Iterate over a lane's pixels: centre, raster index, inside, and lists of a value per pixel."""
         return zip(self.pixel, self.raster, self.inside, *values, strict=True)
 
     def to_raster(self, camera: Camera, values: list[list[Float]]) -> list[Float]:
-        """Images of values per block, written in the kernel of the loop that made them."""
+        """Images of values per pixel of the lanes, written in the kernel of the loop that made them."""
         images = [dr.empty(mi.Float, camera.width * camera.height) for _ in values[0]]
-        for _, raster, inside, of_block in self.each(values):
-            for image, value in zip(images, of_block, strict=True):
+        for _, raster, inside, of_pixel in self.each(values):
+            for image, value in zip(images, of_pixel, strict=True):
                 dr.scatter(image, value, raster, inside, mode=dr.ReduceMode.NoConflicts)
         dr.eval(images)
         return images
@@ -132,7 +130,7 @@ class Lanes:
 
 @dataclass(frozen=True)
 class CompactedPixels:
-    """The P pixels of the patches that list a surfel, patch by patch and block by block.
+    """The P pixels of the patches that list a surfel, patch by patch and lane by lane.
 
     What a SIMD vector reads is then a square of the image, not a line: neighbours' rays are traced together.
     """
@@ -146,38 +144,30 @@ class CompactedPixels:
         """The pixels of the `chosen` patches, to which these lanes belong."""
         grid, patches = Grid(camera), dr.width(chosen)
         lanes_x, lanes_y = grid.lanes
-        raster = dr.empty(mi.UInt32, BLOCKS * patches * PATCH_LANES)
-        for index, of_block in zip(CompactedPixels._indices(patches), lanes.raster, strict=True):
-            dr.scatter(raster, of_block, index, mode=dr.ReduceMode.NoConflicts)
+        (raster,) = CompactedPixels.scattered([[x] for x in lanes.raster], patches)
         slot = dr.full(mi.UInt32, NOWHERE, grid.patches)
         dr.scatter(slot, dr.arange(mi.UInt32, patches), chosen, mode=dr.ReduceMode.NoConflicts)
-        dr.eval(raster, slot)
+        dr.eval(slot)
 
-        # From a pixel of the image to its patch, tile, block and lane.
+        # From a pixel of the image to its patch, tile and lane.
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         x, y = pixel % camera.width + camera.tile_offset[0], pixel // camera.width + camera.tile_offset[1]
         slot = dr.gather(mi.UInt32, slot, y // PATCH_EDGE * grid.columns + x // PATCH_EDGE)
         x, y = x % PATCH_EDGE, y % PATCH_EDGE
         tile = y // camera.tile[1] * grid.tiles[0] + x // camera.tile[0]
         x, y = x % camera.tile[0], y % camera.tile[1]
-        block = y // lanes_y * LANE_PIXELS_PER_AXIS + x // lanes_x
-        lane = tile * (lanes_x * lanes_y) + y % lanes_y * lanes_x + x % lanes_x
-        return CompactedPixels(raster, (slot * BLOCKS + block) * PATCH_LANES + lane, slot != NOWHERE)
+        lane = tile * (lanes_x * lanes_y) + y // SIDE * lanes_x + x // SIDE
+        index = (slot * PATCH_LANES + lane) * LANE_PIXELS + y % SIDE * SIDE + x % SIDE
+        return CompactedPixels(raster, index, slot != NOWHERE)
 
     @staticmethod
-    def _indices(patches: int) -> list[UInt32]:
-        """Index among the P pixels of each lane's pixel in each block."""
+    def scattered(values: list[list[Any]], patches: int) -> list[Any]:
+        """Maps (P,) of values per pixel of the lanes, written in the kernel of the loop that made them."""
         lane = dr.arange(mi.UInt32, patches * PATCH_LANES)
-        first = lane // PATCH_LANES * (BLOCKS * PATCH_LANES) + lane % PATCH_LANES
-        return [first + block * PATCH_LANES for block in range(BLOCKS)]
-
-    @staticmethod
-    def scattered(values: list[list[Float]], patches: int) -> list[Float]:
-        """Maps (P,) of values per block, written in the kernel of the loop that made them."""
-        maps = [dr.empty(mi.Float, BLOCKS * patches * PATCH_LANES) for _ in values[0]]
-        for index, of_block in zip(CompactedPixels._indices(patches), values, strict=True):
-            for image, value in zip(maps, of_block, strict=True):
-                dr.scatter(image, value, index, mode=dr.ReduceMode.NoConflicts)
+        maps = [dr.empty(type(value), LANE_PIXELS * patches * PATCH_LANES) for value in values[0]]
+        for image, of_lane in zip(maps, zip(*values, strict=True), strict=True):
+            packet = mi.ArrayXf if type(image) is mi.Float else mi.ArrayXu
+            dr.scatter(image, packet(list(of_lane)), lane, mode=dr.ReduceMode.NoConflicts)
         dr.eval(maps)
         return maps
 
@@ -209,9 +199,9 @@ def advance(sample: Any, active: Bool, transmittance: Float) -> tuple[Float, Flo
 def walk(lists: TileLists, lanes: Lanes, step: Any, start: list[tuple[Any, ...]], label: str) -> list[Any]:
     """Visit the surfels of each lane's tile in order, until the lane's last pixel has ended.
 
-    `start` has the state of each block; its first entry says whether the pixel goes on. `step` maps a surfel,
-    whether the lane goes on, and the states (one list per quantity) to states in the form of `start`. Returns
-    the last states, one list per quantity.
+    `start` has the state of each pixel of a lane; its first entry says whether the pixel goes on. `step` maps a
+    surfel, whether the lane goes on, and the states (one list per quantity) to states in the form of `start`.
+    Returns the last states, one list per quantity.
     """
 
     def surfel_at(pair: Any, some: Any) -> Any:
@@ -232,5 +222,5 @@ def walk(lists: TileLists, lanes: Lanes, step: Any, start: list[tuple[Any, ...]]
 
 
 def _transposed(rows: list[tuple[Any, ...]]) -> tuple[list[Any], ...]:
-    """One tuple per block to one list per quantity."""
+    """One tuple per pixel of a lane to one list per quantity."""
     return tuple(list(column) for column in zip(*rows, strict=True))
