@@ -35,6 +35,10 @@ ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_MIN = 1e-4
 """A pixel ends before the surfel that would bring T below this: 8 bits show no more. [3DGS, appendix C]"""
 
+DRAFT_TRANSMITTANCE = 3e-3
+"""A pixel of a draft ends behind the surfel that brings T below this, so that its alpha is too small by less
+than an 8-bit step, 1/255. [docs/decisions.md has time and error of other values]"""
+
 LOW_PASS_INV_VARIANCE = 12.0
 """1/pixel²: the screen-space filter is a Gaussian of the variance of a pixel's box, 1/12. The 1/2 of 2DGS
 (§4.2) widens every outline by about a pixel, and a fit then shrinks the surface behind it
@@ -83,8 +87,8 @@ smaller ones. With AVX-512, each of its 16 lanes has 4 pixels. A vector runs unt
 tiles ends, so a patch joins neighbouring tiles, whose lists are alike."""
 
 LANE_PIXELS_PER_AXIS = 2
-"""Width and height, in pixels, of the square of a tile that a lane works on: what it reads of a surfel is used
-for all of its pixels, and what it adds to the surfel's gradient is their sum."""
+"""Width and height, in pixels, of the square of a tile that a lane works on: what it reads of a surfel is
+used for all of its pixels, and what it adds to the surfel's gradient is their sum."""
 
 
 FOCAL_TOLERANCE = 1e-5

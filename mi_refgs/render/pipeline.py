@@ -57,6 +57,7 @@ class Request:
 
     aovs: Collection[str] = ()  # materials, terms of the radiance, "visibility", "normal", "depth", by name
     forward_only: bool = False  # without derivatives: faster, equal to rounding
+    draft: bool = False  # of `forward_only`: pixels end at DRAFT_TRANSMITTANCE, faster, about 50 dB
     sh_degree: int | None = None  # highest SH degree of the radiance, for coarse-to-fine schedules
     screen_offset: Point2f | None = None  # (N,) zeros that receive the gradient of a screen translation
 
@@ -187,7 +188,8 @@ class _View:
         values = features(slots)
         # Antialiasing reads neighbours in the image.
         if self.request.forward_only and not self.scene.shading.antialias:
-            blended = splat_compact(self.geometry, values, self.camera, depth="depth" in self.asked)
+            depth, draft = "depth" in self.asked, self.request.draft
+            blended = splat_compact(self.geometry, values, self.camera, depth=depth, draft=draft)
         else:
             blended = splat(self.geometry, values, self.camera, self.request.screen_offset)
         return GBuffer.of(blended, slots)

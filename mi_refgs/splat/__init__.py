@@ -43,8 +43,10 @@ def splat(
     return composite(footprints, features, lists)
 
 
-def splat_compact(surfels: Surfels, features: list[Float], camera: Camera, *, depth: bool) -> Composited:
+def splat_compact(
+    surfels: Surfels, features: list[Float], camera: Camera, *, depth: bool, draft: bool = False
+) -> Composited:
     """Splat features of surfels as `composite_compact` does: only pixels near surfels, no derivatives."""
     if surfels.count == 0:
         return Composited.nothing(len(features), camera, depth)
-    return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth)
+    return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth, draft)

@@ -199,9 +199,9 @@ def advance(sample: Any, active: Bool, transmittance: Float) -> tuple[Float, Flo
 def walk(lists: TileLists, lanes: Lanes, step: Any, start: list[tuple[Any, ...]], label: str) -> list[Any]:
     """Visit the surfels of each lane's tile in order, until the lane's last pixel has ended.
 
-    `start` has the state of each pixel of a lane; its first entry says whether the pixel goes on. `step` maps a
-    surfel, whether the lane goes on, and the states (one list per quantity) to states in the form of `start`.
-    Returns the last states, one list per quantity.
+    `start` has the state of each pixel of a lane; its first entry says whether the pixel goes on. `step` maps
+    a surfel, whether the lane goes on, and the states (one list per quantity) to states in the form of
+    `start`. Returns the last states, one list per quantity.
     """
 
     def surfel_at(pair: Any, some: Any) -> Any:

@@ -127,7 +127,7 @@ class ReconstructionView(ViewerScene):
     # ---------------- images ----------------
 
     def frame(self, sample: SampleRequest) -> Frame:
-        """See `ViewerScene`; ambient shadows may be outdated unless the sample is `settled`."""
+        """See `ViewerScene`; a draft, with ambient shadows that may be outdated, unless it is `settled`."""
         light, scene = self.light, self.scene
         with dr.suspend_grad():
             if self._stale and (sample.settled or self._lacks_caches):
@@ -135,7 +135,8 @@ class ReconstructionView(ViewerScene):
                 self._stale = False
             background = None if sample.look.object_only else scene.surroundings
             rendered = SurfelScene(scene.surfels, scene.shading, light, self._occluder, background)
-            return render(rendered, sample.camera(), Request(sample.aovs, forward_only=True))
+            request = Request(sample.aovs, forward_only=True, draft=not sample.settled)
+            return render(rendered, sample.camera(), request)
 
     @property
     def _lacks_caches(self) -> bool:
