@@ -36,7 +36,7 @@ TRANSMITTANCE_MIN = 1e-4
 """A pixel ends before the surfel that would bring T below this: 8 bits show no more. [3DGS, appendix C]"""
 
 DRAFT_TRANSMITTANCE = 3e-3
-"""A pixel of a draft ends behind the surfel that brings T below this, so that its alpha is too small by less
+"""A pixel of a draft ends behind the surfel that reduces T below this, so that its alpha is too small by less
 than an 8-bit step, 1/255. [docs/decisions.md has time and error of other values]"""
 
 LOW_PASS_INV_VARIANCE = 12.0
