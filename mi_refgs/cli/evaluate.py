@@ -21,7 +21,7 @@ class Eval:
     data: OtherData = None
     samples: Samples = 1
     antialias: Flag = False
-    """widen roughness by the variation of normals within a pixel, also where the fit did not"""
+    """average reflections over each pixel, at interpolated normals, also where the fit did not"""
     common: Rendering = Rendering()
 
     def run(self) -> Result:

@@ -67,8 +67,8 @@ def evaluate(
                                    with the environment map prefiltered beforehand
     `pruned`                       null for a scene that was not pruned
 
-    Renders have `samples` per pixel, box filtered (`render.samples`); `antialias` widens roughness
-    (`render.antialias`) where the run was fitted without.
+    Renders have `samples` per pixel, box filtered (`render.samples`); `antialias` averages reflections over
+    each pixel (`render.antialias`) where the run was fitted without.
 
     Raises InputError for a folder that is no run or contains neither a scene nor a checkpoint, for data
     that is gone, and for a foreign file in the run that has the name of a result.

@@ -96,7 +96,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * - dominant, multiscatter, antialias
        - |bool|
        - More accuracy for more time: look the light up along the GGX lobe's dominant direction; add
-         interreflection between microfacets; widen roughness by the variance of normals within a pixel.
+         interreflection between microfacets; average reflections over each pixel, at interpolated normals.
          (Default: false)
 
      * - visibility_rays, traced_bounces, ambient_rays

@@ -40,7 +40,7 @@ class Scene:
     visibility: Callable[[Array, Array], Array] | None = None  # unit normals, unit rays (P, 3) → 0 … 1 (P,)
     rules: Rules = field(default_factory=Rules)
     options: Options = field(default_factory=Options)  # but its `diffuse`, which is the one above
-    variance: Array | None = None  # (P,): added to roughness⁴, to 1 at most, before pixels are shaded
+    antialias: bool = False  # the mean over each pixel; of all pixels of the camera, and without gradients
     terms: bool = False  # also the terms of the radiance, premultiplied; these give the light no gradient
 
 
@@ -176,9 +176,7 @@ class Resolve:
 
     def __init__(self, scene: Scene, features: Features, x: Array, y: Array, sums: Array) -> None:
         self.scene, self.features = scene, features
-        camera = scene.camera
-        ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
-        self.ray = unit(ray @ camera.to_world[:3, :3].T)
+        self.ray = rays(scene.camera, x, y)
         self.found = {}
         if scene.visibility is not None:
             self.found["visibility"] = scene.visibility(unit(sums[:, :3]), self.ray)[:, None]
@@ -193,19 +191,37 @@ class Resolve:
         if scene.at == "surfel":
             maps |= {name: blended[name] for name in ("radiance", *TERMS) if name in blended}
         else:
-            if scene.variance is not None:
-                widened = values["roughness"] ** 4 + scene.variance[:, None]
-                values["roughness"] = np.where(
-                    scene.variance[:, None] > 0, np.where(widened.real > 1, 1, widened) ** 0.25,
-                    values["roughness"],
-                )  # fmt: skip
-            found: list[tuple[Array, Array, Array]] = []
-            points = Points(blended["normal"], -self.ray, values | self.found)
-            terms = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
-            taps += [(texel, share, factor * alpha) for texel, share, factor in found]
+            terms = None
+            nodes = self._nodes(blended["normal"], alpha) if scene.antialias else [
+                (blended["normal"], self.ray, self.found)
+            ]  # fmt: skip
+            for normal, ray, visible in nodes:
+                found: list[tuple[Array, Array, Array]] = []
+                points = Points(normal, -ray, values | visible)
+                here = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
+                taps += [(texel, share, factor * alpha / len(nodes)) for texel, share, factor in found]
+                shares = [term / len(nodes) for term in here]
+                terms = shares if terms is None else [a + b for a, b in zip(terms, shares, strict=True)]
+            assert terms is not None
             maps |= {name: term * alpha for name, term in zip(TERMS, terms, strict=True)}
             maps["radiance"] = sum(terms[1:], terms[0]) * alpha
         return np.concatenate([maps[name] for name in self.maps()], axis=1)
+
+    def _nodes(self, normal: Array, alpha: Array) -> list[tuple[Array, Array, dict[str, Array]]]:
+        """Normals, unit rays and visibility (P, …) at the nodes of 2 × 2 Gauss-Legendre points per pixel."""
+        camera, shape, found = self.scene.camera, (self.scene.camera.height, self.scene.camera.width, -1), []
+        y, x = (axis.ravel() + 0.5 for axis in np.mgrid[: camera.height, : camera.width])
+        nodes = np.polynomial.legendre.leggauss(2)[0] / 2
+        for dy in nodes:
+            for dx in nodes:
+                at = [bilinear_map(v.reshape(shape), x + dx, y + dy) for v in (normal, alpha)]
+                visible = {}
+                if "visibility" in self.found:
+                    weighted = bilinear_map((alpha * self.found["visibility"]).reshape(shape), x + dx, y + dy)
+                    some = at[1].real > 0
+                    visible["visibility"] = np.where(some, weighted / np.where(some, at[1], 1), 1)
+                found.append((at[0], rays(camera, x + dx, y + dy), visible))
+        return found
 
     def maps(self) -> dict[str, int]:
         """Columns of each map."""
@@ -216,6 +232,27 @@ class Resolve:
         """Columns by map."""
         widths = self.maps()
         return dict(zip(widths, np.split(values, np.cumsum([*widths.values()])[:-1], axis=1), strict=True))
+
+
+def rays(camera: PinholeCamera, x: Array, y: Array) -> Array:
+    """Unit directions (P, 3) in the world through points of the image (P,), in pixels."""
+    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
+    return unit(ray @ camera.to_world[:3, :3].T)
+
+
+def bilinear_map(values: Array, x: Array, y: Array) -> Array:
+    """Values (P, C) at points of the image (P,), in pixels, of a map (H, W, C) given at pixel centres.
+
+    The border repeats.
+    """
+    column, row = np.floor(x - 0.5).astype(int), np.floor(y - 0.5).astype(int)
+    u, v = (x - 0.5 - column)[:, None], (y - 0.5 - row)[:, None]
+
+    def at(i: int, j: int) -> Array:
+        clipped = np.clip(row + j, 0, len(values) - 1), np.clip(column + i, 0, values.shape[1] - 1)
+        return values[clipped]
+
+    return (1 - v) * ((1 - u) * at(0, 0) + u * at(1, 0)) + v * ((1 - u) * at(0, 1) + u * at(1, 1))
 
 
 # ---------------- scenes with a background ----------------

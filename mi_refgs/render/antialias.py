@@ -1,63 +1,71 @@
-"""Geometric antialiasing of reflections: roughness widened by the variance of normals within a pixel."""
+"""Antialiasing of reflections: each pixel is shaded at four points, at interpolated normals and visibility.
+
+Compositing is most of the time of an image, and a blended normal varies slowly where the surface is smooth;
+its reflection does not. So surfels are composited once per pixel, and their reflection is averaged over it.
+"""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.render.stencil import neighbours
-from mi_refgs.shade.points import safe_normalize
-from mi_refgs.splat.camera import Camera
-from mi_refgs.types import Bool, Float, Vector3f
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
+from mi_refgs.splat import Camera
+from mi_refgs.splat.lanes import CompactedPixels
+from mi_refgs.types import Float
 
-MAX_VARIANCE = 0.18
-"""Largest addition to α²; a surface that a pixel resolves adds less. [κ of Tokuyoshi and Kaplanyan]"""
+NODE = 0.5 / math.sqrt(3)
+"""Distance of the points from the pixel's centre along each axis, pixels: the nodes of the Gauss-Legendre
+rule, whose mean over two nodes per axis is exact for radiance that is cubic in the position."""
 
-NO_NEIGHBOUR = 5.0  # more than the largest squared difference of two unit vectors, 4
+NODES = [(x, y) for y in (-1, 1) for x in (-1, 1)]
+"""Quadrant of each point: signs of its offset from the centre."""
+
+AROUND = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]
+"""Steps to the neighbours whose values are interpolated."""
 
 
-def widened(
-    roughness: Float,  # (H·W,) at the pixel's centre
-    normal: Vector3f,  # (H·W,) blended, of any length
-    alpha: Float,  # (H·W,)
+def averaged(
+    shade: Callable[[ShadingPoints], RadianceTerms],
+    points: ShadingPoints,  # (P,) at the pixels' centres, with the normals as they were blended
+    alpha: Float,  # (P,) by which normals are premultiplied
     camera: Camera,
-) -> Float:
-    """Roughness of the area of a pixel; under AD.
+    pixels: CompactedPixels | None,  # those of the P; None: all, in raster order
+    visibility: bool,
+) -> RadianceTerms:
+    """Mean over each pixel of the radiance at NODES, under AD.
 
-    With α = roughness², α² grows by the variance of the unit normals in the pixel, (|∂n/∂x|² + |∂n/∂y|²) / 12
-    with derivatives per pixel, by MAX_VARIANCE at most, and to 1 at most. The smaller difference to the two
-    neighbours of an axis counts, so that an edge is no curvature; pixels that see nothing (COVERAGE_FLOOR)
-    are no neighbours. The variance has no derivative: a fit would bend normals to blur its reflections.
-
-    The slopes of facets have the variance α²/2 along each axis, and those of their mean plane add up.
-    [Kaplanyan et al. 2016, "Filtering Distributions of Normals for Shading Antialiasing"; isotropic and with
-    a bound: Tokuyoshi and Kaplanyan 2019, "Improved Geometric Specular Antialiasing", eq. 4, whose pixel is
-    a Gaussian and whose sum of both axes stands for either]
+    Normals are interpolated bilinearly between pixel centres as they were blended, so that empty pixels do
+    not count, and visibility if `visibility`, weighted by alpha. Materials and radiance are those of the
+    centre: fits represent textures at pixel centres, and interpolation would blur them.
     """
-    with dr.suspend_grad():
-        # 1/12 squared pixels: the box filter's variance of positions along one axis.
-        variance = 1 / 12 * _squared_turn(safe_normalize(normal), alpha > COVERAGE_FLOOR, camera)
-        variance = dr.minimum(variance, MAX_VARIANCE)
-    turned = variance > 0
-    α2 = dr.minimum(dr.square(dr.square(roughness)) + variance, 1)
-    # √√ has no slope at 0, where a mirror on flat ground stays what it is.
-    return dr.select(turned, dr.sqrt(dr.sqrt(dr.select(turned, α2, 1))), roughness)
+    ray = None if pixels is None else pixels.raster
+    normal = [_interpolated(plane, camera, pixels) for plane in points.normal]
+    free = None
+    if visibility:
+        total = _interpolated(alpha, camera, pixels)
+        visible = _interpolated(alpha * points.visibility, camera, pixels)
+        free = [dr.select(t > 0, v / dr.select(t > 0, t, 1), 1) for v, t in zip(visible, total, strict=True)]
+    found = []
+    for i, (x, y) in enumerate(NODES):
+        view = -dr.normalize(camera.rays(ray, (NODE * x, NODE * y)))
+        at_node = ShadingPoints(mi.Vector3f(*(plane[i] for plane in normal)), view, points.attributes)
+        found.append(shade(at_node if free is None else at_node.replaced(visibility=free[i])).known())
+    return RadianceTerms(**{name: _mean([terms[name] for terms in found]) for name in found[0]})
 
 
-def _squared_turn(unit: Vector3f, seen: Bool, camera: Camera) -> Float:
-    """|∂n/∂x|² + |∂n/∂y|² of unit normals, per squared pixel; 0 where nothing is seen."""
-    pixel, covered = camera.pixel_centres(), dr.select(seen, mi.Float(1), mi.Float(0))
-    total = mi.Float(0)
-    for position, size, steps in (
-        (pixel.x, camera.width, ((-1, 0), (1, 0))),
-        (pixel.y, camera.height, ((0, -1), (0, 1))),
-    ):
-        planes = [neighbours(part, camera.width, camera.height, steps) for part in unit]
-        visible = neighbours(covered, camera.width, camera.height, steps)
-        least = mi.Float(NO_NEIGHBOUR)
-        for side, inside in enumerate((position > 1, position < size - 1)):
-            turn = dr.squared_norm(unit - mi.Vector3f(*(plane[side] for plane in planes)))
-            least = dr.select(inside & (visible[side] > 0), dr.minimum(least, turn), least)
-        total += dr.select(least < NO_NEIGHBOUR, least, 0)
-    return dr.select(seen, total, 0)
+def _interpolated(plane: Float, camera: Camera, pixels: CompactedPixels | None) -> list[Float]:
+    """Values (P,) at each of NODES of a plane (P,) given at pixel centres."""
+    beside = neighbours(plane, camera.width, camera.height, AROUND, pixels)
+    at = dict(zip(AROUND, beside, strict=True))
+    side, corner = NODE * (1 - NODE), NODE**2
+    centre = (1 - NODE) ** 2 * plane
+    return [centre + side * (at[x, 0] + at[0, y]) + corner * at[x, y] for x, y in NODES]
+
+
+def _mean(values: Sequence[mi.Color3f]) -> mi.Color3f:
+    return sum(values[1:], values[0]) / len(values)

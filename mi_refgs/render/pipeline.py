@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -20,7 +21,7 @@ from mi_refgs.constants import COVERAGE_FLOOR, FACING_TOLERANCE
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.kernels.timing import boundary
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.antialias import widened
+from mi_refgs.render.antialias import averaged
 from mi_refgs.render.gbuffer import AROUND, OBJECT, GBuffer, features, inverse_alpha, joined_slots
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.light import Light
@@ -186,8 +187,7 @@ class _View:
             own = self.scene.surfels.count
             slots = joined_slots(slots, others, (own, self.geometry.count - own))
         values = features(slots)
-        # Antialiasing reads neighbours in the image.
-        if self.request.forward_only and not self.scene.shading.antialias:
+        if self.request.forward_only:
             depth, draft = "depth" in self.asked, self.request.draft
             blended = splat_compact(self.geometry, values, self.camera, depth=depth, draft=draft)
         else:
@@ -262,8 +262,6 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
     pixel = None if buffer.pixels is None else buffer.pixels.raster
     ray, index = camera.rays(pixel), camera.image_index(pixel)
     attributes = {name: values[name] for name in view.points.attributes}
-    if shading.antialias:
-        attributes["roughness"] = widened(attributes["roughness"], normal, alpha, camera)
     points = ShadingPoints(normal, -dr.normalize(ray), attributes)
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
 
@@ -276,7 +274,13 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
         maps["visibility"] = points.visibility
 
     # Radiance, premultiplied.
-    shaded = shade(points, scene.light, shading)
+    shaded_at = partial(shade, light=scene.light, shading=shading)
+    if shading.antialias:
+        # Traced radiance exists only where the pixel's own ray is blocked: the rest would have none.
+        interpolated = shading.occlusion and not shading.traced_bounces
+        shaded = averaged(shaded_at, points, alpha, camera, buffer.pixels, interpolated)
+    else:
+        shaded = shaded_at(points)
     terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
     frame = Frame(
         alpha=buffer.alpha,

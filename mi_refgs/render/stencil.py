@@ -8,16 +8,27 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.splat.lanes import CompactedPixels
+
 # A step (dx, dy) in pixels, each -1, 0 or 1.
 Step = tuple[int, int]
 
 
-def neighbours(plane: Any, width: int, height: int, steps: Sequence[Step]) -> list[Any]:
+def neighbours(
+    plane: Any, width: int, height: int, steps: Sequence[Step], pixels: CompactedPixels | None = None
+) -> list[Any]:
     """The plane (mi.Float, raster order) shifted by each step: out_k(x, y) = plane(x + dx_k, y + dy_k).
 
-    Pixels outside repeat the border. Steps are (dx, dy) with entries in {-1, 0, 1}.
+    Pixels outside repeat the border. Steps are (dx, dy) with entries in {-1, 0, 1}. A plane of compacted
+    `pixels`, which has no derivative here, is 0 at all others.
     """
-    return list(dr.custom(_Neighbours, plane, width, height, tuple(steps)))
+    if pixels is None:
+        return list(dr.custom(_Neighbours, plane, width, height, tuple(steps)))
+    dr.eval(plane)
+    inside = dr.minimum(pixels.raster, width * height - 1)  # patches reach beyond the image
+    x, y = inside % width, inside // width
+    index = [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
+    return [pixels.at(plane, i) for i in index]
 
 
 class _Neighbours(dr.CustomOp):

@@ -56,7 +56,7 @@ class ShadingOptions:
     ambient_rays: int = number(0, 0, MAX_RAYS)  # per mesh vertex, for the ambient visibility; 0: unoccluded
     directions: int = number(24, 1, MAX_DIRECTIONS)  # per hemisphere; R3DG uses 64, which takes twice as long
     light_levels: int = number(MAX_LEVELS, 2, MAX_LEVELS)  # prefiltered roughness levels of the light
-    antialias: bool = False  # widen roughness by the variance of normals within a pixel
+    antialias: bool = False  # average the reflection over each pixel, at interpolated normals
 
     def __post_init__(self) -> None:
         for option in fields(ShadingOptions):

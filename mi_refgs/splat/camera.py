@@ -177,9 +177,9 @@ class Camera:
         index = dr.arange(mi.UInt32, self.width * self.height) if raster is None else raster
         return mi.Point2f(index % self.width + 0.5, index // self.width + 0.5)
 
-    def rays(self, raster: UInt32 | None = None) -> Vector3f:
-        """World directions through `pixel_centres`: 1 along the viewing axis, not unit."""
-        pixel = self.pixel_centres(raster)
+    def rays(self, raster: UInt32 | None = None, offset: tuple[float, float] = (0.0, 0.0)) -> Vector3f:
+        """World directions through `pixel_centres` + `offset`, pixels: 1 along the viewing axis, not unit."""
+        pixel = self.pixel_centres(raster) + mi.Vector2f(*offset)
         local = mi.Vector3f((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1)
         return self.rotation.T @ local
 

@@ -171,6 +171,11 @@ class CompactedPixels:
         dr.eval(maps)
         return maps
 
+    def at(self, values: Float, raster: UInt32) -> Float:
+        """Values (P,) at pixels by their index in the image, 0 where there is nothing."""
+        there = dr.gather(mi.Bool, self.there, raster)
+        return dr.gather(mi.Float, values, dr.gather(mi.UInt32, self.index, raster, there), there)
+
     def to_raster(self, values: Any) -> Any:
         """Arrays (P,), and what contains them, as ones (H·W,), 0 where there is nothing; constants stay."""
         dr.eval(values)

@@ -6,11 +6,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from benchmarks.stability.exact import filters
 from mi_refgs import constants as c
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS
-from mi_refgs.reference import image, losses, occlusion
+from mi_refgs.reference import image, occlusion
 from mi_refgs.reference.camera import PinholeCamera, look_at, rotation_axes
 from mi_refgs.reference.footprint import GEOMETRY
 from mi_refgs.reference.light import Light, filtered
@@ -59,14 +60,13 @@ class Oracle:
 
     def __init__(self, case: Case, first: Values) -> None:
         self.case, self.window, shown = case, (slice(None), slice(None)), case
-        if case["accuracy"] == "antialias":  # roughness depends on pixels beside the crop window
+        if case["accuracy"] == "antialias":  # normals are interpolated with pixels beside the crop window
             x, y, width, height = CROPS[case["crop"]]
             shown, self.window = case | {"crop": "none"}, (slice(y, y + height), slice(x, x + width))
         self.camera, self.corner, self.per_axis = camera_of(shown)
         self.pixels = np.arange(self.camera.width * self.camera.height)
         self.own = [*surfels_of(first).raw]
         self.visible: Array | None = None
-        self.variance: Array | None = None
 
         first = {name: np.asarray(x, np.float64) for name, x in first.items()}
         own, around = self._tables(first)
@@ -85,10 +85,9 @@ class Oracle:
         for alpha in (maps["alpha"], maps["object_alpha"]):
             band |= np.abs(alpha - c.COVERAGE_FLOOR)[:, 0] < 0.5 * c.COVERAGE_FLOOR
         self.band = band
-        if chosen.antialias:
+        if chosen.antialias:  # what a pixel interpolates must be decided, too
             shape = self.camera.height, self.camera.width
-            normal, share = maps["object_normal"].reshape(*shape, 3), maps["object_alpha"].reshape(shape)
-            self.variance = losses.widened_roughness(np.zeros(shape), normal, share).ravel() ** 4
+            self.band = maximum_filter(band.reshape(shape), 3).ravel()
 
     def image(self, values: Values) -> Array:
         """(H, W, channels), as `mi.render` gives it."""
@@ -112,7 +111,7 @@ class Oracle:
         chosen, (own, around) = shading(self.case), self._tables(values)
         scene = image.Scene(
             own, self.camera, self.pixels, self.order, chosen.at, chosen.reflectance, chosen.diffuse,
-            light_of(self.case, values), options=self.options, terms=True, variance=self.variance,
+            light_of(self.case, values), options=self.options, terms=True, antialias=chosen.antialias,
         )  # fmt: skip
         if chosen.occlusion and chosen.model.visibility == "mirror":
             scene = replace(scene, visibility=self._visibility)

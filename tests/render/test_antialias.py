@@ -1,4 +1,4 @@
-"""Roughness widened within a pixel: the float64 reference, derivatives, and many samples."""
+"""Reflections averaged over a pixel: the float64 reference, the quadrature, derivatives, and many samples."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ import numpy as np
 import pytest
 
 from mi_refgs.kernels.device import upload
-from mi_refgs.reference import losses as oracle
 from mi_refgs.reference.camera import look_at
-from mi_refgs.render.antialias import widened
+from mi_refgs.reference.image import bilinear_map
+from mi_refgs.render.antialias import averaged
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 
-SIZE = (9, 7)
-"""Width and height of the maps."""
+WIDTH, HEIGHT = 9, 7
+NODES = np.polynomial.legendre.leggauss(2)[0] / 2
+"""The Gauss-Legendre rule's two nodes, pixels from the centre."""
 
 
 def camera(size: int, focal: float) -> Camera:
@@ -31,69 +33,100 @@ def camera(size: int, focal: float) -> Camera:
     return Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose)
 
 
+def oblong() -> Camera:
+    return replace(camera(WIDTH, 8.0), height=HEIGHT)
+
+
 @pytest.fixture
-def maps(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Roughness, normals that bend, with an edge, of any length, and alpha with holes, at the border too."""
-    width, height = SIZE
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    bend = np.stack([0.04 * x + 0.02 * y**2, 0.07 * y, np.full(x.shape, 1.0)], -1)
-    bend[:, 5:] += [1.5, 0, 0]
-    bend[3, 7] = [-3, 0, -1]  # alone: its turns to all sides exceed the bound
-    alpha = rng.uniform(0.2, 1, (height, width))
+def maps(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Premultiplied normals, alpha with holes, at the border too, and visibility of 0 or 1."""
+    alpha = rng.uniform(0.2, 1, (HEIGHT, WIDTH, 1))
     alpha[[0, 2, 5, 6], [3, 2, 8, 0]] = 0
-    alpha[1, 6] = 5e-4
-    return rng.uniform(0, 0.6, (height, width)), bend * rng.uniform(0.1, 3, (height, width, 1)), alpha
+    alpha[3:6, 3:6] = 0  # a pixel whose neighbours are empty, too
+    normal = rng.normal(size=(HEIGHT, WIDTH, 3)) * alpha
+    return {"normal": normal, "alpha": alpha, "visibility": 1.0 * (rng.random(alpha.shape) > 0.5)}
 
 
-def found(roughness: mi.Float, normal: np.ndarray, alpha: np.ndarray) -> mi.Float:
-    width, height = SIZE
-    view = replace(camera(width, 8.0), height=height)
-    columns = mi.Vector3f(*(upload(normal[..., i]) for i in range(3)))
-    return widened(roughness, columns, upload(alpha), view)
+def columns(values: np.ndarray) -> list[mi.Float]:
+    return [upload(np.ascontiguousarray(plane)) for plane in np.moveaxis(values, -1, 0)]
 
 
-def test_maps_against_the_oracle(maps: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-    roughness, normal, alpha = maps
-    roughness[2, 4] = 0  # a perfect mirror
-    expected = oracle.widened_roughness(roughness, normal, alpha)
-    np.testing.assert_allclose(found(upload(roughness), normal, alpha), expected.ravel(), atol=2e-6)
-    grown = expected**4 - roughness**4
-    assert (grown[alpha < 1e-3] == 0).all() and grown.max() == pytest.approx(0.18)
-    assert 1e-4 < np.median(grown[alpha > 1e-3]) < 1e-2
-    rough = np.full_like(roughness, 0.99)
-    expected = oracle.widened_roughness(rough, normal, alpha)
-    np.testing.assert_allclose(found(upload(rough), normal, alpha), expected.ravel(), atol=2e-6)
-    assert expected.max() == 1
-    flat = np.tile([0.0, 0, 2], (*alpha.shape, 1))
-    np.testing.assert_array_equal(found(upload(roughness), flat, alpha), np.float32(roughness).ravel())
+def radiance(points: ShadingPoints) -> RadianceTerms:
+    """Radiance that is cubic in normal and visibility."""
+    n, v = points.normal, points.visibility
+    return RadianceTerms(specular=mi.Color3f(n.x * n.y, n.z * v, v * v * v))
+
+
+def found(
+    normal: list[mi.Float], alpha: mi.Float, visibility: mi.Float, *, interpolate: bool = True
+) -> mi.Color3f:
+    view = oblong()
+    points = ShadingPoints(mi.Vector3f(*normal), -dr.normalize(view.rays()), visibility=visibility)
+    return averaged(radiance, points, alpha, view, None, interpolate).specular
+
+
+def expected(maps: dict[str, np.ndarray]) -> np.ndarray:
+    """The same (H·W, 3) in float64."""
+    y, x = (axis.ravel() + 0.5 for axis in np.mgrid[:HEIGHT, :WIDTH])
+    total = np.zeros((HEIGHT * WIDTH, 3))
+    for dx in NODES:
+        for dy in NODES:
+            weighted = maps["alpha"] * maps["visibility"]
+            n, a, av = (bilinear_map(v, x + dx, y + dy) for v in (maps["normal"], maps["alpha"], weighted))
+            v = np.where(a > 0, av / np.where(a > 0, a, 1), 1)[:, 0]
+            total += np.stack([n[:, 0] * n[:, 1], n[:, 2] * v, v**3], -1) / 4
+    return total
+
+
+def test_interpolation_against_the_reference(maps: dict[str, np.ndarray]) -> None:
+    given = columns(maps["normal"]), columns(maps["alpha"])[0], columns(maps["visibility"])[0]
+    np.testing.assert_allclose(found(*given).numpy().T, expected(maps), atol=1e-6)
+    centre = found(*given, interpolate=False).numpy()[2].reshape(HEIGHT, WIDTH)
+    np.testing.assert_array_equal(centre, maps["visibility"][..., 0])
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
-def test_derivative_of_the_roughness(
-    mode: str, maps: tuple[np.ndarray, np.ndarray, np.ndarray], rng: np.random.Generator
+def test_derivatives_against_differences(
+    mode: str, maps: dict[str, np.ndarray], rng: np.random.Generator
 ) -> None:
-    """Against differences of the float64 reference; normals have none."""
-    roughness, normal, alpha = maps
-    weight, tangent = rng.normal(size=(2, *roughness.shape))
-    step = 1e-6
-    slope = (
-        oracle.widened_roughness(roughness + step, normal, alpha)
-        - oracle.widened_roughness(roughness - step, normal, alpha)
-    ) / (2 * step)
-    given = upload(roughness)
-    dr.enable_grad(given)
-    out = found(given, normal, alpha)
+    """Normals and alpha, against central differences of the float64 reference; visibility has none."""
+    maps["alpha"] += 0.1
+    tangent = {name: rng.normal(size=maps[name].shape) for name in ("normal", "alpha")}
+    sides = [
+        expected(maps | {name: maps[name] + step * x for name, x in tangent.items()})
+        for step in (1e-6, -1e-6)
+    ]
+    slope, weight = (sides[0] - sides[1]) / 2e-6, rng.normal(size=(HEIGHT * WIDTH, 3))
+    normal, alpha = columns(maps["normal"]), columns(maps["alpha"])
+    leaves = [*normal, *alpha]
+    dr.enable_grad(leaves)
+    out = found(normal, alpha[0], *columns(maps["visibility"]))
+    along = columns(tangent["normal"]) + columns(tangent["alpha"])
     if mode == "forward":
-        dr.set_grad(given, upload(tangent))
-        np.testing.assert_allclose(dr.forward_to(out), (slope * tangent).ravel(), atol=1e-4)
+        for leaf, value in zip(leaves, along, strict=True):
+            dr.set_grad(leaf, value)
+        np.testing.assert_allclose(dr.forward_to(out).numpy().T, slope, atol=2e-5)
     else:
-        dr.backward(dr.sum(out * upload(weight)))
-        np.testing.assert_allclose(dr.grad(given), (slope * weight).ravel(), atol=1e-4)
-    turned = mi.Vector3f(*(upload(normal[..., i]) for i in range(3)))
-    dr.enable_grad(turned)
-    width, height = SIZE
-    plain = widened(upload(roughness), turned, upload(alpha), replace(camera(width, 8.0), height=height))
-    assert not dr.grad_enabled(plain)
+        dr.backward(dr.sum(dr.sum(out * mi.Color3f(*columns(weight)))))
+        sums = [np.sum(dr.grad(leaf).numpy() * x.numpy()) for leaf, x in zip(leaves, along, strict=True)]
+        assert sum(sums) == pytest.approx(np.sum(slope * weight), rel=1e-4)
+
+
+def test_points_integrate_cubic_radiance_exactly() -> None:
+    """With x in pixels, the mean of x² over a pixel is that at its centre and 1/12 more."""
+    view = camera(5, 4.0)
+    rays, alpha = view.rays(), dr.ones(mi.Float, 25)
+
+    def cubic(points: ShadingPoints) -> RadianceTerms:
+        local = view.rotation @ -points.view
+        x, y = (local.x / local.z * view.fx, local.y / local.z * view.fy)  # from the image's centre
+        return RadianceTerms(specular=mi.Color3f(x * x, x * x * x, x * y * y))
+
+    points = ShadingPoints(mi.Vector3f(0, 0, 1) + 0 * rays, -dr.normalize(rays))
+    mean = averaged(cubic, points, alpha, view, None, False).specular.numpy()
+    y, x = np.mgrid[-2:3, -2:3].reshape(2, -1)
+    exact = [x**2 + 1 / 12, x**3 + x / 4, x * (y**2 + 1 / 12)]
+    np.testing.assert_allclose(mean, exact, atol=2e-5)
 
 
 def mirror_ball() -> tuple[Surfels, EnvironmentLight]:
@@ -109,7 +142,7 @@ def mirror_ball() -> tuple[Surfels, EnvironmentLight]:
     return Surfels.from_numpy(raw), EnvironmentLight.from_radiance(stripes)
 
 
-def radiance(made: TrainedScene, samples: int, size: int = 24) -> np.ndarray:
+def image(made: TrainedScene, samples: int, size: int = 24) -> np.ndarray:
     frame: Frame = made.renderer(aovs=False, samples=samples)(camera(size, 1.2 * size))
     return np.array([*frame.radiance], np.float64)
 
@@ -119,12 +152,12 @@ def test_one_sample_comes_closer_to_many() -> None:
     surfels, light = mirror_ball()
     plain = TrainedScene(surfels, light, None, Shading(), 1, 0.0)
     filtered = replace(plain, shading=Shading(antialias=True))
-    truth = radiance(plain, 144)
-    errors = [np.sqrt(np.mean((radiance(made, 1) - truth) ** 2)) for made in (plain, filtered)]
+    truth = image(plain, 144)
+    errors = [np.sqrt(np.mean((image(made, 1) - truth) ** 2)) for made in (plain, filtered)]
     assert errors[1] < 0.6 * errors[0]
-    assert np.sqrt(np.mean((radiance(filtered, 144) - truth) ** 2)) < 0.1 * errors[0]
+    assert np.sqrt(np.mean((image(filtered, 144) - truth) ** 2)) < 0.1 * errors[0]
     own, other = (made.renderer()(camera(24, 29.0)).maps["roughness"] for made in (plain, filtered))
-    np.testing.assert_allclose(own, other, atol=1e-5)  # of one order of additions or another
+    np.testing.assert_array_equal(own, other)
 
 
 def test_antialias_requires_deferred_shading() -> None:

@@ -45,6 +45,7 @@ SHADINGS = {
     "mirror rays": Shading(occlusion=True),
     "lobe rays": Shading(occlusion=True, visibility_rays=4),
     "antialias": Shading(antialias=True),
+    "antialiased rays": Shading(antialias=True, occlusion=True),
     "irradiance": Shading(diffuse="irradiance", occlusion=True, ambient_rays=8),
     "monte_carlo": Shading(at="surfel", reflectance="monte_carlo", occlusion=True),
 }

@@ -98,9 +98,10 @@ def test_forward_only_lobe_samples_are_those_of_the_pixel() -> None:
     assert_same(*both(things(), camera_at(30.0), shading))
 
 
-def test_forward_only_antialiasing_reads_neighbours_in_the_image() -> None:
-    shading = Shading()
-    assert_same(*both(things(), camera_at(30.0), replace(shading, antialias=True)))
+@pytest.mark.parametrize("occlusion", [False, True])
+def test_forward_only_antialiasing_reads_neighbours_in_the_image(occlusion: bool) -> None:
+    shading = Shading(occlusion=occlusion, antialias=True)
+    assert_same(*both(things(), camera_at(30.0), shading))
 
 
 def test_nothing_in_view_is_black() -> None:
