@@ -61,7 +61,6 @@ COMMON = [
     "light.height=8",
     "mesh.resolution=16",
     "stage.initial.until=8",
-    "refine.gradient=1e-5",
     "log_every=1",
 ]
 

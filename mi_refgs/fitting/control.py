@@ -18,14 +18,16 @@ import numpy as np
 from mi_refgs.data.region import Region
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.initial import converted, first_light
-from mi_refgs.fitting.refine import SizeLimits, TableEdit
+from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import LIGHT, Method
-from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Vector2f
+from mi_refgs.types import Float
 
+EPOCHS = (
+    2  # passes over the training views in which each view comes at least once: permutations follow each other
+)
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 
@@ -64,23 +66,17 @@ class AdaptiveControl:
         self.setup, self.state = setup, state
         self.options = setup.method.refine
 
-    def observe(
-        self,
-        δ: Vector2f,  # (N,) gradient with respect to the surfels' screen offsets, per pixel; tables in order
-        camera: Camera,
-        iteration: int,
-    ) -> None:
-        """Add the gradients of a step to the statistics of the tables, in normalised device coordinates."""
+    def observe(self, error: Float, iteration: int) -> None:
+        """Add the squared errors (N,) that surfels are responsible for in a step; tables in order."""
         if self.options.densify is None or iteration > self.options.densify.until:
             return
-        length = dr.norm(δ * mi.Vector2f(0.5 * camera.width, 0.5 * camera.height))
         if len(self.state.tables) == 1:
-            self.state.tables[0].observe(length)
+            self.state.tables[0].observe(error)
             return
         begin = mi.UInt32(0)
         for table in self.state.tables:
-            count = dr.width(table.gradient_sum)
-            table.observe(dr.gather(mi.Float, length, dr.arange(mi.UInt32, count) + begin))
+            count = dr.width(table.error_sum)
+            table.observe(dr.gather(mi.Float, error, dr.arange(mi.UInt32, count) + begin))
             begin = dr.opaque(mi.UInt32, count)
 
     def changes_rows(self, iteration: int) -> bool:
@@ -117,25 +113,25 @@ class AdaptiveControl:
             state.optimiser.set_factor("opacity", 1.0)
 
     def _densify(self, iteration: int) -> None:
+        """Grow where the error is, prune, and let surfels of an open scene change tables."""
         options, data, method, state = self.options, self.setup.data, self.setup.method, self.state
-        draws = self.setup.rng(iteration, "densify")
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
         for table in state.tables:
-            surfels, limits = table.surfels, SizeLimits.of(options, data.scene_extent)
+            surfels, largest, behind = table.surfels, options.prune_extent * data.scene_extent, False
             if table.prefix:  # surfels of the background may grow with their distance
                 assert data.region is not None and method.surroundings is not None
                 outside = depth_outside(surfels.raw["position"].numpy(), data.region)
                 distance = data.region.radius * (1 + np.maximum(outside, 0))
-                split = options.dense_extent * np.maximum(distance, data.scene_extent)
-                limits = SizeLimits(split, method.surroundings.prune_extent * distance, keep_one=True)
-            edit = refine.densify_and_prune(surfels, table.gradient, limits, options, table.max_count, draws)
+                largest, behind = method.surroundings.prune_extent * distance, True
+            error, unseen = table.error_sum.numpy(), table.unseen.numpy() >= EPOCHS * len(data.views)
+            edit = refine.densify_and_prune(surfels, error, unseen, largest, options, table.max_count, behind)
             table.apply(edit)
         if self.setup.open_scene:
             assert data.region is not None
             inner, outer = (table.surfels for table in state.tables)
-            edits = exchanged(inner, outer, method, data.region, draws)
+            edits = exchanged(inner, outer, method, data.region, self.setup.rng(iteration, "densify"))
             for table, edit in zip(state.tables, edits, strict=True):
                 table.apply(edit)
         state.occluder.vertex_surfels = None

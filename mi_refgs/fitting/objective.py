@@ -143,7 +143,7 @@ def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss]:
 
 
 def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: int) -> tuple[Float, Float]:
-    """Weighted sum of the losses (width 1), and the mean squared error of the image, detached."""
+    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached."""
     image, target = inputs.image, inputs.target
     # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
     factors = {
@@ -162,4 +162,4 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
         if name in factors and (value := registered.value(inputs)) is not None:
             loss += factors[name] * value
     squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
-    return loss, dr.mean(sum(squares, mi.Float(0))) / 3
+    return loss, sum(squares, mi.Float(0)) / 3

@@ -31,7 +31,7 @@ from mi_refgs.data.view import View
 from mi_refgs.fitting import cost_model
 from mi_refgs.fitting.cost_model import Speed
 from mi_refgs.fitting.targets import bytes_of
-from mi_refgs.fitting.train import Trainer
+from mi_refgs.fitting.train import FUSED_VIEWS, Trainer
 from mi_refgs.kernels.device import machine, simd_width
 from mi_refgs.methods.build import plain
 from mi_refgs.methods.method import Method, Refine
@@ -240,7 +240,8 @@ def estimate(
     meshes = 0 if method.mesh is None else method.mesh.extract.count(method.iterations)
     files = views * size[0] * size[1] * DECODING
     steps *= GROWTH if has_alpha else OPEN_GROWTH
-    seconds = START + files + steps + meshes * (speed.mesh + views * speed.mesh_view)
+    fused = views + (meshes - 1) * min(views, FUSED_VIEWS) if meshes else 0
+    seconds = START + files + steps + meshes * speed.mesh + fused * speed.mesh_view
     return Estimate(seconds, bytes_of(method, views, pixels), width, height)
 
 

@@ -3,7 +3,7 @@
 A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes the files):
 
     params/NAME  optimiser/NAME/PART       parameters, and Adam's moments and counters of each
-    gradient_sum  gradient_count           per surfel, with the prefix "surroundings/" for the background
+    error_sum  unseen                      per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
     iteration  seconds  held_until  decisions  exposure  light_gradient
 """
@@ -55,35 +55,27 @@ class ParameterTable:
     optimiser: Adam
     prefix: str  # "" of the object, AROUND of the background
     max_count: int  # most surfels that the method allows
-    gradient_sum: Float = None  # (N,) of screen-space gradients since the last densification, NDC
-    gradient_count: Float = None  # (N,) views with a gradient
+    error_sum: Float = None  # (N,) squared error that each is responsible for, since the last densification
+    unseen: Float = None  # (N,) steps since the last one that showed it
 
     @property
     def surfels(self) -> Surfels:
         """The surfels, attached to the leaves that the optimiser owns."""
         return Surfels(channels_of(self.params, self.prefix))
 
-    @property
-    def gradient(self) -> np.ndarray:
-        """Mean length of the observed gradients (N,); waits for the device."""
-        mean: np.ndarray = self.gradient_sum.numpy() / np.maximum(self.gradient_count.numpy(), 1)
-        return mean
-
     def clear(self) -> None:
-        """Set the statistics to zero."""
-        count = self.surfels.count
-        self.gradient_sum = dr.opaque(mi.Float, 0, count)
-        self.gradient_count = dr.opaque(mi.Float, 0, count)
+        """Set the errors to zero."""
+        self.error_sum = dr.opaque(mi.Float, 0, self.surfels.count)
 
     def observe(
         self,
-        length: Float,  # (N,) of a step's gradients with respect to screen positions, NDC
+        error: Float,  # (N,) squared error of a step that each surfel is responsible for: Σ w e²
     ) -> None:
         """Add to the statistics."""
-        seen = (length > 0) & dr.isfinite(length)
-        self.gradient_sum += dr.select(seen, length, 0.0)
-        self.gradient_count += dr.select(seen, mi.Float(1), 0)
-        dr.schedule(self.gradient_sum, self.gradient_count)
+        seen = (error > 0) & dr.isfinite(error)
+        self.error_sum += dr.select(seen, error, 0.0)
+        self.unseen = dr.select(seen, 0.0, self.unseen + 1)
+        dr.schedule(self.error_sum, self.unseen)
 
     def apply(self, edit: TableEdit) -> None:
         """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows."""
@@ -103,9 +95,9 @@ class ParameterTable:
         """Replace the surfels by descendants of the rows `parent`; those that are `fresh` have no history."""
         self.replace(surfels)
         self.optimiser.gather(parent, self._names(surfels), fresh)
-        self.gradient_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_sum, parent))
-        self.gradient_count = dr.select(fresh, 0, dr.gather(mi.Float, self.gradient_count, parent))
-        dr.eval(self.gradient_sum, self.gradient_count)
+        self.error_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.error_sum, parent))
+        self.unseen = dr.select(fresh, 0, dr.gather(mi.Float, self.unseen, parent))
+        dr.eval(self.error_sum, self.unseen)
 
     def replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
         """Replace the surfels; the attributes in `cleared` lose their moments."""
@@ -143,6 +135,7 @@ class FitState:
         made.optimiser.set_factor(GAIN, 0.0)
         for table in made.tables:
             table.clear()
+            table.unseen = dr.opaque(mi.Float, 0, table.surfels.count)
         return made
 
     @staticmethod
@@ -187,8 +180,8 @@ class FitState:
         state = {f"{PARAMS}{name}": tensor.numpy() for name, tensor in self.params.items()}
         state |= {f"{OPTIMISER}{name}": value for name, value in self.optimiser.state_dict().items()}
         for table in self.tables:
-            state[f"{table.prefix}gradient_sum"] = table.gradient_sum.numpy()
-            state[f"{table.prefix}gradient_count"] = table.gradient_count.numpy()
+            state[f"{table.prefix}error_sum"] = table.error_sum.numpy()
+            state[f"{table.prefix}unseen"] = table.unseen.numpy()
         state |= {name: np.array(getattr(self, name)) for name in ("iteration", "seconds", "held_until")}
         state |= self.prefilter.state()
         for name, value in (("exposure", self.exposure), ("decisions", self.decisions)):
@@ -209,8 +202,8 @@ class FitState:
         made = FitState._assembled(setup, tensors(state, PARAMS))
         made.optimiser.load_state_dict(part(state, OPTIMISER))
         for table in made.tables:
-            table.gradient_sum = upload(state[f"{table.prefix}gradient_sum"])
-            table.gradient_count = upload(state[f"{table.prefix}gradient_count"])
+            table.error_sum = upload(state[f"{table.prefix}error_sum"])
+            table.unseen = upload(state[f"{table.prefix}unseen"])
         made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
         made.held_until = int(state["held_until"])
         made.decisions = decisions_of(state)

@@ -142,11 +142,10 @@ class Relocation:
 
 @dataclass(frozen=True)
 class Refine:
-    """Adaptive density control [3DGS §5.2, 2DGS; Ref-Gaussian §3.4]."""
+    """Adaptive density control [3DGS §5.2; Ref-Gaussian §3.4], by error [Rota Bulò et al. 2024]."""
 
     densify: Window | None = None
-    gradient: float = 2e-4  # NDC units; a mean over views, independent of the number of iterations
-    dense_extent: float = 0.01  # clone below, split above, in scene extents
+    grow: float = 0.25  # fraction of the surfels, those with the largest error, that an event splits at most
     prune_opacity: float = 0.05
     prune_extent: float = 0.1  # scene extents; larger surfels are removed
     reset: Window | None = None  # opacity to at most reset_opacity

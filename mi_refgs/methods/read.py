@@ -49,6 +49,9 @@ RENAMED = {
 }
 """Earlier keys → what they are called now; files may have either."""
 
+REMOVED = ("refine.gradient", "refine.dense_extent")
+"""Keys of version 0.1 that resolved files may have: densification by screen-space gradients."""
+
 
 @dataclass(frozen=True)
 class Preset:
@@ -128,6 +131,9 @@ def load_resolved(path: Path) -> Method:
     A run has the losses in its file and no others; a file of 0.1, with numbers as weights, may lack some.
     """
     parsed = _parsed(path)
+    for key in REMOVED:
+        with contextlib.suppress(InputError):  # only older files have it
+            _drop(parsed, key, path)
     losses = parsed.get("loss")
     complete = isinstance(losses, dict) and all(isinstance(loss, dict) for loss in losses.values())
     table = _modernised(parsed, str(path))

@@ -36,15 +36,17 @@ class GBuffer:
     slots: dict[str, Any]  # premultiplied by alpha, each of the type that was blended
     inverse: Float  # 1/alpha or 1/opacity of the object where that is seen, else 0
     pixels: CompactedPixels | None
+    attribution: Float = None  # the map of `Request.attribution`
 
     @staticmethod
     def of(blended: Composited, kinds: Slots) -> GBuffer:
-        """The maps of the `features` of slots."""
+        """The maps of the `features` of slots, and of the attribution if it follows them."""
         slots = _grouped(kinds, blended.features)
+        rest = blended.features[len(features(kinds)) :]
         inverse = inverse_alpha(blended.alpha)
         own = inverse_alpha(slots[OBJECT]) if OBJECT in slots else inverse
         mean_depth = None if blended.depth is None else blended.depth * inverse
-        return GBuffer(blended.alpha, mean_depth, slots, own, blended.pixels)
+        return GBuffer(blended.alpha, mean_depth, slots, own, blended.pixels, rest[0] if rest else None)
 
     def divided(self, name: str) -> Any:
         """A slot divided by alpha or the object's opacity: the mean of what is seen, 0 where nothing is."""

@@ -32,7 +32,7 @@ from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives import require_known_primitive
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Color3f, Float, Point2f, Vector3f
+from mi_refgs.types import Color3f, Float, Vector3f
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Request:
     forward_only: bool = False  # without derivatives: faster, equal to rounding
     draft: bool = False  # of `forward_only`: pixels end at DRAFT_TRANSMITTANCE, faster, about 50 dB
     sh_degree: int | None = None  # highest SH degree of the radiance, for coarse-to-fine schedules
-    screen_offset: Point2f | None = None  # (N,) zeros that receive the gradient of a screen translation
+    attribution: Float | None = None  # (N,) zeros, which get Σ w δ for adjoints δ of the frame's
 
 
 RADIANCE = Request()
@@ -92,6 +92,7 @@ class Frame:
     object_alpha: Float = None  # opacity of the object, `alpha` itself without surroundings
     normal_alpha: Float = None  # `alpha` in forward, `object_alpha` in deferred shading
     distance: Float = None  # mean along the ray from the near plane, of several samples per pixel
+    attribution: Float = None  # blend of `Request.attribution`, zeros
 
     def only(self, aovs: Collection[str]) -> Frame:
         """The same frame without depth, normal, terms and maps that are not named."""
@@ -107,7 +108,7 @@ class Frame:
 def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> Frame:
     """Render a view of a scene.
 
-    With surroundings, the rows of `screen_offset` are those of the object, then theirs. Raises InputError as
+    With surroundings, the rows of `attribution` are those of the object, then theirs. Raises InputError as
     `Shading.require_inputs` does.
     """
     require_supported_variant("mi_refgs.render_frame")
@@ -134,14 +135,14 @@ def render_depth(
 
 
 def _without_empty_tables(scene: SurfelScene, request: Request) -> tuple[SurfelScene, Request]:
-    """The scene with `Surfels.never_empty`; an offset on the screen is then nobody's."""
+    """The scene with `Surfels.never_empty`; an attribution is then nobody's."""
     surfels, surroundings = scene.surfels, scene.surroundings
     if surfels.count and (surroundings is None or surroundings.surfels.count):
         return scene, request
     if surroundings is not None:
         surroundings = replace(surroundings, surfels=surroundings.surfels.never_empty())
     scene = replace(scene, surfels=surfels.never_empty(), surroundings=surroundings)
-    return scene, replace(request, screen_offset=None)
+    return scene, replace(request, attribution=None)
 
 
 # ---------------- the two orders ----------------
@@ -191,7 +192,9 @@ class _View:
             depth, draft = "depth" in self.asked, self.request.draft
             blended = splat_compact(self.geometry, values, self.camera, depth=depth, draft=draft)
         else:
-            blended = splat(self.geometry, values, self.camera, self.request.screen_offset)
+            if self.request.attribution is not None:
+                values = [*values, self.request.attribution]
+            blended = splat(self.geometry, values, self.camera)
         return GBuffer.of(blended, slots)
 
 
@@ -243,6 +246,7 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
         background=view.background,
         object_alpha=blended.get(OBJECT, None if view.others else buffer.alpha),
         normal_alpha=buffer.alpha,
+        attribution=buffer.attribution,
     )
     return frame, buffer
 
@@ -292,5 +296,6 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
         background=view.background,
         object_alpha=alpha,
         normal_alpha=alpha,
+        attribution=buffer.attribution,
     )
     return frame, buffer

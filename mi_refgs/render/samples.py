@@ -80,6 +80,7 @@ def supersampled(
         object_alpha=object_alpha,
         normal_alpha=alphas[id(fine.normal_alpha)],
         distance=distance,
+        attribution=None if fine.attribution is None else mean(fine.attribution),
     )
 
 

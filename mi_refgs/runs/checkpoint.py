@@ -78,6 +78,10 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
             state = {name: archive[name] for name in archive.files}
     except (ValueError, EOFError, KeyError, OSError, MemoryError, zipfile.BadZipFile) as error:
         raise DamagedError(f"no .npz of arrays: {error}") from error
+    for prefix in ("", AROUND):  # version 0.1: screen-space gradients in place of errors
+        if f"{prefix}gradient_sum" in state:
+            state[f"{prefix}error_sum"] = state.pop(f"{prefix}gradient_sum")
+            state[f"{prefix}unseen"] = np.zeros_like(state.pop(f"{prefix}gradient_count"))
     check(state)
     return state
 
@@ -128,7 +132,7 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     _check(state, scalars, ())
     tables = {"": table} | ({} if around is None else {AROUND: around.surfels})
     for prefix, rows in tables.items():
-        _check(state, [f"{prefix}gradient_sum", f"{prefix}gradient_count"], (rows.count,))
+        _check(state, [f"{prefix}error_sum", f"{prefix}unseen"], (rows.count,))
     _check(state, signed, signed=True)
     if part(state, MESH):
         _check(state, [f"{MESH}voxel"], ())

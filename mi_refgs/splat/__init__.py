@@ -8,7 +8,7 @@ from mi_refgs.splat.composite import Composited, composite, composite_compact
 from mi_refgs.splat.tiles import TileLists, list_by_tile
 from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Float, Point2f
+from mi_refgs.types import Float
 
 __all__ = [
     "Camera",
@@ -24,21 +24,20 @@ __all__ = [
 
 
 @phase("project")
-def project(surfels: Surfels, camera: Camera, screen_offset: Point2f | None = None) -> Footprints:
-    """Footprints of surfels in a camera; `screen_offset` as in `Primitive.project`."""
-    return surfels.primitive.project(surfels, camera, screen_offset)
+def project(surfels: Surfels, camera: Camera) -> Footprints:
+    """Footprints of surfels in a camera."""
+    return surfels.primitive.project(surfels, camera)
 
 
 def splat(
     surfels: Surfels,
     features: list[Float],  # K × (N,)
     camera: Camera,
-    screen_offset: Point2f | None = None,  # (N,) zeros, pixels; receives the gradient of a translation
 ) -> Composited:
     """Splat features of surfels to maps of H·W pixels in raster order; derivatives as in `composite`."""
     if surfels.count == 0:
         return Composited.nothing(len(features), camera)
-    footprints = project(surfels, camera, screen_offset)
+    footprints = project(surfels, camera)
     lists = list_by_tile(footprints, camera, features)
     return composite(footprints, features, lists)
 

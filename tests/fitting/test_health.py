@@ -64,7 +64,7 @@ def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
     trainer.train(look)
     assert trainer.health.skipped == 1 and trainer.surfels.count == len(before) - 2
     assert said == [f"iteration {failed[0]}, view 2: albedo not finite at surfels 17, 52: 2 were removed"]
-    assert len(trainer.fit.tables[0].gradient_sum) == trainer.surfels.count
+    assert len(trainer.fit.tables[0].error_sum) == trainer.surfels.count
     lines = (run.path / "metrics.jsonl").read_text().splitlines()
     assert json.loads(lines[-1])["skipped_steps"] == 1
 

@@ -48,7 +48,7 @@ def method(tmp_path_factory: pytest.TempPathFactory) -> Method:
     settings = [
         f"iterations={STEPS}", "surfels.count=80", "surfels.max_count=100",
         "surroundings.count=60", "surroundings.max_count=90", "log_every=4",
-        "refine.densify={ start = 0, until = 10, every = 4 }", "refine.gradient=1e-5",
+        "refine.densify={ start = 0, until = 10, every = 4 }",
         "refine.reset={ start = 0, until = 6, every = 6 }", "loss.normal=0.1",
     ]  # fmt: skip
     return methods.load(str(path), "quick", settings)

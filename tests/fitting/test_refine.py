@@ -39,41 +39,79 @@ def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels
 
 
 def densify(
-    surfels: Surfels, gradient: np.ndarray, max_count: int = 100, extent: float = 1.0
+    surfels: Surfels,
+    error: np.ndarray,
+    most: int = 100,
+    largest: float = 0.1,
+    options: Refine = OPTIONS,
+    unseen: np.ndarray | None = None,
 ) -> refine.TableEdit:
-    limits, rng = refine.SizeLimits.of(OPTIONS, extent), np.random.default_rng(1)
-    return refine.densify_and_prune(surfels, gradient, limits, OPTIONS, max_count, rng)
+    unseen = np.zeros(surfels.count, bool) if unseen is None else unseen
+    return refine.densify_and_prune(surfels, error, unseen, largest, options, most)
 
 
-def test_small_hot_surfels_are_cloned_and_cold_ones_left_alone() -> None:
-    surfels = table()
-    edited = densify(surfels, np.array([0, 1e-3, 0, 0, 5e-4, 0]))
-    assert edited.parent.tolist() == [0, 1, 2, 3, 4, 5, 1, 4]
-    assert edited.fresh.tolist() == [False] * 6 + [True] * 2
-    for name, values in edited.surfels.to_numpy().items():
-        assert np.array_equal(values, surfels.to_numpy()[name][edited.parent]), name
+def test_surfels_with_the_largest_error_are_split() -> None:
+    """As many as an event may add, or as there is room for; those without error stay as they are."""
+    surfels, error = table(8), np.array([0, 3.0, 1, 0, 2, 0, 5, 4])
+    assert densify(surfels, error).parent.tolist() == [0, 1, 2, 3, 4, 5, *(6, 7), *(6, 7)]
+    assert densify(surfels, error, most=9).parent.tolist() == [0, 1, 2, 3, 4, 5, 7, 6, 6]
+    assert densify(surfels, error, most=8).parent.tolist() == [*range(8)]
+    every = densify(surfels, error, options=dataclasses.replace(OPTIONS, grow=1.0))
+    assert every.parent.tolist() == [0, 3, 5, *(1, 2, 4, 6, 7), *(1, 2, 4, 6, 7)]
+    assert every.fresh.tolist() == [False] * 3 + [True] * 10
+    for name in ("metallic", "roughness", "albedo", "rotation"):
+        values = every.surfels.to_numpy()[name]
+        assert np.array_equal(values, surfels.to_numpy()[name][every.parent]), name
 
 
-def test_large_hot_surfels_are_split_within_their_own_plane() -> None:
-    surfels = table(scale=0.05)
-    edited = densify(surfels, np.array([0, 1e-3, 0, 0, 0, 0]))
-    assert edited.parent.tolist() == [0, 2, 3, 4, 5, 1, 1]
-    raw, children = surfels.to_numpy(), edited.surfels.to_numpy()
-    shrunk = np.exp(children["scale"][5:] - raw["scale"][[1, 1]])
-    np.testing.assert_allclose(shrunk, 1 / refine.SPLIT_SHRINK, rtol=1e-5)
-    normal = np.array(surfels.frame()[2]).T[1]
-    offsets = children["position"][5:] - raw["position"][1]
-    assert np.abs(offsets @ normal).max() < 1e-6
-    assert 0 < np.abs(offsets).max() < 6 * 0.05
+def test_children_lie_on_the_longest_axis_of_their_parent() -> None:
+    surfels = table(2).to_numpy()
+    surfels["scale"] = np.log([[0.02, 0.01], [0.01, 0.02]])
+    whole = Surfels.from_numpy(surfels)
+    children = densify(whole, np.ones(2), options=dataclasses.replace(OPTIONS, grow=1.0)).surfels.to_numpy()
+    axes = np.array(whole.frame()).transpose(2, 0, 1)
+    along = 0.02 * refine.SPLIT_OFFSET * np.stack([axes[0, 0], axes[1, 1]])
+    np.testing.assert_allclose(
+        children["position"] - surfels["position"][[0, 1, 0, 1]], [*along, *-along], atol=1e-6
+    )
+    shrunk = np.exp(children["scale"] - surfels["scale"][[0, 1, 0, 1]])
+    np.testing.assert_allclose(shrunk, [[refine.SPLIT_SCALE, 1], [1, refine.SPLIT_SCALE]] * 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("opacity, most", [(0.3, 0.005), (0.9, 0.016), (0.99, 0.02)])
+def test_split_hardly_changes_the_profile(opacity: float, most: float) -> None:
+    """Both children composited, along the axis of the split, and on a line beside it."""
+    x = np.linspace(-5, 5, 1001)
+    child = refine.split_opacity(np.array([opacity]))[0]
+    for aside in (1.0, np.exp(-0.5)):
+        parent = opacity * aside * np.exp(-(x**2) / 2)
+        first, second = (
+            child * aside * np.exp(-((x - side * refine.SPLIT_OFFSET) ** 2) / (2 * refine.SPLIT_SCALE**2))
+            for side in (-1, 1)
+        )
+        both = first + second - first * second
+        assert np.sum((both - parent) ** 2) < 1.5 * most * np.sum(parent**2)
+
+
+def test_no_child_is_too_transparent_to_stay() -> None:
+    """It would be removed at the next event; while removal waits for a reset, it is split."""
+    surfels, error = table(opacity=0.06), np.ones(6)
+    assert densify(surfels, error).parent.tolist() == [*range(6)]
+    assert len(densify(surfels, error, options=dataclasses.replace(OPTIONS, prune_opacity=0.0)).parent) == 8
+
+
+def test_surfels_that_no_view_shows_are_removed() -> None:
+    unseen = np.arange(6) == 2
+    assert densify(table(), np.zeros(6), unseen=unseen).parent.tolist() == [0, 1, 3, 4, 5]
 
 
 def test_ordered_rows_keep_their_values_and_parents() -> None:
     edited = densify(table(40), np.where(np.arange(40) % 3, 0, 1e-3))
     ordered = edited.ordered()
-    place = [
-        np.flatnonzero((edited.parent == p) & (edited.fresh == f))[0]
-        for p, f in zip(ordered.parent, ordered.fresh, strict=True)
-    ]
+    before, after = (table.surfels.to_numpy()["position"] for table in (edited, ordered))
+    place = [int(np.flatnonzero((before == position).all(axis=1))[0]) for position in after]
+    assert edited.parent[place].tolist() == ordered.parent.tolist()
+    assert edited.fresh[place].tolist() == ordered.fresh.tolist()
     assert sorted(place) == list(range(len(edited.parent))) != place
     for name, values in ordered.surfels.to_numpy().items():
         assert np.array_equal(values, edited.surfels.to_numpy()[name][place]), name
@@ -87,24 +125,12 @@ def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
     assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
 
 
-def test_sizes_are_shares_of_scene() -> None:
-    """In any unit the same surfels are cloned, split and dropped."""
-    gradient, sizes = np.array([1e-3, 1e-3, 1e-3, 0, 0, 0]), np.array([0.005, 0.05, 0.5, 0.005, 0.05, 0.5])
-    parents = []
-    for unit in (1e-3, 1.0, 1e3):
-        raw = table().to_numpy()
-        raw["scale"] = np.log(unit * sizes)[:, None] + np.zeros((1, 2))
-        parents.append(densify(Surfels.from_numpy(raw), gradient, extent=unit).parent.tolist())
-    assert parents == [[0, 3, 4, 0, 1, 1]] * 3
-
-
 def test_opacities_get_time_to_grow_back_after_reset() -> None:
     surfels = table(opacity=0.02)
     waiting = dataclasses.replace(OPTIONS, prune_opacity=0.0)
-    limits, rng = refine.SizeLimits.of(OPTIONS, 1.0), np.random.default_rng(1)
-    assert len(refine.densify_and_prune(surfels, np.zeros(6), limits, waiting, 100, rng).parent) == 6
+    assert len(densify(surfels, np.zeros(6), options=waiting).parent) == 6
     with pytest.raises(InputError, match=r"refine\.prune_opacity"):
-        refine.densify_and_prune(surfels, np.zeros(6), limits, OPTIONS, 100, rng)
+        densify(surfels, np.zeros(6))
 
 
 def test_wait_follows_rate_that_lifts_opacities() -> None:
@@ -122,13 +148,6 @@ def test_wait_follows_rate_that_lifts_opacities() -> None:
     assert refine.prune_wait(options, rate / 2) == pytest.approx(2 * wait)
     raised = dataclasses.replace(options, prune_opacity=options.reset_opacity)
     assert refine.prune_wait(raised, rate) == 0 and refine.prune_wait(options, 0.0) == np.inf
-
-
-@pytest.mark.parametrize("scale", [0.005, 0.05])
-def test_growth_stops_at_limit_and_takes_hottest(scale: float) -> None:
-    edited = densify(table(scale=scale), np.array([3, 9, 4, 8, 5, 7]) * 1e-3, max_count=8)
-    assert len(edited.parent) == 8
-    assert np.flatnonzero(np.bincount(edited.parent) == 2).tolist() == [1, 3]
 
 
 def test_reset_lowers_opacity_and_lifts_metallic_only() -> None:

@@ -115,26 +115,35 @@ def test_edit_clears_moments_of_what_it_changed(method: Method) -> None:
     assert before - moving() == {"optimiser/opacity/first", "optimiser/scale/first"}
 
 
-@pytest.mark.parametrize("samples, factor", [(1, 1), (4, 2)])
-def test_screen_gradient_is_in_normalised_device_coordinates(
-    samples: int, factor: int, method: Method, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("samples", [1, 4])
+@pytest.mark.parametrize("stage", ["initial", "deferred"])
+def test_statistics_distribute_the_squared_error_over_surfels(
+    stage: str, samples: int, method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Normalised device coordinates: what densification compares then has no unit."""
-    initial = dataclasses.replace(method.stage["initial"], samples=samples)
-    method = dataclasses.replace(method, stage=method.stage | {"initial": initial})
-    offsets, original = [], train.render
+    """They sum to the squared error times alpha, and each gets that of the pixels that show it."""
+    only = {"only": dataclasses.replace(method.stage[stage], until=30, samples=samples)}
+    method = dataclasses.replace(method, stage=only, mesh=None)
+    frames, errors = [], []
+    render, measure = train.supersampled, train.objective
 
-    def render(scene: Any, camera: Any, request: Any) -> Any:
-        offsets.append(request.screen_offset)
-        assert camera.width == SIZE // 3 * factor  # coarse, and each pixel of as many samples
-        return original(scene, camera, request)
+    def rendered(*inputs: Any, **options: Any) -> Any:
+        assert inputs[2] == samples
+        frames.append(render(*inputs, **options))
+        return frames[-1]
 
-    monkeypatch.setattr(train, "render", render)
+    def measured(*inputs: Any) -> Any:
+        loss, error = measure(*inputs)
+        errors.append(error)
+        return loss, error
+
+    monkeypatch.setattr(train, "supersampled", rendered)
+    monkeypatch.setattr(train, "objective", measured)
     trainer = Trainer(method, ball())
     trainer.step()
-    expected = 0.5 * (SIZE // 3) * factor * np.linalg.norm(np.array(dr.grad(offsets[0])), axis=0)
-    assert expected.max() > 0
-    np.testing.assert_allclose(trainer.fit.tables[0].gradient_sum.numpy(), expected, rtol=1e-5, atol=1e-9)
+    found = trainer.fit.tables[0].error_sum.numpy()
+    total = float(dr.sum(errors[0] * dr.detach(frames[0].alpha))[0])
+    assert total > 0 and found.sum() == pytest.approx(total, rel=1e-4)
+    assert ((found > 0) == (trainer.fit.tables[0].unseen.numpy() == 0)).all()
 
 
 def send_in_iteration_7(monkeypatch: pytest.MonkeyPatch, *numbers: signal.Signals) -> list[int]:

@@ -87,7 +87,7 @@ WRONG = {
     "columns cut": replaced("params/rotation", lambda x: x[:, :3]),
     "flat": replaced("params/position", lambda x: x.ravel()),
     "moments cut": replaced("optimiser/position/first", lambda x: x[1:]),
-    "statistics cut": replaced("gradient_sum", lambda x: x[1:]),
+    "statistics cut": replaced("error_sum", lambda x: x[1:]),
     "a light of another shape": replaced("params/light", lambda x: x[:, :-1]),
     "NaN": replaced("params/roughness", spoilt(np.nan)),
     "infinite light": replaced("params/light", spoilt(np.inf)),

@@ -40,7 +40,7 @@ extract = { start = 9, until = 30, every = 10 }
 resolution = 24
 [refine]
 densify = { start = 3, until = 24, every = 6 }
-gradient = 1e-6
+prune_extent = 1.0
 reset = { start = 0, until = 24, every = 14 }
 reset_raise = ["metallic"]
 propagate = { when = { start = 0, until = 24, every = 5 }, hold = 4, noise = 0.1 }

@@ -25,7 +25,6 @@ from tests.scenes.splats import (
     check_image,
     check_lists,
     check_reference_slopes,
-    check_screen_offset,
     check_transpose,
     fast_gradients,
     fast_maps,
@@ -106,10 +105,6 @@ def test_gradients_match_the_oracle(seed: int) -> None:
 def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
     """⟨∇loss, v⟩ from reverse mode equals the directional derivative from forward mode, for random v."""
     check_transpose(make_scene(seed), seed)
-
-
-def test_screen_offset_receives_the_gradient_of_a_translation() -> None:
-    check_screen_offset(make_scene(0))
 
 
 def test_crossing_surfels_each_hide_the_other_on_their_own_side() -> None:

@@ -68,13 +68,11 @@ class Ball(Primitive):
     columns = 5  # 1/σ², p.z, centre.x, centre.y, opacity
     sizes = ("radius",)
 
-    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any) -> Footprints:
         p, opacity = camera.to_camera(surfels.position()), surfels.opacity()
         visible = dr.detach((p.z > camera.near) & (p.z > 0) & (opacity >= ALPHA_MIN))
         z = dr.select(visible, p.z, 1)
         centre = mi.Vector2f(camera.fx * p.x / z + camera.cx, camera.fy * p.y / z + camera.cy)
-        if screen_offset is not None:
-            centre += mi.Vector2f(screen_offset)
         sigma = dr.maximum(dr.abs(camera.fx) * surfels.value("radius") / z, 0.5)
         columns = [dr.rcp(sigma * sigma), z, centre.x, centre.y, opacity]
         with dr.suspend_grad():
@@ -191,16 +189,14 @@ def test_balls_are_splatted_and_differentiated() -> None:
     assert dr.forward_to(loss())[0] == pytest.approx(expected, rel=1e-3)
 
 
-def test_balls_are_cloned_split_and_written(tmp_path: Path) -> None:
+def test_balls_are_split_and_written(tmp_path: Path) -> None:
     surfels = balls()
-    options, rng = Refine(dense_extent=0.3, prune_extent=10.0), np.random.default_rng(0)
-    limits = refine.SizeLimits.of(options, 1.0)
-    edited = refine.densify_and_prune(surfels, np.ones(30), limits, options, 90, rng)
+    error = np.arange(30.0) - 9  # two thirds have one
+    edited = refine.densify_and_prune(surfels, error, np.zeros(30, bool), 10.0, Refine(grow=1.0), 90)
     before, after = surfels.to_numpy(), edited.surfels.to_numpy()
-    split = np.exp(before["radius"][edited.parent, 0]) > 0.3
-    assert 0 < split.sum() < len(split) == 60
-    shrunk = np.log(np.where(split, refine.SPLIT_SHRINK, 1))
-    np.testing.assert_allclose(after["radius"][:, 0], before["radius"][edited.parent, 0] - shrunk, rtol=1e-5)
+    assert len(edited.parent) == 50 and edited.fresh.sum() == 40
+    shrunk = np.where(edited.fresh, np.log(refine.SPLIT_SCALE), 0)
+    np.testing.assert_allclose(after["radius"][:, 0], before["radius"][edited.parent, 0] + shrunk, rtol=1e-5)
     write_ply(tmp_path / "balls.ply", edited.surfels)
     read = read_ply(tmp_path / "balls.ply")
     assert read.primitive.name == "ball"
@@ -216,7 +212,7 @@ def test_balls_are_fitted(tmp_path: Path) -> None:
         checkpoint_every = 3
         surfels = {{ primitive = "ball", attributes = ["radiance_sh"], degree = {{ radiance_sh = 1 }} }}
         stage.all = {{ until = 6, reflectance = "radiance" }}
-        refine = {{ densify = {{ start = 1, until = 6, every = 2 }}, gradient = 1e-9, prune_extent = 10.0 }}
+        refine = {{ densify = {{ start = 1, until = 6, every = 2 }}, prune_extent = 10.0 }}
         """
     )
     data, run = write_data(tmp_path / "data"), tmp_path / "run"

@@ -61,7 +61,7 @@ class Gaussian(Primitive):
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
     sizes = ("scale",)
 
-    def project(self, surfels: Any, camera: Any, screen_offset: Point2f | None = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any) -> Footprints:
         """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
@@ -93,8 +93,6 @@ class Gaussian(Primitive):
         determinant = crossed + low_pass.x * yy + low_pass.y * unfiltered.x
         a = dr.sqrt(yy * dr.rcp(determinant))
         centre = focal * slope + middle
-        if screen_offset is not None:
-            centre += mi.Vector2f(screen_offset)
         columns = [a / focal.x, -a * xy / (yy * focal.y), dr.rsqrt(yy) / focal.y]
         columns += [z, centre.x, centre.y, opacity]
         columns = [dr.select(visible, column, 0) for column in columns]

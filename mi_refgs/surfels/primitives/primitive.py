@@ -72,12 +72,10 @@ class Primitive(ABC):
     # ---------------- footprints, under AD ----------------
 
     @abstractmethod
-    def project(self, surfels: Any, camera: Any, screen_offset: Any = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any) -> Footprints:
         """Footprints of all surfels in a camera.
 
-        `screen_offset` (mi.Point2f (N,), pixels) is added to the centres: of zeros, it receives the gradient
-        of a screen translation, which densification reads. The rectangles have no derivative. Culled surfels
-        cover no pixel and get zero gradient.
+        The rectangles have no derivative. Culled surfels cover no pixel and get zero gradient.
         """
 
     @abstractmethod
@@ -120,13 +118,22 @@ class Primitive(ABC):
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Orthonormal world axes (N, A, 3) of its Gaussian, and standard deviations (N, A) along them.
 
-        Densification draws the positions of a split primitive's children from this Gaussian.
+        Densification splits a primitive along the longest of them.
         """
 
     def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
         """Multiply the standard deviations of some primitives by a factor, in place."""
         for name in self.sizes:
             raw[name][rows] += np.float32(np.log(factor))
+
+    def shrink(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, factor: float) -> None:
+        """Multiply the standard deviation along one axis (n,) of each of n primitives by a factor, in place.
+
+        Of a primitive with one size for all axes, that size is multiplied.
+        """
+        for name in self.sizes:
+            along = np.minimum(axis, raw[name].shape[1] - 1)
+            raw[name][rows] += np.log(factor) * (np.arange(raw[name].shape[1]) == along[:, None])
 
 
 def _check(primitive: Primitive) -> None:

@@ -73,7 +73,7 @@ class Surfel(Primitive):
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
     sizes = ("scale",)
 
-    def project(self, surfels: Any, camera: Any, screen_offset: Point2f | None = None) -> Footprints:
+    def project(self, surfels: Any, camera: Any) -> Footprints:
         """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, edge-on by EDGE_ON_COSINE, opacity below ALPHA_MIN,
@@ -103,8 +103,6 @@ class Surfel(Primitive):
         )
         of_u, of_v = inverse / s.x, inverse / s.y
         centre = focal * slope + mi.Vector2f(camera.cx, camera.cy)
-        if screen_offset is not None:
-            centre += mi.Vector2f(screen_offset)
         columns = [of_u * along_v.y / focal.x, -of_u * along_v.x / focal.y]
         columns += [-of_v * along_u.y / focal.x, of_v * along_u.x / focal.y]
         columns += [inverse * n.x / focal.x, inverse * n.y / focal.y]
