@@ -232,17 +232,26 @@ def estimate(
     """Estimate a fit to so many images of `size` (width, height), with or without alpha, downscaled by
     `factor`."""
     width, height = size[0] // factor, size[1] // factor
-    pixels, begin, steps = width * height, 0, 0.0
-    for name, stage in method.stages():
-        for block, count in _blocks(method, begin, min(stage.until, method.iterations)):
-            steps += count * speed.step(name, pixels // block**2)
-        begin = stage.until
+    pixels = width * height
+    steps = _steps(method, speed, pixels, method.iterations)
+    if method.metal_trial is not None:  # the start that is not continued
+        steps += _steps(method, speed, pixels, min(method.metal_trial.until, method.iterations))
     meshes = 0 if method.mesh is None else method.mesh.extract.count(method.iterations)
     files = views * size[0] * size[1] * DECODING
     steps *= GROWTH if has_alpha else OPEN_GROWTH
     fused = views + (meshes - 1) * min(views, FUSED_VIEWS) if meshes else 0
     seconds = START + files + steps + meshes * speed.mesh + fused * speed.mesh_view
     return Estimate(seconds, bytes_of(method, views, pixels), width, height)
+
+
+def _steps(method: Method, speed: Speed, pixels: int, last: int) -> float:
+    """Seconds of the iterations up to `last`, on images of so many pixels."""
+    begin, seconds = 0, 0.0
+    for name, stage in method.stages():
+        for block, count in _blocks(method, begin, min(stage.until, last)):
+            seconds += count * speed.step(name, pixels // block**2)
+        begin = stage.until
+    return seconds
 
 
 def _blocks(method: Method, begin: int, end: int) -> list[tuple[int, int]]:

@@ -14,6 +14,7 @@ from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure
+from mi_refgs.fitting.metal_trial import install_metal_trial
 from mi_refgs.fitting.objective import require_losses
 from mi_refgs.fitting.plan import Estimate, planned
 from mi_refgs.fitting.select import DECISIONS, install_trials, with_components
@@ -209,6 +210,7 @@ def begin(
     else:
         run.create(method, str(views.path.resolve()), views.region)
     install_trials(trainer, tell)
+    install_metal_trial(trainer, tell)
     return trainer
 
 

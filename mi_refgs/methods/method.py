@@ -281,6 +281,13 @@ class Selection:
 
 
 @dataclass(frozen=True)
+class MetalTrial:
+    """Choice between metal and dielectric at the start, by a trial of both (`fitting.metal_trial`)."""
+
+    until: int = field(metadata=ITERATIONS)  # last iteration with every surfel metal, or none
+
+
+@dataclass(frozen=True)
 class Method:
     """All settings of a fit; the resolved copy is saved with the run."""
 
@@ -300,6 +307,7 @@ class Method:
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
     preview_every: int = 1_000  # iterations
     log_every: int = 50  # iterations
+    metal_trial: MetalTrial | None = None  # absent: metallic learns from its initial value
     select: Selection | None = None
     components: tuple[str, ...] = ()  # of `select`, in use
     name: str = ""  # filled in by `load`, as the others below: the file's stem

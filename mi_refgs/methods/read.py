@@ -426,6 +426,8 @@ def _require_consistent(method: Method, where: str) -> None:
         ranges.append(("exposure.rate", method.exposure.rate, method.exposure.rate >= 0, "0 or more"))
     if relocate is not None:
         ranges.append(("refine.relocate.grow", relocate.grow, relocate.grow >= 0, "0 or more"))
+    if (metals := method.metal_trial) is not None:
+        ranges.append(("metal_trial.until", metals.until, metals.until >= 1, "1 or more"))
     if (around := method.surroundings) is not None:
         ranges += [
             (f"surroundings.{key}", getattr(around, key), allowed, wanted)
@@ -460,8 +462,9 @@ def _require_consistent(method: Method, where: str) -> None:
             if absent := [one for one in named if one not in known]:
                 raise InputError(f"{where}: stage.{name}: {key}: there is no '{absent[0]}'; remove it")
 
-    if method.refine.propagate is not None and "metallic" not in attributes:
-        raise InputError(f"{where}: refine.propagate: there is no attribute 'metallic'; add it, or drop this")
+    for key, used in (("refine.propagate", method.refine.propagate), ("metal_trial", method.metal_trial)):
+        if used is not None and "metallic" not in attributes:
+            raise InputError(f"{where}: {key}: there is no attribute 'metallic'; add it, or drop this")
 
 
 def _require_known_names(method: Method, attributes: set[str], where: str) -> None:

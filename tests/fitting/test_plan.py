@@ -13,7 +13,7 @@ from mi_refgs.cli import main
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import memory
-from mi_refgs.methods.method import CoarseImages, DataOptions, Method, Rates, SurroundingsOptions
+from mi_refgs.methods.method import CoarseImages, DataOptions, MetalTrial, Method, Rates, SurroundingsOptions
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.splat import Camera
 from tests.scenes.highlight import small_method
@@ -47,6 +47,8 @@ def test_estimate_is_sum_of_stages(method: Method) -> None:
     assert more == pytest.approx(50 * memory.PER_SURFEL)
     scene = plan.estimate(method, SPEED, 7, (20, 20), 1, has_alpha=False)
     assert whole.seconds - scene.seconds == pytest.approx((plan.GROWTH - plan.OPEN_GROWTH) * at_400)
+    twice = plan.estimate(dataclasses.replace(method, metal_trial=MetalTrial(11)), SPEED, 7, (20, 20), 1)
+    assert twice.seconds - whole.seconds == pytest.approx(8 * 5 + 3 * 10)
     tiny = plan.estimate(method, SPEED, 7, (1, 1), 1)
     assert tiny.seconds == pytest.approx(others + 7 * plan.DECODING + 0.5 * at_100)  # never next to nothing
 
