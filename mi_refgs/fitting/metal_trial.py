@@ -39,7 +39,9 @@ def install_metal_trial(trainer: Trainer, tell: Callable[[str], None] = lambda _
         if earlier is not None:
             earlier(trainer)
         if trainer.iteration == 0:
-            tell(choose_metallic(trainer, min(options.until, trainer.method.iterations)))
+            steps = min(options.until, trainer.method.iterations)
+            tell(f"begins as dielectric and as metal, {steps} iterations each; the better continues")
+            tell(choose_metallic(trainer, steps))
 
     trainer.before_step = before_step
 
