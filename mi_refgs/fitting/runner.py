@@ -162,10 +162,6 @@ def _fit(
     if warning := finish(trainer, run):
         progress.warn(warning)
     options, count = trainer.method.surfels, trainer.surfels.count
-    if trainer.method.refine.densify is not None and count >= options.max_count:
-        progress.warn(
-            f"all {count} surfels in use; more may help: --set surfels.max_count={2 * options.max_count}"
-        )
     if count < options.count // 10:
         progress.warn(f"{count} of {options.count} surfels are left; look at the previews")
     return trainer

@@ -53,7 +53,7 @@ def test_old_checkpoint_renders_when_artefacts_are_gone(run: Path) -> None:
     assert opened.trained.iteration == {"object": 3, "open": 6}[run.name]
 
 
-@pytest.mark.filterwarnings("ignore:.*training views", "ignore:all 60 surfels")
+@pytest.mark.filterwarnings("ignore:.*training views")
 def test_old_run_resumes(run: Path, one_thread: None) -> None:
     if run.name == "object":
         (run / "model.json").unlink()

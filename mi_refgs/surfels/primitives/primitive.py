@@ -129,7 +129,7 @@ class Primitive(ABC):
     def shrink(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, factor: float) -> None:
         """Multiply the standard deviation along one axis (n,) of each of n primitives by a factor, in place.
 
-        Of a primitive with one size for all axes, that size is multiplied.
+        A primitive with one size for all axes shrinks along all of them.
         """
         for name in self.sizes:
             along = np.minimum(axis, raw[name].shape[1] - 1)
