@@ -171,7 +171,7 @@ propagate = { when = { start = 0, until = 2_601, every = 650 } }
 
 
 EVENTS = {
-    "ref_gaussian": dict(degree=2, densify=14, mesh=8),
+    "ref_gaussian": dict(degree=2, densify=14, reset_opacity=2, mesh=8),
     "ref_gaussian_paper": dict(
         degree=3, densify=48, reset_opacity=8, propagate_normals=16, mesh=16, restart=1
     ),
