@@ -6,7 +6,7 @@ import json
 import sys
 import tempfile
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from subprocess import SubprocessError
 
@@ -48,8 +48,8 @@ def fitted(cell: Cell) -> Row:
     scoring are outside. Raises InputError as `read_dataset` and `begin` do.
     """
     method, path = cell.resolved(), Path(cell.data)
-    training = _part(read_views(method, path, "train", truth=False), validation=False)
-    validation = _part(read_views(method.downscaled(1), path, "train", decode=False), validation=True)
+    training, _ = read_views(method, path, "train", truth=False).held_out(HOLDOUT)
+    _, validation = read_views(method.downscaled(1), path, "train", decode=False).held_out(HOLDOUT)
     if not training.views:
         raise InputError(f"{path}: one training view; give 2 or more, of which one is a validation view")
     with tempfile.TemporaryDirectory() as folder:
@@ -73,12 +73,6 @@ def fitted(cell: Cell) -> Row:
         "views": len(training.views),
         "validation_views": len(validation.views),
     }
-
-
-def _part(data: Dataset, validation: bool) -> Dataset:
-    """Return the validation views, or the others."""
-    chosen = (view for i, view in enumerate(data.views) if (i % HOLDOUT == 0) == validation)
-    return replace(data, views=tuple(chosen))
 
 
 def scores(trainer: Trainer, data: Dataset) -> Row:

@@ -96,14 +96,17 @@ class Verdict:
         """PSNR above the rival, dB: negative by how much the preset misses the front."""
         return None if self.rival is None else self.preset.psnr - self.rival.psnr
 
+    @property
+    def is_on_front(self) -> bool:
+        """Whether no other setting dominates the preset."""
+        return self.rival is None or not self.rival.dominates(self.preset)
+
     def text(self) -> str:
         """Return the verdict in words."""
-        if self.rival is None:
+        if self.rival is None or (margin := self.margin) is None:
             return "on the front: no other setting is as cheap"
-        margin = self.preset.psnr - self.rival.psnr
         doubt = "" if is_clear(self.preset, self.rival) else ", a difference that is not clear"
-        on_front = not self.rival.dominates(self.preset)
-        if on_front:
+        if self.is_on_front:
             return f"on the front, {margin:.2f} dB above {self.rival.name}{doubt}"
         found = f"misses the front by {-margin:.2f} dB ({self.rival.name}{doubt})"
         if self.quicker is not None:
@@ -133,7 +136,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     by_name = {name: settings_of(rows, name) for name in names}
     fewest = min(len(setting.rows) for settings in by_name.values() for setting in settings)
     judged = [(name, verdict) for name in names for verdict in verdicts(by_name[name])]
-    on_front = [one for _, one in judged if one.rival is None or not one.rival.dominates(one.preset)]
+    on_front = [one for _, one in judged if one.is_on_front]
     return {
         "verdict": f"{len(on_front)} of {len(judged)} fits with a preset are on the Pareto front",
         "cpu_range": f"{number(min(row['cpu_seconds'] for row in rows), 2)} to "

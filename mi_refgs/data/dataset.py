@@ -189,6 +189,11 @@ class Dataset:
         """Whether all images have alpha; views need not be loaded."""
         return all(view.has_alpha for view in self.views)
 
+    def held_out(self, every: int) -> tuple[Dataset, Dataset]:
+        """Two data sets: without every so many views, the first included, and of these validation views."""
+        kept = tuple(view for i, view in enumerate(self.views) if i % every)
+        return replace(self, views=kept), replace(self, views=self.views[::every])
+
     @cached_property
     def scene_extent(self) -> float:
         """1.1 × the largest distance of a camera to their mean, scene units (3DGS).

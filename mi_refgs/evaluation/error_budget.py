@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from mi_refgs.data.view import View
 from mi_refgs.evaluation.images import RenderedView
-from mi_refgs.evaluation.metrics import FOREGROUND_ALPHA, angle_deg
+from mi_refgs.evaluation.metrics import FOREGROUND_ALPHA, angle_deg, foreground
 from mi_refgs.evaluation.scores import PIXEL_CLASSES
 from mi_refgs.evaluation.surface import TrueSurface
 from mi_refgs.kernels.device import upload
@@ -30,17 +30,18 @@ NO_BUDGET = "the data set has no ground-truth depth and normals"
 def classify(view: View, surface: TrueSurface | None) -> np.ndarray | None:
     """Return the index in CLASSES (H, W) of each pixel of a loaded view; None without true depth and normals.
 
-    Silhouette precedes crease, and crease precedes smooth. A depth edge is a step between neighbouring
-    pixels that leaves the tangent plane of either by more than CREASE_DEGREES.
+    A pixel of several classes is silhouette first, then crease. At a depth edge, the line between the points
+    of neighbouring pixels leaves the tangent plane of either by more than CREASE_DEGREES.
     """
     if view.depth is None or view.normal is None:
         return None
     camera, covered, shape = view.camera(), view.covered(), view.depth.shape
-    hit = (covered > FOREGROUND_ALPHA) & (view.depth > 0) & np.any(view.normal != 0, axis=-1)
-    point = camera.origin + camera.rays() * upload(view.depth)
+    hit = foreground(view.normal, covered) & (view.depth > 0)
+    ray = camera.rays()
+    point = camera.origin + ray * upload(view.depth)
     smooth = np.full(shape, CLASSES.index("smooth"))
     if surface is not None:
-        normal, ray = mi.Vector3f(view.normal.reshape(-1, 3).T), camera.rays()
+        normal = mi.Vector3f(view.normal.reshape(-1, 3).T)
         mirrored = ray - 2 * mi.Vector3f(normal * (normal @ ray))
         free = surface.occluder.visible(mi.Point3f(point), mirrored, normal, upload(hit, mi.Bool)).numpy()
         unblocked = free.reshape(shape) > 0
@@ -85,7 +86,7 @@ class ErrorBudget:
         if classes is None or view.normal is None:
             return
         ours, true = (np.clip(image, 0, 1).astype(np.float64) for image in (rendered.image, view.displayed))
-        known = (view.covered() > FOREGROUND_ALPHA) & np.any(view.normal != 0, axis=-1)
+        known = foreground(view.normal, view.covered())
         angle = np.where(known, angle_deg(rendered.normal, view.normal), 0)
         self.pixels += _sums(classes, np.ones(classes.shape)).astype(int)
         self.squared += _sums(classes, np.sum((ours - true) ** 2, axis=-1))

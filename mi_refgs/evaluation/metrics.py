@@ -116,12 +116,17 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
     if normal.shape != truth.shape or normal.shape[:2] != np.shape(alpha):
         sizes = f"{normal.shape}, {truth.shape}, {np.shape(alpha)}"
         raise InputError(f"metrics: normal: shapes {sizes} do not fit; render at the size of the data set")
-    foreground = (alpha > FOREGROUND_ALPHA) & (np.linalg.norm(truth, axis=-1) > 0)
-    total = float(np.sum(angle_deg(normal, truth)[foreground]))
+    scored = foreground(truth, alpha)
+    total = float(np.sum(angle_deg(normal, truth)[scored]))
     return {
-        "normal_mae_deg": total / max(int(foreground.sum()), 1),
-        "normal_mae_deg_full": total / foreground.size,
+        "normal_mae_deg": total / max(int(scored.sum()), 1),
+        "normal_mae_deg_full": total / scored.size,
     }
+
+
+def foreground(truth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Find pixels (H, W) with alpha > FOREGROUND_ALPHA and a true normal (H, W, 3)."""
+    return np.asarray((alpha > FOREGROUND_ALPHA) & (np.linalg.norm(truth, axis=-1) > 0))
 
 
 def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -25,9 +25,9 @@ from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
-EPOCHS = (
-    2  # passes over the training views in which each view comes at least once: permutations follow each other
-)
+EPOCHS = 2
+"""Passes over the training views that contain each view at least once, wherever they begin: every epoch has
+an order of its own."""
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 
@@ -66,10 +66,12 @@ class AdaptiveControl:
         self.setup, self.state = setup, state
         self.options = setup.method.refine
 
-    def observe(self, error: Float, iteration: int) -> None:
-        """Add the squared errors (N,) that surfels are responsible for in a step; tables in order."""
-        if self.options.densify is None or iteration > self.options.densify.until:
-            return
+    def observes(self, iteration: int) -> bool:
+        """Whether a later densification requires the errors of this iteration."""
+        return self.options.densify is not None and iteration <= self.options.densify.until
+
+    def observe(self, error: Float) -> None:
+        """Add the squared errors (N,) of an iteration by responsible surfel, the object's first."""
         if len(self.state.tables) == 1:
             self.state.tables[0].observe(error)
             return
@@ -119,15 +121,19 @@ class AdaptiveControl:
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
         for table in state.tables:
-            surfels, largest, behind = table.surfels, options.prune_extent * data.scene_extent, False
-            if table.prefix:  # surfels of the background may grow with their distance
+            surfels, is_background = table.surfels, bool(table.prefix)
+            largest: float | np.ndarray = options.prune_extent * data.scene_extent
+            if is_background:  # its surfels may grow with their distance
                 assert data.region is not None and method.surroundings is not None
                 outside = depth_outside(surfels.raw["position"].numpy(), data.region)
                 distance = data.region.radius * (1 + np.maximum(outside, 0))
-                largest, behind = method.surroundings.prune_extent * distance, True
+                largest = method.surroundings.prune_extent * distance
             error, unseen = table.error_sum.numpy(), table.unseen.numpy() >= EPOCHS * len(data.views)
-            edit = refine.densify_and_prune(surfels, error, unseen, largest, options, table.max_count, behind)
-            table.apply(edit)
+            table.apply(
+                refine.densify_and_prune(
+                    surfels, error, unseen, largest, options, table.max_count, keep_one=is_background
+                )
+            )
         if self.setup.open_scene:
             assert data.region is not None
             inner, outer = (table.surfels for table in state.tables)

@@ -99,17 +99,18 @@ def densify_and_prune(
     # The surfels to split: those with the largest error, as many as there is room for.
     left = int(keep.sum())
     room = min(max(most - left, 0), math.ceil(options.grow * left))
-    stays = split_opacity(opacity) >= options.prune_opacity  # else the next event would remove the children
-    candidates = np.flatnonzero(keep & stays & (error > 0))
+    lasting = split_opacity(opacity) >= options.prune_opacity  # else the next event would remove the children
+    candidates = np.flatnonzero(keep & lasting & (error > 0))
     split = np.sort(candidates[np.argsort(-error[candidates], kind="stable")[:room]])
     keep[split] = False
 
     # Two children of each, in place of the parent.
-    parent = np.concatenate([np.flatnonzero(keep), split, split])
-    fresh = np.arange(len(parent)) >= int(keep.sum())
+    kept = np.flatnonzero(keep)
+    parent = np.concatenate([kept, split, split])
+    fresh = np.arange(len(parent)) >= len(kept)
     table = {name: values[parent].copy() for name, values in raw.items()}
     if len(split):
-        children = slice(int(keep.sum()), len(parent))
+        children = slice(len(kept), len(parent))
         axes, deviations = primitive.extent({name: values[children] for name, values in table.items()})
         longest = deviations.argmax(axis=1)
         along = np.take_along_axis(axes, longest[:, None, None], axis=1)[:, 0]

@@ -112,10 +112,9 @@ def install_trials(trainer: Trainer, tell: Callable[[str], None] = lambda _: Non
     if select is None:
         return
     whole = trainer.data
-    kept = tuple(view for i, view in enumerate(whole.views) if i % select.holdout)
-    judges = replace(whole, views=whole.views[:: select.holdout])
+    fitted, judges = whole.held_out(select.holdout)
     if _undecided(trainer, select):
-        trainer.adopt(FitSetup(trainer.method, replace(whole, views=kept)), trainer.state())
+        trainer.adopt(FitSetup(trainer.method, fitted), trainer.state())
 
     def before_step(trainer: Trainer) -> None:
         while names := _undecided(trainer, select):

@@ -302,10 +302,12 @@ class Trainer:
         target = self.targets.at(iteration, index)
         camera, surfels, around = target.camera, fit.surfels, fit.surroundings
 
-        # Zeros whose gradient is the squared error that each surfel is responsible for.
-        rows = surfels.count + (0 if around is None else around.surfels.count)
-        attribution = dr.opaque(mi.Float, 0, rows)
-        dr.enable_grad(attribution)
+        # Zeros whose gradient is the squared error that each surfel is responsible for: one more feature.
+        attribution = None
+        if control.observes(iteration):
+            rows = surfels.count + (0 if around is None else around.surfels.count)
+            attribution = dr.opaque(mi.Float, 0, rows)
+            dr.enable_grad(attribution)
 
         # Render the view, and differentiate its loss.
         shading = self.fit.shading(stage)
@@ -327,7 +329,8 @@ class Trainer:
             fit.prefilter.close()
 
         # Statistics, the optimiser's step, and the random step of positions.
-        control.observe(dr.grad(attribution), iteration)
+        if attribution is not None:
+            control.observe(dr.grad(attribution))
         if iteration % self.method.log_every == 0:
             dr.schedule(self.loss, self.error)
         fit.optimiser.stage = stage.rates

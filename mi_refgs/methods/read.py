@@ -424,6 +424,7 @@ def _require_consistent(method: Method, where: str) -> None:
         ranges.append(("light.every", light.every, light.every >= 1, "1 or more"))
     if method.exposure is not None:
         ranges.append(("exposure.rate", method.exposure.rate, method.exposure.rate >= 0, "0 or more"))
+    ranges.append(("refine.grow", method.refine.grow, method.refine.grow >= 0, "0 or more"))
     if relocate is not None:
         ranges.append(("refine.relocate.grow", relocate.grow, relocate.grow >= 0, "0 or more"))
     if (metals := method.metal_trial) is not None:

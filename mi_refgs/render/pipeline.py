@@ -58,7 +58,7 @@ class Request:
 
     aovs: Collection[str] = ()  # materials, terms of the radiance, "visibility", "normal", "depth", by name
     forward_only: bool = False  # without derivatives: faster, equal to rounding
-    draft: bool = False  # of `forward_only`: pixels end at DRAFT_TRANSMITTANCE, faster, about 50 dB
+    draft: bool = False  # if `forward_only`: pixels end at DRAFT_TRANSMITTANCE, faster, about 50 dB
     sh_degree: int | None = None  # highest SH degree of the radiance, for coarse-to-fine schedules
     attribution: Float | None = None  # (N,) zeros, which get Σ w δ for adjoints δ of the frame's
 
