@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mi_refgs.cli.command import Flag, OtherData, Rendering, Result, RunFolder, Samples
+from mi_refgs.cli.command import OtherData, Rendering, Result, RunFolder, Samples
 from mi_refgs.evaluation.scores import PIXEL_CLASSES, SCORES
 
 
@@ -20,8 +20,6 @@ class Eval:
     run_folder: RunFolder
     data: OtherData = None
     samples: Samples = 1
-    antialias: Flag = False
-    """average reflections over each pixel, at interpolated normals, also where the fit did not"""
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -30,7 +28,7 @@ class Eval:
         from mi_refgs.runs.run import Run
 
         folder = Run(self.run_folder)
-        result = evaluate(folder, self.data, progress=True, samples=self.samples, antialias=self.antialias)
+        result = evaluate(folder, self.data, progress=True, samples=self.samples)
         return Result(result, f"{table(result)}\nsheets: {self.run_folder / SHEET}, {DECOMPOSITION}")
 
 

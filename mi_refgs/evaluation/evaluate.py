@@ -43,9 +43,7 @@ MEANS = """psnr psnr_gain ssim flip lpips psnr_region ssim_region region_share n
     normal_mae_deg_full""".split()  # scores of views whose means are reported
 
 
-def evaluate(
-    run: Run, data: Path | None = None, progress: bool = False, samples: int = 1, antialias: bool = False
-) -> dict[str, Any]:
+def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples: int = 1) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
@@ -67,8 +65,7 @@ def evaluate(
                                    with the environment map prefiltered beforehand
     `pruned`                       null for a scene that was not pruned
 
-    Renders have `samples` per pixel, box filtered (`render.samples`); `antialias` averages reflections over
-    each pixel (`render.antialias`) where the run was fitted without.
+    Renders have `samples` per pixel, box filtered (`render.samples`).
 
     Raises InputError for a folder that is no run or contains neither a scene nor a checkpoint, for data
     that is gone, and for a foreign file in the run that has the name of a result.
@@ -80,8 +77,6 @@ def evaluate(
     outputs = [*renders, SHEET, DECOMPOSITION, METRICS]
     run.output.require_free(outputs)
     fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
-    if antialias:
-        fitted = replace(fitted, shading=replace(fitted.shading, antialias=True))
     per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
     run.output.claim(*outputs)
 

@@ -154,9 +154,10 @@ class Trainer:
         return self.fit.shading(self.method.stage_at(iteration or max(self.iteration, 1))[1])
 
     def view(self, camera: Camera, aovs: bool = True, object_only: bool = False) -> Frame:
-        """Render the present state, without derivatives; `object_only`: without the background."""
+        """Render the present state as its export does, without derivatives; `object_only`: without the
+        background."""
         with dr.suspend_grad():
-            shading = self.shading()
+            shading = self.shading().antialiased()
             self.fit.update_missing_caches(shading)
             light, around = shading.light_of(self.light), None if object_only else self.surroundings
             scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around)

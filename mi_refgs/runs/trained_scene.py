@@ -72,7 +72,7 @@ class TrainedScene:
             Surfels(channels_of(params)),
             light_of(params),
             mesh,
-            Shading.resolve(stage.shading, mesh is not None),
+            Shading.resolve(stage.shading, mesh is not None).antialiased(),
             iteration,
             float(state["seconds"]),
             surroundings=surroundings_of(params),

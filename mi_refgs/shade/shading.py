@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from mi_refgs.errors import InputError
@@ -60,6 +60,11 @@ class Shading(ShadingOptions):
         given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
         untraced = Shading(**given | {name: getattr(ShadingOptions, name) for name in ("occlusion", *TRACED)})
         return Shading(**given | {"occlusion": True}) if mesh and untraced.traceable else untraced
+
+    def antialiased(self) -> Shading:
+        """With `antialias` where it has an effect: for displayed images; the steps of a fit go without."""
+        able = self.shaded_at == "pixel" and "antialias" in self.model.honours
+        return replace(self, antialias=True) if able else self
 
     @staticmethod
     def from_json(note: Mapping[str, Any]) -> Shading:

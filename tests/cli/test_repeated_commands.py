@@ -130,7 +130,6 @@ ANEW: dict[str, dict[str, Row]] = {
         "run_folder": WHERE,
         "--data": Shows(("--data", "{moved}")),
         "--samples": Shows(("--samples", "4")),
-        "--antialias": Shows(("--antialias",)),
     },
     "render": dict.fromkeys(
         ("scene", "--output", "--sensor", "--camera", "--object", "--samples", "--aov"), WHOLE
@@ -347,7 +346,7 @@ def test_eval_does_not_depend_on_earlier_eval(places: dict[str, str], finished: 
     for result in (first, *found):
         del result["ms_per_frame"]
     assert found[0] == found[1] != first
-    assert found[0]["samples"] == 4 and found[0]["antialias"] and found[0]["dataset"] == places["moved"]
+    assert found[0]["samples"] == 4 and found[0]["dataset"] == places["moved"]
 
 
 def test_render_replaces_image(finished: Path, tmp_path: Path) -> None:
