@@ -45,7 +45,7 @@ def exchanged(
     tables = [inner.to_numpy(), outer.to_numpy()]
     own_depth, other_depth = (depth_outside(table["position"], region) for table in tables)
     leaves = [own_depth > MARGIN, other_depth < -MARGIN]
-    for i, limit in enumerate((options.max_count, method.surfels.max_count)):  # of the destination
+    for i, limit in enumerate((options.max_count, method.surfels.most)):  # of the destination
         room = limit - len(leaves[1 - i])
         leaves[i] &= np.cumsum(leaves[i]) <= min(max(room, 0), len(leaves[i]) - 1)
     edits = []
@@ -113,6 +113,14 @@ class AdaptiveControl:
             state.held_until = iteration + options.propagate.hold
         if iteration >= state.held_until:
             state.optimiser.set_factor("opacity", 1.0)
+
+    def fill(self) -> None:
+        """Split the object's surfels with the largest error, as many as there is room for; prune none."""
+        table, options = self.state.tables[0], replace(self.options, grow=1.0, prune_opacity=0.0)
+        error, unseen = table.error_sum.numpy(), np.zeros(table.surfels.count, bool)
+        table.apply(refine.densify_and_prune(table.surfels, error, unseen, np.inf, options, table.max_count))
+        self.state.occluder.vertex_surfels = None
+        table.clear()
 
     def _densify(self, iteration: int) -> None:
         """Grow where the error is, prune, and let surfels of an open scene change tables."""

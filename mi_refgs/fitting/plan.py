@@ -9,6 +9,7 @@ part in every kernel of Dr.Jit; beside other processes it stays, while the wall 
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -49,6 +50,8 @@ SAFETY = 0.8  # fraction of the time limit that the estimate may reach: data set
 GROWTH, OPEN_GROWTH = 1.0, 0.6
 """Mean time of a step relative to the synthetic data set, with alpha and without: the number of surfels
 grows, but opaque ones hide others, and without alpha surfels start far larger than they end."""
+CAPACITY_TIME = 1.45
+"""Relative time of a step with twice the surfels: 1.43 for `base_2dgs` on *chair*, 200², 20,000 to 40,000."""
 START = 10.0  # seconds for the visual hull, previews, checkpoints and artefacts
 DECODING = 1.5e-8  # seconds per pixel of a file, once per image: JPEG 8e-9, PNG 2e-8
 WORTH = 1e7  # iterations × pixels from which a fit takes minutes, and an estimate is worth its time
@@ -200,8 +203,9 @@ def planned(
         return method, None
     speed = speed_of(method, data.has_alpha)
 
-    def at(factor: int) -> Estimate:
-        return estimate(method, speed, len(data.views), (width, height), factor, data.has_alpha)
+    def at(factor: int, capacity: float = 1.0) -> Estimate:
+        size = width, height
+        return estimate(method, speed, len(data.views), size, factor, data.has_alpha, capacity)
 
     factor = method.data.downscale or 1
     if limit is None or not free:
@@ -223,14 +227,36 @@ def planned(
             f"{path}: the fit takes {minutes(chosen.seconds)}, more than {minutes(limit)}; "
             f"--set data.downscale={factor + 1} reads smaller images"
         )
-    return method.downscaled(factor), chosen
+    affordable = _with_affordable_capacity(
+        method, lambda capacity: at(factor, capacity).seconds <= SAFETY * limit
+    )
+    return affordable.downscaled(factor), chosen
+
+
+def _with_affordable_capacity(method: Method, fits: Callable[[float], bool]) -> Method:
+    """The method without the components whose number of surfels does not fit into the time."""
+    if method.select is None:
+        return method
+    capacity = {
+        name: component.change.get("surfels", {}).get("capacity", 1.0)
+        for name, component in method.select.component.items()
+    }
+    slow = {name for name, factor in capacity.items() if factor > 1 and not fits(factor)}
+    kept = {name: one for name, one in method.select.component.items() if name not in slow}
+    return replace(method, select=replace(method.select, component=kept))
 
 
 def estimate(
-    method: Method, speed: Speed, views: int, size: tuple[int, int], factor: int, has_alpha: bool = True
+    method: Method,
+    speed: Speed,
+    views: int,
+    size: tuple[int, int],  # width, height
+    factor: int,
+    has_alpha: bool = True,
+    capacity: float = 1.0,
 ) -> Estimate:
-    """Estimate a fit to so many images of `size` (width, height), with or without alpha, downscaled by
-    `factor`."""
+    """Estimate a fit to so many images of `size`, with or without alpha, downscaled by `factor`, with
+    `capacity` times the surfels."""
     width, height = size[0] // factor, size[1] // factor
     pixels = width * height
     steps = _steps(method, speed, pixels, method.iterations)
@@ -238,7 +264,7 @@ def estimate(
         steps += _steps(method, speed, pixels, min(method.metal_trial.until, method.iterations))
     meshes = 0 if method.mesh is None else method.mesh.extract.count(method.iterations)
     files = views * size[0] * size[1] * DECODING
-    steps *= GROWTH if has_alpha else OPEN_GROWTH
+    steps *= (GROWTH if has_alpha else OPEN_GROWTH) * CAPACITY_TIME ** math.log2(capacity)
     fused = views + (meshes - 1) * min(views, FUSED_VIEWS) if meshes else 0
     seconds = START + files + steps + meshes * speed.mesh + fused * speed.mesh_view
     return Estimate(seconds, bytes_of(method, views, pixels), width, height)

@@ -7,6 +7,7 @@ from the attributes, the G-buffer, the kernels and the optimiser.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -18,6 +19,7 @@ import numpy as np
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
+from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.exposure import displayed_of, image_of, psnr
 from mi_refgs.fitting.initial import converted, first_light, with_columns
 from mi_refgs.fitting.optim import Adam
@@ -33,7 +35,8 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     """Copy a fit to a trainer of another method, at the same iteration, without a run folder.
 
     Parameters of both methods are kept, others start as `method` says. SH of another degree are cut or filled
-    with zeros, a light of another size is resampled; entries that are kept have their history.
+    with zeros, a light of another size is resampled; entries that are kept have their history. If the method
+    allows more surfels, those with the largest error are split at once.
     """
     state = trainer.state()
     old, rng = part(state, PARAMS), trainer.setup.rng(trainer.iteration, "branch")
@@ -55,6 +58,8 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
         new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
         new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}
     made = Trainer(method, trainer.data, state=new)
+    if method.surfels.most > trainer.method.surfels.most:
+        AdaptiveControl(made.setup, made.fit).fill()
     if method.mesh is not None and made.fit.occluder.empty and made.shading().traceable:
         made.extract_mesh()
     return made
@@ -143,7 +148,7 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
     if present := [other for other in component.unless if other in method.components]:
         return Decision(name, iteration, False, f"nothing to do beside {present[0]}")
     made = methods.load(method.file, method.preset, method.assignments, (*method.components, name))
-    candidate = replace(made, data=method.data)
+    candidate = replace(made, data=method.data, select=method.select)
     if iteration + component.trial > method.iterations:
         return Decision(name, iteration, False, "too late in the fit")
     try:
@@ -161,7 +166,7 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
 
 def required_gain(without: ComponentTrial, with_it: ComponentTrial, select: Selection) -> float:
     """PSNR gain (dB) that a component has to reach for its cost; negative if it saves cost."""
-    time_price = select.gain_per_ms * (with_it.ms - without.ms)
+    time_price = select.gain_per_doubling * math.log2(with_it.ms / without.ms)
     price = time_price + select.gain_per_mb * (with_it.mb - without.mb)
     costs = with_it.mb > without.mb or with_it.ms > (1 + TIME_NOISE) * without.ms
     return price + (select.gain if costs else 0)
@@ -224,4 +229,5 @@ def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
     names = tuple(row["component"] for row in decisions if row["stays"])
     if method.select is None or names == method.components:
         return method
-    return replace(methods.load(method.file, method.preset, method.assignments, names), data=method.data)
+    made = methods.load(method.file, method.preset, method.assignments, names)
+    return replace(made, data=method.data, select=method.select)

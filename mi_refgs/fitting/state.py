@@ -141,7 +141,7 @@ class FitState:
     @staticmethod
     def _assembled(setup: FitSetup, params: dict[str, TensorXf]) -> FitState:
         optimiser, method = Adam(params, setup.groups(params)), setup.method
-        tables = [ParameterTable(params, optimiser, "", method.surfels.max_count)]
+        tables = [ParameterTable(params, optimiser, "", method.surfels.most)]
         if setup.open_scene and method.surroundings is not None:
             tables.append(ParameterTable(params, optimiser, AROUND, method.surroundings.max_count))
         return FitState(params, optimiser, tables)

@@ -26,7 +26,7 @@ PIXEL_BYTES = 4 * 4 + 3
 
 def bytes_of(method: Method, views: int, pixels: int) -> float:
     """Memory, in bytes, of a fit to so many images of so many pixels each."""
-    surfels = method.surfels.max_count
+    surfels = method.surfels.most
     surfels += method.surroundings.max_count if method.surroundings is not None else 0
     images = min(views * pixels * 12, CACHE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
     return of_fit(pixels, surfels, images)
@@ -35,7 +35,7 @@ def bytes_of(method: Method, views: int, pixels: int) -> float:
 def require_memory(method: Method, data: Dataset) -> None:
     """Raise InputError if the fit requires more memory than there is."""
     pixels = max((view.width * view.height for view in data.views), default=0)
-    what = f"fit: images of {pixels:,} pixels, {method.surfels.max_count:,} surfels at most"
+    what = f"fit: images of {pixels:,} pixels, {method.surfels.most:,} surfels at most"
     remedy = "read them smaller with --set data.downscale=N, or lower surfels.max_count"
     require(bytes_of(method, len(data.views), pixels), what, remedy)
 

@@ -42,7 +42,8 @@ class SurfelOptions:
     primitive: str = "surfel"  # what is splatted
     attributes: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
     count: int = 20_000  # initial surfels
-    max_count: int = 40_000  # densification stops here
+    max_count: int = 40_000  # densification stops here, times `capacity`
+    capacity: float = 1.0  # factor of `max_count`; a component that raises it fills the room at once
     inside: float = 0.0  # fraction of initial surfels in the visual hull's volume; the others on its surface
     degree: dict[str, int] = field(default_factory=dict)  # SH degree by attribute; else 3
     sh_raise: Window = AT_ONCE  # one SH degree of radiance_sh more at each event
@@ -52,6 +53,11 @@ class SurfelOptions:
     def degree_of(self, name: str) -> int:
         """SH degree of an attribute."""
         return self.degree.get(name, MAX_SH_DEGREE)
+
+    @property
+    def most(self) -> int:
+        """Largest number of surfels."""
+        return round(self.capacity * self.max_count)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -265,13 +271,14 @@ class Selection:
     """Optional components that a fit tries on validation views, and the gain that keeps them.
 
     A component stays if the PSNR of these views rises by the price of the step time and memory that it costs,
-    and by `gain` if it costs anything; one that saves time and memory may lose as much.
+    and by `gain` if it costs anything; one that saves time and memory may lose as much. The price of time is
+    relative, so that slow and fast machines decide alike.
     """
 
     component: dict[str, MethodComponent]
     holdout: int = 8  # every so many training views validate
     gain: float = 0.02  # dB
-    gain_per_ms: float = 0.003  # dB per millisecond of a step
+    gain_per_doubling: float = 0.5  # dB per doubling of the time of a step: what twice the iterations bring
     gain_per_mb: float = 0.001  # dB per MB of parameters and their moments
 
     @property

@@ -49,8 +49,9 @@ RENAMED = {
 }
 """Earlier keys → what they are called now; files may have either."""
 
-REMOVED = ("refine.gradient", "refine.dense_extent")
-"""Keys of version 0.1 that resolved files may have: densification by screen-space gradients."""
+REMOVED = ("refine.gradient", "refine.dense_extent", "select.gain_per_ms")
+"""Keys of version 0.1 that resolved files may have: densification by screen-space gradients, and a price of
+time in milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -424,6 +425,7 @@ def _require_consistent(method: Method, where: str) -> None:
         ranges.append(("light.every", light.every, light.every >= 1, "1 or more"))
     if method.exposure is not None:
         ranges.append(("exposure.rate", method.exposure.rate, method.exposure.rate >= 0, "0 or more"))
+    ranges.append(("surfels.capacity", surfels.capacity, surfels.capacity > 0, "more than 0"))
     ranges.append(("refine.grow", method.refine.grow, method.refine.grow >= 0, "0 or more"))
     if relocate is not None:
         ranges.append(("refine.relocate.grow", relocate.grow, relocate.grow >= 0, "0 or more"))

@@ -13,7 +13,16 @@ from mi_refgs.cli import main
 from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import memory
-from mi_refgs.methods.method import CoarseImages, DataOptions, MetalTrial, Method, Rates, SurroundingsOptions
+from mi_refgs.methods.method import (
+    CoarseImages,
+    DataOptions,
+    MetalTrial,
+    Method,
+    MethodComponent,
+    Rates,
+    Selection,
+    SurroundingsOptions,
+)
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.splat import Camera
 from tests.scenes.highlight import small_method
@@ -86,6 +95,31 @@ def test_largest_images_within_time_limit_are_chosen(
     monkeypatch.setattr(plan, "speed_of", lambda *_: pytest.fail("measured"))
     small, nothing = plan.planned(method, data, 1.0)
     assert nothing is None and small.data.downscale == 1
+
+
+def test_surfels_beyond_the_time_limit_are_not_tried(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The image size is chosen first; twice or four times the surfels have to fit into what is left."""
+    data = write_data(tmp_path / "data", truth=False)
+    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "SMALL_IMAGE": 399}.items():
+        monkeypatch.setattr(plan, name, value)
+    tried = {
+        "colour": MethodComponent(1, 1),
+        "twice": MethodComponent(1, 1, {"surfels": {"capacity": 2}}),
+        "fourfold": MethodComponent(2, 1, {"surfels": {"capacity": 4}}, needs=("twice",)),
+    }
+    method = dataclasses.replace(method, select=Selection(tried))
+    one, two, four = (
+        plan.estimate(method, SPEED, 3, (20, 20), 1, capacity=capacity).seconds
+        for capacity in (1.0, 2.0, 4.0)
+    )
+    steps = 8 * 5 + 22 * 10
+    assert two - one == pytest.approx(0.45 * steps) and four - one == pytest.approx((1.45**2 - 1) * steps)
+    for seconds, names in ((one, ["colour"]), (two, ["colour", "twice"]), (four, [*tried])):
+        made, expected = plan.planned(method, data, (seconds + 1e-6) / plan.SAFETY)
+        assert made.select is not None and [*made.select.component] == names
+        assert made.data.downscale == 1 and expected is not None and expected.seconds == one
 
 
 @pytest.mark.parametrize("preset", ["", *PRESETS])

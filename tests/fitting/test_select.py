@@ -24,7 +24,8 @@ from mi_refgs.fitting.select import branched
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
-from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.methods.method import LIGHT, Method, Refine
+from mi_refgs.methods.window import Window
 from mi_refgs.runs.run import Run
 from mi_refgs.surfels.ply import read_ply
 from tests.helpers import refused, with_pixels
@@ -144,7 +145,10 @@ def test_required_gain_depends_on_time_and_memory() -> None:
     method = methods.load("auto", "quick")
     assert method.select is not None
     asked = select.required_gain(cheap, dear, method.select)
-    expected = method.select.gain + 20 * method.select.gain_per_ms + 10 * method.select.gain_per_mb
+    doublings = np.log2(25 / 5)
+    expected = (
+        method.select.gain + doublings * method.select.gain_per_doubling + 10 * method.select.gain_per_mb
+    )
     assert asked == pytest.approx(expected)
     assert select.required_gain(dear, cheap, method.select) == pytest.approx(method.select.gain - expected)
 
@@ -248,6 +252,22 @@ def test_branching_keeps_common_parameters(variant: str, views: Dataset) -> None
     rich.step()
     poor.step()
     np.testing.assert_array_equal(trainer.fit.params["position"].numpy(), before["position"])
+
+
+def test_capacity_is_filled_at_once_where_the_error_is(variant: str, views: Dataset) -> None:
+    """The trial of more surfels begins with them: those with the largest error are split, none is removed."""
+    method = other(variant, "degree")
+    refine = Refine(densify=Window(0, 9, 9), prune_opacity=0.9)
+    small = replace(method, refine=refine, surfels=replace(method.surfels, max_count=60))
+    trainer = step_to(Trainer(small, views), 3)
+    error = trainer.fit.tables[0].error_sum.numpy()
+    assert trainer.surfels.count == 60 and np.count_nonzero(error) > 20
+    more = branched(trainer, replace(small, surfels=replace(small.surfels, capacity=4 / 3)))
+    assert more.surfels.count == more.method.surfels.most == 80
+    position = trainer.surfels.raw["position"].numpy()
+    same = (more.surfels.raw["position"].numpy()[:, None] == position).all(-1).any(0)
+    assert set(np.flatnonzero(~same)) == set(np.argsort(-error)[:20])
+    assert not more.fit.tables[0].error_sum.numpy().any() and trainer.surfels.count == 60
 
 
 def test_branching_resamples_light(variant: str, views: Dataset) -> None:

@@ -362,19 +362,19 @@ def test_bad_settings_are_named(assignment: str, words: str) -> None:
 
 def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
     """Each key of `read.RENAMED`: in the config.toml of a run, in `drop`, in assignments and in own files."""
-    now = methods.load("auto", "quick", ["select.component.degree_1.trial=9"], ["levels_3"])
+    now = methods.load("auto", "quick", ["select.component.surfels_2x.trial=9"], ["surfels_2x"])
     old = methods.dump(now).replace("[select.component", "[select.term")
     old = old.replace("components =", "terms =").replace('\nname = "auto"', '\nvariant = "auto"', 1)
     old = old.replace("attributes =", "channels =").replace("[rates.attribute]", "[rates.channel]")
-    keys = "[select.term.degree_1]", "terms = [", 'variant = "auto"', "[rates.channel]", "\nchannels ="
+    keys = "[select.term.surfels_2x]", "terms = [", 'variant = "auto"', "[rates.channel]", "\nchannels ="
     assert all(key in old for key in keys)
     (tmp_path / "config.toml").write_text(old)
     assert methods.load_resolved(tmp_path / "config.toml") == now
-    changed = methods.load("auto", "quick", ["select.term.degree_1.trial=9"], ["levels_3"])
+    changed = methods.load("auto", "quick", ["select.term.surfels_2x.trial=9"], ["surfels_2x"])
     assert dataclasses.replace(changed, assignments=now.assignments) == now
-    (tmp_path / "own.toml").write_text('extends = "auto"\ndrop = ["select.term.lobe_rays"]\n')
+    (tmp_path / "own.toml").write_text('extends = "auto"\ndrop = ["select.term.surfels_4x"]\n')
     select = methods.load(str(tmp_path / "own.toml")).select
-    assert select is not None and "lobe_rays" not in select.component
+    assert select is not None and "surfels_4x" not in select.component
     (tmp_path / "own.toml").write_text(
         'extends = "ref_gaussian"\ndrop = ["rates.channel.scale"]\n[surfels]\nfrom_pictures = ["albedo"]\n'
         "[loss]\nnormal_rise = 600\n[loss.registered.rough]\nweight = 0.5\n"
@@ -400,16 +400,16 @@ def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
             "surfels={count=9, attributes=['albedo','radiance_sh','metallic','roughness','indirect_sh']}",
         ),
         (
-            "select.term.degree_1.change.loss.normal=0.7",
-            "select.component.degree_1.change.loss.normal.weight=0.7",
+            "select.term.surfels_2x.change.loss.normal=0.7",
+            "select.component.surfels_2x.change.loss.normal.weight=0.7",
         ),
         (
-            "select.component.degree_1.change={rates={channel={scale=0.1}}}",
-            "select.component.degree_1.change={rates={attribute={scale=0.1}}}",
+            "select.component.surfels_2x.change={rates={channel={scale=0.1}}}",
+            "select.component.surfels_2x.change={rates={attribute={scale=0.1}}}",
         ),
         (
-            "select.component.degree_1.change.rates.channel.scale=0.1",
-            "select.component.degree_1.change.rates.attribute.scale=0.1",
+            "select.component.surfels_2x.change.rates.channel.scale=0.1",
+            "select.component.surfels_2x.change.rates.attribute.scale=0.1",
         ),
     ],
 )
@@ -427,8 +427,8 @@ def test_a_weight_under_the_earlier_key_registered_may_be_a_number(tmp_path: Pat
 @pytest.mark.parametrize("change", [".loss.normal=0.7", "={loss={normal=0.7}}"])
 def test_a_component_has_its_assigned_changes(tmp_path: Path, change: str) -> None:
     """They reach the trial, and a run of it is resumed by the same assignment."""
-    assigned = [f"select.component.light_64.change{change}"]
-    made = methods.load("auto", "quick", assigned, ["light_64"])
+    assigned = [f"select.component.surfels_2x.change{change}"]
+    made = methods.load("auto", "quick", assigned, ["surfels_2x"])
     assert made.loss["normal"].weight == 0.7 != methods.load("auto", "quick", assigned).loss["normal"].weight
     (tmp_path / "config.toml").write_text(methods.dump(made))
     assert not methods.differences(methods.load_resolved(tmp_path / "config.toml"), made)
