@@ -79,7 +79,7 @@ def is_due(setup: FitSetup, state: FitState) -> bool:
     options, select = setup.exposure, setup.method.select
     if options is None or state.exposure is not None or state.iteration < options.after:
         return False
-    return select is None or len(state.decisions) >= len(select.component)
+    return select is None or {*select.component} <= {row["component"] for row in state.decisions}
 
 
 def decide(setup: FitSetup, iteration: int, render: Render) -> dict[str, Any]:

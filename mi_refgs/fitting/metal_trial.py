@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
+from mi_refgs.fitting.select import Decision
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
 
@@ -58,8 +59,9 @@ def choose_metallic(trainer: Trainer, steps: int) -> str:
     trainer.restore((metal if is_metal else dielectric)[1].state())
     trainer.fit.optimiser.set_factor("metallic", 1.0)
     trainer.fit.seconds = time.perf_counter() - begin
-    verdict = "metal" if is_metal else "dielectric"
-    return f"metallic starts as {verdict}: {metal[0]:.2f} dB as metal, {dielectric[0]:.2f} dB as dielectric"
+    scores = f"{metal[0]:.2f} dB as metal, {dielectric[0]:.2f} dB as dielectric"
+    trainer.fit.decisions.append(asdict(Decision("metal", 0, is_metal, scores)))
+    return f"metallic starts as {'metal' if is_metal else 'dielectric'}: {scores}"
 
 
 def _begun(trainer: Trainer, metallic: float, steps: int) -> tuple[float, Trainer]:

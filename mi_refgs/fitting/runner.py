@@ -27,7 +27,7 @@ from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import MODEL
 from mi_refgs.runs.views import read_views, with_region
 
-DEFAULT_METHOD = "ref_gaussian.toml"  # file of `variants/` that is fitted by default: the full method
+DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
 OPEN_PURPOSE = "photographs"  # purpose of the method that is fitted by default to images without alpha
 Tell = Callable[[str], None]  # is called with sentences for the user
 FindPoints = Callable[[Dataset, Path, Tell], PointCloud | None]

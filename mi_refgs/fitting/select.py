@@ -161,7 +161,9 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
     stays = gain >= wanted
     if stays:
         trainer.adopt(FitSetup(candidate, trainer.data), rival.state())
-    return Decision(name, iteration, stays, f"{gain:+.2f} dB of {wanted:.2f} asked", without, with_it)
+    cost = f"{with_it.ms / without.ms:.2f} times the time per step and {with_it.mb - without.mb:+.1f} MB"
+    reason = f"{gain:+.2f} dB on validation views, {wanted:+.2f} dB required for {cost}"
+    return Decision(name, iteration, stays, reason, without, with_it)
 
 
 def required_gain(without: ComponentTrial, with_it: ComponentTrial, select: Selection) -> float:
@@ -206,18 +208,17 @@ def _changes(row: dict[str, Any]) -> list[str]:
 
 def sentence(decision: Decision) -> str:
     """The decision as one sentence."""
-    verdict = "stays" if decision.stays else "is left out"
-    _, ms, mb = _changes(asdict(decision)) or ["", "", ""]
-    costs = f", {ms} per step, {mb}" if ms else ""
-    return f"{decision.component} {verdict}: {decision.reason}{costs}"
+    return f"{decision.component} {'stays' if decision.stays else 'is left out'}: {decision.reason}"
 
 
 def table(decisions: list[dict[str, Any]]) -> str:
     """Format the decisions of a fit as a text table."""
     rows = [("component", "iteration", "gain", "time", "memory", "verdict")]
     for row in decisions:
-        verdict = "stays" if row["stays"] else f"left out ({row['reason']})"
-        cells = _changes(row) or [""] * 3
+        changes = _changes(row)
+        why = "" if changes else f" ({row['reason']})"
+        verdict = ("stays" if row["stays"] else "left out") + why
+        cells = changes or [""] * 3
         rows.append((row["component"], str(row["iteration"]), *cells, verdict))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
@@ -226,8 +227,10 @@ def table(decisions: list[dict[str, Any]]) -> str:
 
 def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
     """The method with the components that the decisions kept."""
+    if method.select is None:
+        return method
     names = tuple(row["component"] for row in decisions if row["stays"])
-    if method.select is None or names == method.components:
+    if names == method.components:
         return method
     made = methods.load(method.file, method.preset, method.assignments, names)
     return replace(made, data=method.data, select=method.select)

@@ -60,6 +60,9 @@ def test_the_gain_of_metal_decides(
     np.testing.assert_allclose(ends[0], metal_trial.DIELECTRIC, atol=1e-6)
     np.testing.assert_allclose(ends[1], metal_trial.METAL, atol=1e-6)
     assert f"metallic starts as {better}: " in " ".join(said)
+    (row,) = trainer.fit.decisions
+    assert row["component"] == "metal" and row["stays"] == (better == "metal") and "as metal" in row["reason"]
+    assert trainer.method.components == ()
     found = metallic(trainer)
     assert trainer.iteration == 6 and np.abs(found - held).max() > 1e-4 and np.abs(found - held).mean() < 0.1
 
