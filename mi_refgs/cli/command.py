@@ -46,7 +46,10 @@ Settings = Annotated[
 METHODS = ", ".join(sorted(path.stem for path in resource_dir("variants").glob("*.toml")))
 MethodName = Annotated[
     str | None,
-    optional("NAME|FILE.toml", help=f"method (default: the full method): {METHODS}, or a file"),
+    optional(
+        "NAME|FILE.toml",
+        help=f"method (default: auto, what the scene needs of the full method): {METHODS}, or a file",
+    ),
 ]
 Preset = Annotated[
     str | None,

@@ -41,8 +41,8 @@ class Choice:
     """What the user says about the method of a fit."""
 
     method: str | Method | None = None
-    """A name, the path of a .toml, or None: the full method, or for images without alpha the one that fits
-    their background too. A `Method` is fitted as it is."""
+    """A name, the path of a .toml, or None: what the scene needs of the full method, or for images without
+    alpha the method that fits their background too. A `Method` is fitted as it is."""
     preset: str | None = None  # "standard" by default
     settings: Settings = ()
     minutes: float | None = None  # time that the fit may take; a resumed run has to have its size of images
@@ -234,7 +234,7 @@ def finish(trainer: Trainer, run: Run) -> str | None:
 
 
 def load_method(method: str | None, preset: str | None, settings: Settings = ()) -> Method:
-    """Load a method by name or path, by default the full one at the preset "standard"."""
+    """Load a method by name or path, by default DEFAULT_METHOD at the preset "standard"."""
     path = method or str(resource_dir("variants") / DEFAULT_METHOD)
     return methods.load(path, preset or DEFAULT_PRESET, methods.assignments(settings))
 
@@ -242,7 +242,7 @@ def load_method(method: str | None, preset: str | None, settings: Settings = ())
 def default_method(
     data: Path, preset: str | None = None, settings: Settings = (), say: Tell = lambda _: None
 ) -> str | None:
-    """The method for images without alpha, if the data set has such; None for the full one."""
+    """The method for images without alpha, if the data set has such; None for DEFAULT_METHOD."""
     # Settings of anything else may be those of the other method.
     of_data = [text for text in methods.assignments(settings) if text.startswith("data.")]
     views = read_views(load_method(None, preset, of_data), data, "train", truth=False, decode=False)
