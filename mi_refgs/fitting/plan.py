@@ -274,15 +274,18 @@ def _steps(method: Method, speed: Speed, pixels: int, last: int) -> float:
     """Seconds of the iterations up to `last`, on images of so many pixels."""
     begin, seconds = 0, 0.0
     for name, stage in method.stages():
-        for block, count in _blocks(method, begin, min(stage.until, last)):
+        for block, count in _blocks(method, pixels, begin, min(stage.until, last)):
             seconds += count * speed.step(name, pixels // block**2)
         begin = stage.until
     return seconds
 
 
-def _blocks(method: Method, begin: int, end: int) -> list[tuple[int, int]]:
-    """Block sides of coarse images in the iterations after `begin` to `end`, and how many have each."""
+def _blocks(method: Method, pixels: int, begin: int, end: int) -> list[tuple[int, int]]:
+    """Block sides of images of so many pixels in the iterations after `begin` to `end`, and how many have
+    each."""
     ends = sorted({end, *(coarse.until for coarse in method.data.coarse if begin < coarse.until < end)})
     return [
-        (method.data.block_at(last), last - first) for first, last in pairwise([begin, *ends]) if last > first
+        (method.data.block_at(last, pixels), last - first)
+        for first, last in pairwise([begin, *ends])
+        if last > first
     ]

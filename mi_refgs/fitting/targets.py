@@ -69,12 +69,12 @@ class Targets:
         self.data, self.options, self.budget = data, options, budget
         self._kept: OrderedDict[tuple[int, int], Target] = OrderedDict()
         self._bytes = 0
-        blocks = {1, *(images.block for images in options.coarse)}
-        pixels = sum(view.width * view.height for view in data.views)
-        if sum(PIXEL_BYTES * pixels // block**2 for block in blocks) <= budget:
-            for block in blocks:
-                for index in range(len(self)):
-                    self._target(index, block)
+        sizes = [view.width * view.height for view in data.views]
+        wanted = [(i, 1) for i in range(len(sizes))]
+        wanted += [(i, c.block) for c in options.coarse for i, size in enumerate(sizes) if c.applies(size)]
+        if sum(PIXEL_BYTES * sizes[i] // block**2 for i, block in {*wanted}) <= budget:
+            for index, block in wanted:
+                self._target(index, block)
 
     def __len__(self) -> int:
         return len(self.data.views)
@@ -84,7 +84,8 @@ class Targets:
 
     def at(self, iteration: int, index: int) -> Target:
         """The target of a view in a (1-based) iteration, whose images may be coarse."""
-        return self._target(index, self.options.block_at(iteration))
+        view = self.data.views[index]
+        return self._target(index, self.options.block_at(iteration, view.width * view.height))
 
     def _target(self, index: int, block: int) -> Target:
         if (key := (index, block)) in self._kept:

@@ -237,6 +237,11 @@ class CoarseImages:
 
     until: int = field(metadata=ITERATIONS)  # iterations
     block: int = 2  # pixels along a side of the squares that are averaged into one
+    least: int = 0  # pixels that are left at least: smaller images are not averaged
+
+    def applies(self, pixels: int) -> bool:
+        """Whether images of so many pixels are averaged."""
+        return pixels // self.block**2 >= self.least
 
 
 @dataclass(frozen=True)
@@ -248,9 +253,10 @@ class DataOptions:
     downscale: int | None = None  # pixels of a file per pixel, along a side; absent: as the preset allows
     coarse: tuple[CoarseImages, ...] = ()
 
-    def block_at(self, iteration: int) -> int:
-        """Pixels along a side that a (1-based) iteration averages into one; 1: full resolution."""
-        due = [images for images in self.coarse if iteration <= images.until]
+    def block_at(self, iteration: int, pixels: int) -> int:
+        """Pixels along a side that a (1-based) iteration averages into one, in an image of so many pixels; 1:
+        full resolution."""
+        due = [images for images in self.coarse if iteration <= images.until and images.applies(pixels)]
         return min(due, key=lambda images: images.until).block if due else 1
 
 

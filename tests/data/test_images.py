@@ -349,7 +349,8 @@ def test_memory_is_bounded(tmp_path: Path, rng: np.random.Generator) -> None:
 def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both are equal and of the resolution of the iteration; the most recently used ones are kept."""
     data = ball(24, 5)
-    options = DataOptions(coarse=(CoarseImages(until=3, block=2),))
+    coarse = CoarseImages(until=3, block=2), CoarseImages(until=2, block=4, least=37)
+    options = DataOptions(coarse=coarse)
     whole, one = Targets(data, options), PIXEL_BYTES * 24 * 24
     made: list[int] = []
     real = View.camera
@@ -364,7 +365,8 @@ def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPat
     for index in (0, 1, 0, 2, 0, 1):
         assert few[index].camera.width == 24
         assert np.array_equal(few[index].image[0], whole[index].image[0])
-        assert whole.at(3, index).camera.width == 12 and whole.at(4, index) is whole[index]
+        assert whole.at(1, index).camera.width == whole.at(3, index).camera.width == 12
+        assert whole.at(4, index) is whole[index]
     assert made == [0, 1, 2, 1]
     lone = Targets(data, options, 1)
     assert lone[3] is lone[3] and lone[4] is not lone[3] and len(lone) == 5

@@ -80,13 +80,14 @@ def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
         "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
         "[refine.propagate]\nwhen = {start = 0, until = 4000, every = 100}\nhold = 200\n"
         "[loss]\nsmooth = { weight = 1, until = 3000 }\n"
-        "[data]\ncoarse = [{ until = 1000, block = 2 }, { until = 400, block = 4 }]\n"
+        "[data]\ncoarse = [{ until = 1000, block = 2, least = 400 }, { until = 400, block = 4 }]\n"
     )
     method = methods.load(str(path), "quick")
     assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
     assert method.refine.propagate is not None
     assert (method.refine.propagate.hold, method.loss["smooth"].until) == (100, 1500)
-    assert [method.data.block_at(i) for i in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
+    assert [method.data.block_at(i, 1600) for i in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
+    assert [method.data.block_at(i, 1599) for i in (1, 200, 201, 501)] == [4, 4, 1, 1]
 
 
 def test_only_declared_fields_are_scaled() -> None:
@@ -171,7 +172,7 @@ propagate = { when = { start = 0, until = 2_601, every = 650 } }
 
 
 EVENTS = {
-    "ref_gaussian": dict(degree=2, densify=14, reset_opacity=2, mesh=8),
+    "ref_gaussian": dict(degree=2, densify=14, reset_opacity=1, mesh=8),
     "ref_gaussian_paper": dict(
         degree=3, densify=48, reset_opacity=8, propagate_normals=16, mesh=16, restart=1
     ),
