@@ -276,8 +276,12 @@ def _require_same(run: Run, made: Method, choice: Choice) -> None:
 
 def _require(run: Run, option: str, made: Method, now: Method) -> None:
     """Raise InputError if the method of a run is not that of an option."""
-    if now.data.downscale is None:  # decided when the run was started
+    # The image size, and the components that fit into the time limit, were decided when the run was started.
+    if now.data.downscale is None:
         now = now.downscaled(made.data.downscale)
+    if now.select is not None and made.select is not None:
+        tried = {name: one for name, one in now.select.component.items() if name in made.select.component}
+        now = replace(now, select=replace(now.select, component=tried))
     for key, (before, after) in methods.differences(made, now).items():
         raise InputError(
             f"{run.path / 'config.toml'}: {option}: {key}: the run was started with {before}, and "

@@ -19,7 +19,7 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import select
-from mi_refgs.fitting.runner import begin
+from mi_refgs.fitting.runner import Choice, _require_same, begin
 from mi_refgs.fitting.select import branched
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
@@ -200,6 +200,18 @@ def test_interrupted_selection_resumes(
     assert [row["stays"] for row in resumed.fit.decisions] == [row["stays"] for row in straight.fit.decisions]
     for name, tensor in straight.fit.params.items():
         assert tensor.shape == resumed.fit.params[name].shape
+
+
+def test_a_run_without_the_slow_components_resumes(variant: str, folder: Path, tmp_path: Path) -> None:
+    """Its time limit has left some out: the method that is named again has them."""
+    run, choice = Run(tmp_path / "run"), Choice(variant, "quick", SETTINGS)
+    method = methods.load(variant, "quick", SETTINGS).downscaled(1)
+    assert method.select is not None
+    first = {"degree": method.select.component["degree"]}
+    run.create(replace(method, select=replace(method.select, component=first)), str(folder))
+    _require_same(run, run.method(), choice)
+    changed = replace(choice, settings=[*SETTINGS, "select.component.degree.trial=3"])
+    refused(lambda: _require_same(run, run.method(), changed), "degree.trial", "started with 2")
 
 
 def test_run_keeps_its_decisions(
