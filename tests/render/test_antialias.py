@@ -161,4 +161,7 @@ def test_one_sample_comes_closer_to_many() -> None:
 
 
 def test_antialias_requires_deferred_shading() -> None:
+    assert Shading().antialiased() == Shading(antialias=True)
+    for other in (Shading("surfel"), Shading("surfel", reflectance="radiance")):
+        assert other.antialiased() == other
     refused(lambda: Shading("surfel", antialias=True), "antialias: needs at = pixel")
