@@ -147,11 +147,11 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
         return Decision(name, iteration, False, f"needs {missing[0]}")
     if present := [other for other in component.unless if other in method.components]:
         return Decision(name, iteration, False, f"nothing to do beside {present[0]}")
-    made = methods.load(method.file, method.preset, method.assignments, (*method.components, name))
-    candidate = replace(made, data=method.data, select=method.select)
     if iteration + component.trial > method.iterations:
         return Decision(name, iteration, False, "too late in the fit")
     try:
+        made = methods.load(method.file, method.preset, method.assignments, (*method.components, name))
+        candidate = replace(made, data=method.data, select=method.select)
         rival = branched(trainer, candidate)
         with_it = _run(rival, component.trial, judges, trainer.release)
     except InputError as error:

@@ -100,22 +100,26 @@ def load(
     """Read a method by name or TOML path, with some of its components, scaled to a preset (see `preset_of`).
 
     `assignments` are `key=value`, applied last and not scaled, except that the changes of a component are in
-    the iterations of the file. Raises InputError that names the file and the key for anything unknown or of
-    the wrong type.
+    the iterations of the file, and that nothing is assigned to what a component has dropped. Raises
+    InputError that names the file and the key for anything unknown or of the wrong type.
     """
     path, chosen = _find(name, "--method", Path()), preset_of(preset)
     table = _extended(path, [])
     of_select = [text for text in assignments or () if _keys(text.partition("=")[0].strip())[0] == "select"]
     for assignment in of_select if components else ():
         _assign(table, assignment)
-    for component in components:
+    dropped: list[list[str]] = []
+    for name_of_component in components:
+        component = _component(table, name_of_component, path)
         table = _with_component(table, component, path)
+        dropped += map(_keys, component.drop)
     method = _built(table, str(path))
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     for assignment in assignments or []:
-        _assign(table, assignment)
+        if not _is_dropped(table, _keys(assignment.partition("=")[0].strip()), dropped):
+            _assign(table, assignment)
     file = str(path.resolve()) if name.endswith(".toml") else name
     table |= {"name": path.stem, "file": file, "preset": preset}
     table |= {"components": [*components], "assignments": [*(assignments or [])]}
@@ -299,17 +303,29 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
     return _merge(parent, table)
 
 
-def _with_component(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
-    """The table of a file with the changes of one of its components."""
+def _component(table: dict[str, Any], name: str, path: Path) -> MethodComponent:
+    """A component of a file's table."""
     where = f"{path}: select.component"
     try:
-        component = build(MethodComponent, table["select"]["component"][name], f"{where}.{name}")
+        return build(MethodComponent, table["select"]["component"][name], f"{where}.{name}")
     except (KeyError, TypeError) as error:
         raise InputError(f"{where}: there is no '{name}'; use one of its components") from error
+
+
+def _with_component(table: dict[str, Any], component: MethodComponent, path: Path) -> dict[str, Any]:
+    """The table of a file with the changes of one of its components."""
     for key in component.drop:
         with contextlib.suppress(InputError):  # another component or a base file may have dropped it
             _drop(table, key, path)
     return _merge(table, component.change)
+
+
+def _is_dropped(table: dict[str, Any], keys: list[str], dropped: Sequence[list[str]]) -> bool:
+    """Whether a key, given in parts, is a dropped one, or inside a dropped table that is not there again."""
+    return any(
+        keys[: len(gone)] == gone and (keys == gone or not isinstance(_at(table, keys[:-1]), dict))
+        for gone in dropped
+    )
 
 
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -435,6 +435,25 @@ def test_a_component_has_its_assigned_changes(tmp_path: Path, change: str) -> No
     assert not methods.differences(methods.load_resolved(tmp_path / "config.toml"), made)
 
 
+def test_nothing_is_assigned_to_what_a_component_drops() -> None:
+    """Settings of the light or a stage do not bring them back; others, and new tables of that name, count."""
+    settings = [
+        "stage.deferred.samples=4",
+        "stage.initial.rates={opacity=0.1}",
+        "light.height=64",
+        "light.every=1",
+    ]
+    settings += ["mesh.resolution=64", "rates.attribute.albedo=0.1", "surfels.initial={metallic=0.5}"]
+    plain = methods.load("auto", "quick", [], ["colour_alone"])
+    made = methods.load("auto", "quick", settings, ["colour_alone"])
+    assert dataclasses.replace(made, assignments=()) == plain and made.light is None is made.mesh
+    assert methods.load("auto", "quick", settings).stage["deferred"].samples == 4
+    others = ["stage.radiance.samples=4", "surfels.initial.opacity=0.2", "loss.normal=0.7"]
+    made = methods.load("auto", "quick", others, ["colour_alone"])
+    assert made.stage["radiance"].samples == 4 and made.surfels.initial == {"opacity": 0.2}
+    assert made.loss["normal"].weight == 0.7
+
+
 def test_a_stage_sets_every_shading_option() -> None:
     options = ["dominant=true", "multiscatter=true", "light_levels=3", "visibility_rays=4", "antialias=true"]
     method = methods.load("ref_gaussian", "quick", [f"stage.deferred.{option}" for option in options])
