@@ -129,8 +129,9 @@ def _resumed_method(run: Run, data: Path, choice: Choice) -> Method:
     method = run.method()
     _require_same(run, method, choice)
     if choice.minutes is not None:
-        free = method.downscaled(None)
-        _require(run, "--minutes", method, planned(free, data, 60 * choice.minutes)[0])
+        free = methods.with_components(method, ()).downscaled(None)  # as it was planned
+        size = planned(free, data, 60 * choice.minutes)[0].data.downscale
+        _require(run, "--minutes", method, method.downscaled(size))
     return method
 
 
@@ -198,6 +199,11 @@ def begin(
         require_several_sides(views)
         for note in views.notes:
             tell(f"{views.path}: {note}")
+        if method.select is not None and len(views.views) < method.select.holdout:
+            tell(
+                f"{views.path}: {len(views.views)} views: too few to hold some out, so no component is tried"
+            )
+            method = replace(method, select=None)
         if find_points is not None:
             views = replace(views, points=find_points(views, run.path, tell))
     trainer = Trainer(method, views, run, state, tell=tell, warn=warn)
@@ -258,12 +264,10 @@ def _require_same(run: Run, made: Method, choice: Choice) -> None:
     wanted, preset, file = choice.method, choice.preset, made.file
     changes = methods.assignments(choice.settings)
     if isinstance(wanted, Method):
-        if wanted.select is not None and wanted.components != made.components:
-            wanted = methods.load(wanted.file, wanted.preset, wanted.assignments, made.components)
         _require(run, "method", made, wanted)
     elif wanted is not None:
         file = wanted
-        now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments, made.components)
+        now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments)
         _require(run, "--method (--for)", made, now)
     if preset is not None and preset != made.preset:
         raise InputError(
@@ -271,18 +275,24 @@ def _require_same(run: Run, made: Method, choice: Choice) -> None:
             f"'{preset}'; drop --preset or choose another -o"
         )
     if changes and tuple(changes) != made.assignments:
-        _require(run, "--set", made, methods.load(file, made.preset, changes, made.components))
+        _require(run, "--set", made, methods.load(file, made.preset, changes))
 
 
 def _require(run: Run, option: str, made: Method, now: Method) -> None:
     """Raise InputError if the method of a run is not that of an option."""
-    # The image size, and the components that fit into the time limit, were decided when the run was started.
+    # Components, the image size, and what fits into the time limit have been decided for the run.
+    if made.select is None:  # too few views to try any
+        now = replace(now, select=None)
+    elif now.select is not None:
+        select, known = now.select, now.select.component
+        if {*made.components} <= {*known}:
+            now = methods.with_components(now, made.components)
+        tried = {name: one for name, one in known.items() if name in made.select.component}
+        now = replace(now, select=replace(select, component=tried))
     if now.data.downscale is None:
         now = now.downscaled(made.data.downscale)
-    if now.select is not None and made.select is not None:
-        tried = {name: one for name, one in now.select.component.items() if name in made.select.component}
-        now = replace(now, select=replace(now.select, component=tried))
-    for key, (before, after) in methods.differences(made, now).items():
+    changes = methods.differences(made, now)
+    for key, (before, after) in sorted(changes.items(), key=lambda item: item[0] != "name"):
         raise InputError(
             f"{run.path / 'config.toml'}: {option}: {key}: the run was started with {before}, and "
             f"would now have {after}; drop {option} or choose another -o"

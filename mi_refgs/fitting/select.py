@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import drjit as dr
@@ -123,7 +123,11 @@ def install_trials(trainer: Trainer, tell: Callable[[str], None] = lambda _: Non
 
     def before_step(trainer: Trainer) -> None:
         while names := _undecided(trainer, select):
-            if trainer.iteration < select.component[names[0]].after:
+            component = select.component[names[0]]
+            lacks = {*component.needs} & {
+                row["component"] for row in trainer.fit.decisions if not row["stays"]
+            }
+            if trainer.iteration < component.after and not lacks:
                 return
             seconds, begin = trainer.fit.seconds, time.perf_counter()
             decision = _try(trainer, names[0], select, judges)
@@ -150,17 +154,20 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
     if iteration + component.trial > method.iterations:
         return Decision(name, iteration, False, "too late in the fit")
     try:
-        made = methods.load(method.file, method.preset, method.assignments, (*method.components, name))
-        candidate = replace(made, data=method.data, select=method.select)
+        candidate = methods.with_components(method, (*method.components, name))
         rival = branched(trainer, candidate)
+        if candidate.surfels.most > method.surfels.most and rival.surfels.count <= trainer.surfels.count:
+            return Decision(name, iteration, False, "no surfels to split: densification has ended")
         with_it = _run(rival, component.trial, judges, trainer.release)
     except InputError as error:
         return Decision(name, iteration, False, f"its fit failed: {error}")
-    without = _run(trainer, component.trial, judges, trainer.release)
+    # A copy, so that an interrupt leaves the fit as it was before the trial.
+    plain = Trainer(method, trainer.data, state=trainer.state())
+    without = _run(plain, component.trial, judges, trainer.release)
     gain, wanted = with_it.psnr - without.psnr, required_gain(without, with_it, select)
     stays = gain >= wanted
-    if stays:
-        trainer.adopt(FitSetup(candidate, trainer.data), rival.state())
+    chosen = rival if stays else plain
+    trainer.adopt(FitSetup(chosen.method, trainer.data), chosen.state())
     cost = f"{with_it.ms / without.ms:.2f} times the time per step and {with_it.mb - without.mb:+.1f} MB"
     reason = f"{gain:+.2f} dB on validation views, {wanted:+.2f} dB required for {cost}"
     return Decision(name, iteration, stays, reason, without, with_it)
@@ -227,10 +234,7 @@ def table(decisions: list[dict[str, Any]]) -> str:
 
 def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
     """The method with the components that the decisions kept."""
-    if method.select is None:
-        return method
-    names = tuple(row["component"] for row in decisions if row["stays"])
-    if names == method.components:
-        return method
-    made = methods.load(method.file, method.preset, method.assignments, names)
-    return replace(made, data=method.data, select=method.select)
+    known = () if method.select is None else method.select.component
+    return methods.with_components(
+        method, [row["component"] for row in decisions if row["stays"] and row["component"] in known]
+    )

@@ -11,6 +11,7 @@ from mi_refgs.methods.read import (
     load_resolved,
     names,
     preset_of,
+    with_components,
 )
 from mi_refgs.methods.window import Window
 
@@ -31,4 +32,5 @@ __all__ = [
     "load_resolved",
     "names",
     "preset_of",
+    "with_components",
 ]

@@ -12,7 +12,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ def load(
     """Read a method by name or TOML path, with some of its components, scaled to a preset (see `preset_of`).
 
     `assignments` are `key=value`, applied last and not scaled, except that the changes of a component are in
-    the iterations of the file, and that nothing is assigned to what a component has dropped. Raises
+    the iterations of the file, and that nothing is assigned to what a component drops or changes. Raises
     InputError that names the file and the key for anything unknown or of the wrong type.
     """
     path, chosen = _find(name, "--method", Path()), preset_of(preset)
@@ -108,17 +108,18 @@ def load(
     of_select = [text for text in assignments or () if _keys(text.partition("=")[0].strip())[0] == "select"]
     for assignment in of_select if components else ():
         _assign(table, assignment)
-    dropped: list[list[str]] = []
+    decided: list[list[str]] = []
     for name_of_component in components:
         component = _component(table, name_of_component, path)
         table = _with_component(table, component, path)
-        dropped += map(_keys, component.drop)
+        decided += map(_keys, (*component.drop, *_flat(component.change)))
     method = _built(table, str(path))
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     for assignment in assignments or []:
-        if not _is_dropped(table, _keys(assignment.partition("=")[0].strip()), dropped):
+        keys = _keys(assignment.partition("=")[0].strip())
+        if not any(keys[: len(other)] == other for other in decided):
             _assign(table, assignment)
     file = str(path.resolve()) if name.endswith(".toml") else name
     table |= {"name": path.stem, "file": file, "preset": preset}
@@ -128,6 +129,23 @@ def load(
     if method.select is not None and not components:
         _require_selectable(method, method.select, str(path))
     return method
+
+
+def with_components(method: Method, components: Sequence[str]) -> Method:
+    """A method with these of its components in place of those that it has, read from its file again.
+
+    What else differs from the file stays, unless a component changes it: the image size, the components that
+    may be tried, and changes of the `Method` in Python.
+    """
+    if method.select is None or (*components,) == method.components:
+        return method
+    then, made = (
+        load(method.file, method.preset, method.assignments, names)
+        for names in (method.components, components)
+    )
+    names = {field.name for field in fields(Method)}
+    own = {name for name in names if getattr(method, name) != getattr(then, name) == getattr(made, name)}
+    return replace(made, **{name: getattr(method, name) for name in own})
 
 
 def load_resolved(path: Path) -> Method:
@@ -320,14 +338,6 @@ def _with_component(table: dict[str, Any], component: MethodComponent, path: Pat
     return _merge(table, component.change)
 
 
-def _is_dropped(table: dict[str, Any], keys: list[str], dropped: Sequence[list[str]]) -> bool:
-    """Whether a key, given in parts, is a dropped one, or inside a dropped table that is not there again."""
-    return any(
-        keys[: len(gone)] == gone and (keys == gone or not isinstance(_at(table, keys[:-1]), dict))
-        for gone in dropped
-    )
-
-
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():
@@ -517,6 +527,9 @@ def _require_selectable(method: Method, select: Selection, where: str) -> None:
         if unknown := [one for one in (*component.needs, *component.unless) if one not in select.component]:
             key = f"select.component.{name}: needs"
             raise InputError(f"{where}: {key}: there is no '{unknown[0]}'; name a component")
+        if component.trial < 1:
+            given = f"select.component.{name}.trial: {component.trial}"
+            raise InputError(f"{where}: {given} is out of range; give 1 or more")
         load(method.file, method.preset, method.assignments, [*_needed(select, name), name])
 
 

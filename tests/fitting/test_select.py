@@ -302,6 +302,7 @@ def test_branching_resamples_light(variant: str, views: Dataset) -> None:
     ("old", "new", "words"),
     [
         ("holdout = 3", "holdout = 1", ["select.holdout", "1"]),
+        ("after = 2\ntrial = 2", "after = 2\ntrial = 0", ["select.component.degree.trial", "1 or more"]),
         ('needs = ["specular"]', 'needs = ["speculr"]', ["interreflection", "speculr"]),
         ("light = { height = 8 }", "light = { height = 10 }", ["light.height", "10"]),
         ("degree = { radiance_sh = 1 } } }", "degrees = { radiance_sh = 1 } } }", ["degrees"]),
@@ -325,8 +326,60 @@ def test_trials_end_with_fit(
     """A term that has no room left is not tried, and no step is made beyond the last iteration."""
     judged(monkeypatch, [21.0, 20.0, 19.0, 20.0])
     trainer = fitted(variant, views, tmp_path / "run", "iterations=7")
-    assert trainer.iteration == 7 and len(trainer.fit.decisions) == 2
+    assert trainer.iteration == 7
+    reasons = [row["reason"] for row in trainer.fit.decisions if row["without"] is None]
+    assert reasons == ["needs specular"] and len(trainer.fit.decisions) == 3
     assert Run(tmp_path / "run").method().components == ("degree",)
+
+
+def test_an_interrupt_during_a_trial_leaves_the_fit_as_it_was_before(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In either half of the first trial, after two iterations; the resumed fit ends as a straight one."""
+    monkeypatch.setattr(select.time, "process_time", itertools.count().__next__)
+    straight, step = fitted(variant, views, tmp_path / "straight"), Trainer.step
+    left = 0
+
+    def interrupted(trainer: Trainer) -> None:
+        nonlocal left
+        step(trainer)
+        left -= 1
+        if not left:
+            raise KeyboardInterrupt
+
+    for left in (3, 5):
+        run = Run(tmp_path / f"run_{left}")
+        monkeypatch.setattr(select.time, "process_time", itertools.count().__next__)
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(Trainer, "step", interrupted)
+            begin(methods.load(variant, "quick", SETTINGS), views, run).train()
+        resumed = begin(run.method(), views, run)
+        assert resumed.iteration == 2 and not resumed.fit.decisions
+        monkeypatch.setattr(select.time, "process_time", itertools.count().__next__)
+        resumed.train()
+        for name, tensor in straight.fit.params.items():
+            np.testing.assert_array_equal(tensor.numpy(), resumed.fit.params[name].numpy(), name)
+
+
+def test_surfels_are_not_tried_without_errors_to_split(variant: str, views: Dataset, tmp_path: Path) -> None:
+    """After densification has ended, more surfels would be the same ones."""
+    path = tmp_path / "more.toml"
+    path.write_text(
+        f'extends = "{variant}"\n[refine]\ndensify = {{ start = 0, until = 0, every = 9 }}\n'
+        "[select.component.degree.change.surfels]\ncapacity = 2\n"
+    )
+    trainer = fitted(str(path), views, tmp_path / "run")
+    assert "densification has ended" in trainer.fit.decisions[0]["reason"]
+
+
+def test_nothing_is_tried_on_few_views(variant: str, views: Dataset, tmp_path: Path) -> None:
+    few, run = replace(views, views=views.views[:2]), Run(tmp_path / "run")
+    said: list[str] = []
+    trainer = begin(methods.load(variant, "quick", SETTINGS), few, run, said.append)
+    assert trainer.method.select is None and "2 views: too few to hold some out" in " ".join(said)
+    trainer.train()
+    assert len(trainer.data.views) == 2 and not trainer.fit.decisions
+    _require_same(run, run.method(), Choice(variant, "quick", SETTINGS))
 
 
 def test_rival_that_fails_is_left_out(

@@ -436,22 +436,35 @@ def test_a_component_has_its_assigned_changes(tmp_path: Path, change: str) -> No
 
 
 def test_nothing_is_assigned_to_what_a_component_drops() -> None:
-    """Settings of the light or a stage do not bring them back; others, and new tables of that name, count."""
+    """Settings of the light or a stage do not bring them back, nor change what a component decides."""
     settings = [
         "stage.deferred.samples=4",
         "stage.initial.rates={opacity=0.1}",
         "light.height=64",
         "light.every=1",
     ]
-    settings += ["mesh.resolution=64", "rates.attribute.albedo=0.1", "surfels.initial={metallic=0.5}"]
+    settings += ["mesh.resolution=64", "rates.attribute.albedo=0.1", "surfels.initial.metallic=0.5"]
+    settings += ["surfels.degree.radiance_sh=1"]
     plain = methods.load("auto", "quick", [], ["colour_alone"])
     made = methods.load("auto", "quick", settings, ["colour_alone"])
     assert dataclasses.replace(made, assignments=()) == plain and made.light is None is made.mesh
     assert methods.load("auto", "quick", settings).stage["deferred"].samples == 4
-    others = ["stage.radiance.samples=4", "surfels.initial.opacity=0.2", "loss.normal=0.7"]
-    made = methods.load("auto", "quick", others, ["colour_alone"])
-    assert made.stage["radiance"].samples == 4 and made.surfels.initial == {"opacity": 0.2}
-    assert made.loss["normal"].weight == 0.7
+    made = methods.load("auto", "quick", ["loss.normal=0.7", "surfels.capacity=3"], ["surfels_2x"])
+    assert made.loss["normal"].weight == 0.7 and made.surfels.capacity == 2
+
+
+def test_components_keep_what_python_changed() -> None:
+    """A `Method` that was changed is tried with its changes; those of a component come first."""
+    method = methods.load("auto", "quick", ["loss.ssim=0.3"])
+    rates = dataclasses.replace(method.rates, decay=0.7)
+    own = dataclasses.replace(method.downscaled(3), seed=5, rates=rates, log_every=7)
+    more = methods.with_components(own, ["surfels_2x"])
+    assert (more.seed, more.log_every, more.data.downscale, more.rates) == (5, 7, 3, rates)
+    assert more.surfels.capacity == 2 and more.loss["ssim"].weight == 0.3
+    alone = methods.with_components(more, ["colour_alone"])
+    assert alone.seed == 5 and alone.surfels.capacity == 1 and alone.light is None
+    assert alone.rates == methods.load("auto", "quick", [], ["colour_alone"]).rates
+    assert methods.with_components(alone, []) == dataclasses.replace(own, rates=methods.load("auto").rates)
 
 
 def test_a_stage_sets_every_shading_option() -> None:
