@@ -282,6 +282,7 @@ class Selection:
     """
 
     component: dict[str, MethodComponent]
+    surfels: int | None = None  # largest number before any trial, of a preset that allows more
     holdout: int = 8  # every so many training views validate
     gain: float = 0.02  # dB
     gain_per_doubling: float = 0.5  # dB per doubling of the time of a step: what twice the iterations bring

@@ -117,6 +117,12 @@ def load(
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
+    if (
+        method.select is not None
+        and (most := method.select.surfels) is not None
+        and most < chosen.max_surfels
+    ):
+        table["surfels"] |= {"count": round(START_FRACTION * most), "max_count": most}
     for assignment in assignments or []:
         keys = _keys(assignment.partition("=")[0].strip())
         if not any(keys[: len(other)] == other for other in decided):
@@ -523,6 +529,8 @@ def _require_selectable(method: Method, select: Selection, where: str) -> None:
     """Raise InputError for a selection that cannot be made; each component is loaded with those it needs."""
     if select.holdout < 2:
         raise InputError(f"{where}: select.holdout: {select.holdout} leaves no views to fit; give 2 or more")
+    if select.surfels is not None and select.surfels < 1:
+        raise InputError(f"{where}: select.surfels: {select.surfels} is out of range; give 1 or more")
     for name, component in select.component.items():
         if unknown := [one for one in (*component.needs, *component.unless) if one not in select.component]:
             key = f"select.component.{name}: needs"

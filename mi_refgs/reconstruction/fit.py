@@ -39,10 +39,10 @@ def fit(
 ) -> Reconstruction:
     """Fit surfels, materials and an environment map to the images in folder `data`, as `refgs train` does.
 
-    method: a method of the package (`variants/`), the path of a .toml, or a `Method`; None fits the full
-    method, and to images without alpha the one that fits background Gaussians too. preset: how long, "quick",
-    "standard" (the default), "paper", or iterations and largest number of surfels, "1000:20000". minutes:
-    time that the fit may take, which chooses the image size.
+    method: a method of the package (`variants/`), the path of a .toml, or a `Method`; None fits what the
+    scene needs of the full method (`auto`), and to images without alpha background Gaussians too. preset: how
+    long, "quick", "standard" (the default), "paper", or iterations and largest number of surfels,
+    "1000:20000". minutes: time that the fit may take, which chooses the image size.
     settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"].
 
     output: the run folder, which is kept. Without one a temporary folder is used, which is removed with the

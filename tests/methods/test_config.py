@@ -453,6 +453,20 @@ def test_nothing_is_assigned_to_what_a_component_drops() -> None:
     assert made.loss["normal"].weight == 0.7 and made.surfels.capacity == 2
 
 
+def test_trials_begin_with_no_more_surfels_than_the_selection_says() -> None:
+    """Presets that allow more start as `quick`; presets that allow fewer, and settings, count."""
+    counts = {
+        preset: (method.surfels.count, method.surfels.max_count)
+        for preset in ("quick", "standard", "paper", "500:1000")
+        for method in [methods.load("auto", preset)]
+    }
+    assert counts == dict.fromkeys(("quick", "standard", "paper"), (15_000, 20_000)) | {
+        "500:1000": (750, 1000)
+    }
+    assert methods.load("auto", "standard", ["surfels.max_count=50000"]).surfels.max_count == 50_000
+    assert methods.load("ref_gaussian", "standard").surfels.max_count == 40_000
+
+
 def test_components_keep_what_python_changed() -> None:
     """A `Method` that was changed is tried with its changes; those of a component come first."""
     method = methods.load("auto", "quick", ["loss.ssim=0.3"])
