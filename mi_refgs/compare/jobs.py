@@ -10,7 +10,7 @@ import dataclasses
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -209,8 +209,10 @@ def require_same(job: Job) -> None:
         job.run.output.require_free()
         return
     made = job.run.method()
-    # Optional components are those that the run has chosen.
-    for key, (before, now) in differences(made, job.method(made.components)).items():
+    # Optional components are those that the run has chosen; on few views it has tried none.
+    wanted = job.method(made.components)
+    wanted = replace(wanted, select=None) if made.select is None else wanted
+    for key, (before, now) in differences(made, wanted).items():
         raise InputError(
             f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --methods, "
             f"--preset or --set would make it {now}; choose another -o, or remove that run"

@@ -230,6 +230,11 @@ def planned(
     affordable = _with_affordable_capacity(
         method, lambda capacity: at(factor, capacity).seconds <= SAFETY * limit
     )
+    if affordable != method:
+        tell(
+            f"{path}: fits with more surfels would take more than {minutes(limit)}, and are not tried; "
+            "--minutes M gives them other time"
+        )
     return affordable.downscaled(factor), chosen
 
 

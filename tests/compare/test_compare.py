@@ -322,6 +322,13 @@ def test_other_settings_are_refused_by_the_run_itself(
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
 
 
+def test_a_run_on_few_views_is_the_same_again(ball: Path, tmp_path: Path) -> None:
+    """Nothing was tried on them, so the run has no selection."""
+    job = Job(str(tmp_path / "run"), str(ball), "auto", 0, "30:20", (), "llvm_ad_rgb", None)
+    job.run.create(dataclasses.replace(job.method(), select=None), str(ball))
+    jobs.require_same(job)
+
+
 # ---------- The page ----------
 
 

@@ -117,7 +117,9 @@ def test_surfels_beyond_the_time_limit_are_not_tried(
     steps = 8 * 5 + 22 * 10
     assert two - one == pytest.approx(0.45 * steps) and four - one == pytest.approx((1.45**2 - 1) * steps)
     for seconds, names in ((one, ["colour"]), (two, ["colour", "twice"]), (four, [*tried])):
-        made, expected = plan.planned(method, data, (seconds + 1e-6) / plan.SAFETY)
+        said: list[str] = []
+        made, expected = plan.planned(method, data, (seconds + 1e-6) / plan.SAFETY, said.append)
+        assert len(said) == (len(names) < 3) and all("are not tried" in text for text in said)
         assert made.select is not None and [*made.select.component] == names
         assert made.data.downscale == 1 and expected is not None and expected.seconds == one
 
