@@ -67,7 +67,7 @@ def test_the_gain_of_metal_decides(
     assert trainer.iteration == 6 and np.abs(found - held).max() > 1e-4 and np.abs(found - held).mean() < 0.1
 
 
-def test_images_of_a_fit_decide(views: Dataset, tmp_path: Path) -> None:
+def test_images_of_a_fit_decide(views: Dataset, tmp_path: Path, one_thread: None) -> None:
     """The fit ends where one with that metallic and the same seed does."""
     trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4")
     sentence = next(one for one in said if "metallic starts" in one)

@@ -333,7 +333,7 @@ def test_trials_end_with_fit(
 
 
 def test_an_interrupt_during_a_trial_leaves_the_fit_as_it_was_before(
-    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_thread: None
 ) -> None:
     """In either half of the first trial, after two iterations; the resumed fit ends as a straight one."""
     monkeypatch.setattr(select.time, "process_time", itertools.count().__next__)
