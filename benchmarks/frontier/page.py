@@ -253,11 +253,11 @@ def plot(result: dict[str, Any], folder: Path) -> Path:
             label = f"{line[0]}, {line[1]:,} surfels, 1/{line[2]}, {line[3]} samples"
             style = {"color": colour, "marker": marker, "markersize": 4, "linewidth": 0.8, "capsize": 2}
             _draw(ax, found, label=label, **style)
-        for preset in (one for one in settings if one.preset is not None):
+        presets = sorted((one for one in settings if one.preset is not None), key=lambda one: one.seconds)
+        for i, preset in enumerate(presets):  # labels to the left, alternately above and below their star
             _draw(ax, [preset], color="#444444", marker="*", markersize=9)
-            place = (preset.seconds, preset.psnr)
-            look = {"textcoords": "offset points", "fontsize": 7}
-            ax.annotate(preset.name, place, xytext=(5, -9), **look)
+            look = {"textcoords": "offset points", "fontsize": 7, "ha": "right"}
+            ax.annotate(preset.name, (preset.seconds, preset.psnr), xytext=(-5, 5 if i % 2 else -11), **look)
         best = front(settings)
         x, y = [one.seconds for one in best], [one.psnr for one in best]
         ax.step(x, y, where="post", color="#bbbbbb", lw=3, zorder=0, label="Pareto front")
