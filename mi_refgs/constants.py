@@ -87,8 +87,8 @@ smaller ones. With AVX-512, each of its 16 lanes has 4 pixels. A vector runs unt
 tiles ends, so a patch joins neighbouring tiles, whose lists are alike."""
 
 LANE_PIXELS_PER_AXIS = 2
-"""Width and height, in pixels, of the square that one lane composites. The lane reads a surfel once for these
-pixels, and adds the sum of their gradients to the surfel's."""
+"""Width and height, in pixels, of the square that a lane composites. It reads each surfel once for all pixels
+of the square, and adds the sum of their gradients to the surfel's."""
 
 
 FOCAL_TOLERANCE = 1e-5

@@ -51,7 +51,7 @@ GROWTH, OPEN_GROWTH = 1.0, 0.6
 """Mean time of a step relative to the synthetic data set, with alpha and without: the number of surfels
 grows, but opaque ones hide others, and without alpha surfels start far larger than they end."""
 CAPACITY_TIME = 1.45
-"""Relative time of a step with twice the surfels: 1.43 for `base_2dgs` on *chair*, 200², 20,000 to 40,000."""
+"""Relative time per step with twice the surfels: 1.43 for `base_2dgs` on *chair*, 200², 20,000 to 40,000."""
 START = 10.0  # seconds for the visual hull, previews, checkpoints and artefacts
 DECODING = 1.5e-8  # seconds per pixel of a file, once per image: JPEG 8e-9, PNG 2e-8
 WORTH = 1e7  # iterations × pixels from which a fit takes minutes, and an estimate is worth its time

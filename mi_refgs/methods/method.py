@@ -285,7 +285,7 @@ class Selection:
     surfels: int | None = None  # largest number before any trial, of a preset that allows more
     holdout: int = 8  # every so many training views validate
     gain: float = 0.02  # dB
-    gain_per_doubling: float = 0.5  # dB per doubling of the time of a step
+    gain_per_doubling: float = 0.5  # dB per doubling of the time per step
     gain_per_mb: float = 0.001  # dB per MB of parameters and their moments
 
     @property
