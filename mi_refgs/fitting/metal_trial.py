@@ -69,7 +69,8 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> tuple[float, Traine
     surfels = trainer.method.surfels
     surfels = replace(surfels, initial={**surfels.initial, "metallic": metallic})
     # Every step is logged, so that it evaluates its error.
-    copy = Trainer(replace(trainer.method, surfels=surfels, log_every=1), trainer.data)
+    method = replace(trainer.method, surfels=surfels, log_every=1)
+    copy = Trainer(method, trainer.data, targets=trainer.targets)
     copy.fit.optimiser.set_factor("metallic", 0.0)
     found = []
     for step in range(steps):

@@ -76,6 +76,10 @@ class Targets:
             for index, block in wanted:
                 self._target(index, block)
 
+    def are_of(self, data: Dataset, options: DataOptions) -> bool:
+        """Whether these are the targets of this very data set, read with these options."""
+        return self.data is data and self.options == options
+
     def __len__(self) -> int:
         return len(self.data.views)
 

@@ -63,12 +63,14 @@ class Trainer:
         run: Run | None = None,
         state: dict[str, np.ndarray] | None = None,
         *,
+        targets: Targets | None = None,
         tell: Callable[[str], None] = lambda _: None,
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start.
 
-        `tell` is called with decisions about the exposure, `warn` with steps that failed.
+        `targets` of another fit are shared if they are of the same data. `tell` is called with decisions
+        about the exposure, `warn` with steps that failed.
         """
         self.run, self.tell, self.warn = run, tell, warn
         self.before_step: Callable[[Trainer], None] | None = None  # is called before each step of `train`
@@ -78,23 +80,25 @@ class Trainer:
         self.error: Float = None  # mean squared error of the last step, width 1
         if state is None and run is not None:
             state = run.load_checkpoint()
-        self._set_up(FitSetup(method, data))
+        self._set_up(FitSetup(method, data), targets)
         if state is None:
             self.fit = FitState.start(self.setup, exposure.initial_gains(self.setup))
         else:
             self.restore(state)
 
-    def _set_up(self, setup: FitSetup) -> None:
+    def _set_up(self, setup: FitSetup, targets: Targets | None) -> None:
         require_losses(setup.method)
         require_memory(setup.method, setup.data)
-        self.setup, self.targets = setup, Targets(setup.data, setup.method.data)
+        if targets is None or not targets.are_of(setup.data, setup.method.data):
+            targets = Targets(setup.data, setup.method.data)
+        self.setup, self.targets = setup, targets
 
     def adopt(self, setup: FitSetup, state: dict[str, np.ndarray]) -> None:
         """Continue with another method, data and state, such as those of a `branched` fit.
 
         Raises InputError if the state is not one of the method.
         """
-        self._set_up(setup)
+        self._set_up(setup, self.targets)
         self.restore(state)
 
     def end_trial(self, decision: dict[str, Any], seconds: float, data: Dataset) -> None:
