@@ -10,7 +10,7 @@ import dataclasses
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from mi_refgs import __version__
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.plan import sized
+from mi_refgs.fitting.select import as_decided
 from mi_refgs.io.files import read_json, write_json
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import DataOptions, Method
@@ -64,10 +65,9 @@ class Job:
         """Data set, method and seed as text."""
         return f"{Path(self.data).name} × {self.name} × seed {self.seed}"
 
-    def method(self, components: Sequence[str] = ()) -> Method:
-        """Load the method with these optional components; raises InputError as `load` and `sized` do."""
-        method = load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"], components)
-        return sized(method, Path(self.data))
+    def method(self) -> Method:
+        """Load the method; raises InputError as `load` and `sized` do."""
+        return sized(load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"]), Path(self.data))
 
     def write(self) -> None:
         """Write the job into its run folder; raises InputError where that is impossible."""
@@ -209,10 +209,7 @@ def require_same(job: Job) -> None:
         job.run.output.require_free()
         return
     made = job.run.method()
-    # Optional components are those that the run has chosen; on few views it has tried none.
-    wanted = job.method(made.components)
-    wanted = replace(wanted, select=None) if made.select is None else wanted
-    for key, (before, now) in differences(made, wanted).items():
+    for key, (before, now) in differences(made, as_decided(job.method(), made)).items():
         raise InputError(
             f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --methods, "
             f"--preset or --set would make it {now}; choose another -o, or remove that run"

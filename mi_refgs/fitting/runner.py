@@ -17,7 +17,7 @@ from mi_refgs.fitting import exposure
 from mi_refgs.fitting.metal_trial import install_metal_trial
 from mi_refgs.fitting.objective import require_losses
 from mi_refgs.fitting.plan import Estimate, planned
-from mi_refgs.fitting.select import DECISIONS, install_trials, with_components
+from mi_refgs.fitting.select import DECISIONS, as_decided, install_trials, with_components
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
@@ -280,18 +280,7 @@ def _require_same(run: Run, made: Method, choice: Choice) -> None:
 
 def _require(run: Run, option: str, made: Method, now: Method) -> None:
     """Raise InputError if the method of a run is not that of an option."""
-    # Components, the image size, and what fits into the time limit have been decided for the run.
-    if made.select is None:  # too few views to try any
-        now = replace(now, select=None)
-    elif now.select is not None:
-        select, known = now.select, now.select.component
-        if {*made.components} <= {*known}:
-            now = methods.with_components(now, made.components)
-        tried = {name: one for name, one in known.items() if name in made.select.component}
-        now = replace(now, select=replace(select, component=tried))
-    if now.data.downscale is None:
-        now = now.downscaled(made.data.downscale)
-    changes = methods.differences(made, now)
+    changes = methods.differences(made, as_decided(now, made))
     for key, (before, after) in sorted(changes.items(), key=lambda item: item[0] != "name"):
         raise InputError(
             f"{run.path / 'config.toml'}: {option}: {key}: the run was started with {before}, and "

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -57,7 +57,7 @@ def branched(trainer: Trainer, method: Method) -> Trainer:
     for name, values in wanted.items():
         new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
         new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}
-    made = Trainer(method, trainer.data, state=new)
+    made = Trainer(method, trainer.data, state=new, targets=trainer.targets)
     if method.surfels.most > trainer.method.surfels.most:
         AdaptiveControl(made.setup, made.fit).fill()
     if method.mesh is not None and made.fit.occluder.empty and made.shading().traceable:
@@ -162,7 +162,7 @@ def _try(trainer: Trainer, name: str, select: Selection, judges: Dataset) -> Dec
     except InputError as error:
         return Decision(name, iteration, False, f"its fit failed: {error}")
     # A copy, so that an interrupt leaves the fit as it was before the trial.
-    plain = Trainer(method, trainer.data, state=trainer.state())
+    plain = Trainer(method, trainer.data, state=trainer.state(), targets=trainer.targets)
     without = _run(plain, component.trial, judges, trainer.release)
     gain, wanted = with_it.psnr - without.psnr, required_gain(without, with_it, select)
     stays = gain >= wanted
@@ -238,3 +238,17 @@ def with_components(method: Method, decisions: list[dict[str, Any]]) -> Method:
     return methods.with_components(
         method, [row["component"] for row in decisions if row["stays"] and row["component"] in known]
     )
+
+
+def as_decided(method: Method, made: Method) -> Method:
+    """The method with what has been decided for a run of it, which was `made`: its components, those that it
+    tries, its image size."""
+    select = method.select
+    if made.select is None:  # too few views to try any
+        method = replace(method, select=None)
+    elif select is not None:
+        if {*made.components} <= {*select.component}:
+            method = methods.with_components(method, made.components)
+        tried = {name: one for name, one in select.component.items() if name in made.select.component}
+        method = replace(method, select=replace(select, component=tried))
+    return method if method.data.downscale is not None else method.downscaled(made.data.downscale)

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs, page
 from mi_refgs.compare.jobs import Job, Shared
@@ -423,7 +424,7 @@ def test_run_that_selected_components_is_accepted(ball: Path, tmp_path: Path) ->
         "change = { surfels = { degree = { radiance_sh = 0 } } }\n"
     )
     job = jobs.plan(tmp_path / "out", [ball], [str(variant)], [0], Shared("quick", threads=1))[0]
-    chosen = job.method(["colour"])
+    chosen = methods.with_components(job.method(), ["colour"])
     job.run.create(chosen, str(ball))
     assert chosen.components == ("colour",) and chosen.surfels.degree_of("radiance_sh") == 0
     jobs.require_same(job)

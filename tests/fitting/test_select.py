@@ -17,11 +17,13 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import select
 from mi_refgs.fitting.runner import Choice, _require_same, begin
 from mi_refgs.fitting.select import branched
 from mi_refgs.fitting.state import decisions_of
+from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import LIGHT, Method, Refine
@@ -138,6 +140,22 @@ def test_component_without_its_requirement_is_not_tried(
     assert trainer.surfels.sh_degree() == 1 and LIGHT not in trainer.fit.params
     text = select.table(trainer.fit.decisions)
     assert "left out (needs specular)" in text and "+1.00 dB" in text and len(text.splitlines()) == 4
+
+
+def test_trials_share_the_images_on_the_device(
+    variant: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All views are uploaded when the fit begins, its own when trials do, all again when they end."""
+    judged(monkeypatch, [20.01, 20.0, 25.0, 20.0, 27.0, 25.0])
+    uploaded, upload = [], Target.of
+
+    def counted(view: View, background: np.ndarray) -> Target:
+        uploaded.append(view.name)
+        return upload(view, background)
+
+    monkeypatch.setattr(Target, "of", counted)
+    fitted(variant, views, tmp_path / "run")
+    assert len(uploaded) == 9 + 6 + 9
 
 
 def test_required_gain_depends_on_time_and_memory() -> None:
