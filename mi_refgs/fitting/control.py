@@ -136,7 +136,7 @@ class AdaptiveControl:
                 outside = depth_outside(surfels.raw["position"].numpy(), data.region)
                 distance = data.region.radius * (1 + np.maximum(outside, 0))
                 largest = method.surroundings.prune_extent * distance
-            error, unseen = table.error_sum.numpy(), table.unseen.numpy() >= EPOCHS * len(data.views)
+            error, unseen = table.error_sum.numpy(), table.unseen.numpy() >= EPOCHS * self.setup.epoch
             table.apply(
                 refine.densify_and_prune(
                     surfels, error, unseen, largest, options, table.max_count, keep_one=is_background

@@ -46,6 +46,9 @@ WARM, TIMED, REPEATS = 4, 4, 3
 counts."""
 SMALL_IMAGE = 256 * 256  # pixels of an image up to which it is not downscaled, unless the method says so
 LEAST = 96  # pixels of the shorter side below which no image is downscaled: smaller images show no surface
+PIXELS_PER_SURFEL = 16
+"""Pixels of an image per surfel, at the largest number of surfels, above which images are downscaled: they
+show more than the surfels can."""
 SAFETY = 0.8  # fraction of the time limit that the estimate may reach: data sets differ by as much
 GROWTH, OPEN_GROWTH = 1.0, 0.6
 """Mean time of a step relative to the synthetic data set, with alpha and without: the number of surfels
@@ -77,7 +80,7 @@ def measured(method: Method, has_alpha: bool) -> Speed:
 
 def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, float], tuple[float, float]]:
     """Seconds per step by stage; per mesh, and per view of a mesh."""
-    whole = replace(method.data, coarse=())
+    whole = replace(method.data, coarse=(), crop=None)
     still = replace(method, refine=Refine(), exposure=None, select=None, data=whole)
     trainer = Trainer(still, synthetic_data(has_alpha, size))
     every = 1 if method.light is None else method.light.every
@@ -211,16 +214,28 @@ def planned(
     if limit is None or not free:
         return method, at(factor)
 
-    # The smallest factor whose estimate keeps the limit.
+    # The smallest factor whose estimate keeps the limit, and whose pixels the surfels can show.
     most = min(width, height) // LEAST if width * height > SMALL_IMAGE else 1
+    surfels = method.surfels.most * max(_capacities(method).values(), default=1.0)
+    while factor < most and width * height > PIXELS_PER_SURFEL * surfels * factor**2:
+        factor += 1
+    shown = factor
     while at(factor).seconds > SAFETY * limit and factor < most:
         factor += 1
     chosen = at(factor)
     if factor > 1:
+        reason = (
+            f"the fit takes {minutes(limit)} at most; --set data.downscale=1 reads them whole "
+            f"({minutes(at(1).seconds)}), --minutes M gives it other time"
+        )
+        if factor == shown:
+            reason = (
+                f"{surfels:,.0f} surfels can show them; --set data.downscale=1 reads them whole "
+                f"({minutes(at(1).seconds)}), surfels.max_count gives it more surfels"
+            )
         tell(
             f"{path}: images of {width} × {height} pixels are read as {chosen.width} × {chosen.height}, so "
-            f"that the fit takes {minutes(limit)} at most; --set data.downscale=1 reads them whole "
-            f"({minutes(at(1).seconds)}), --minutes M gives it other time"
+            f"that {reason}"
         )
     if chosen.seconds > limit:
         tell(
@@ -238,15 +253,17 @@ def planned(
     return affordable.downscaled(factor), chosen
 
 
+def _capacities(method: Method) -> dict[str, float]:
+    """The factor of the number of surfels that each optional component of a method sets."""
+    components = {} if method.select is None else method.select.component
+    return {name: one.change.get("surfels", {}).get("capacity", 1.0) for name, one in components.items()}
+
+
 def _with_affordable_capacity(method: Method, fits: Callable[[float], bool]) -> Method:
     """The method without the components whose number of surfels does not fit into the time."""
     if method.select is None:
         return method
-    capacity = {
-        name: component.change.get("surfels", {}).get("capacity", 1.0)
-        for name, component in method.select.component.items()
-    }
-    slow = {name for name, factor in capacity.items() if factor > 1 and not fits(factor)}
+    slow = {name for name, factor in _capacities(method).items() if factor > 1 and not fits(factor)}
     kept = {name: one for name, one in method.select.component.items() if name not in slow}
     return replace(method, select=replace(method.select, component=kept))
 
@@ -263,34 +280,33 @@ def estimate(
     """Estimate a fit to so many images of `size`, with or without alpha, downscaled by `factor`, with
     `capacity` times the surfels."""
     width, height = size[0] // factor, size[1] // factor
-    pixels = width * height
-    steps = _steps(method, speed, pixels, method.iterations)
+    steps = _steps(method, speed, (width, height), method.iterations)
     if method.metal_trial is not None:  # the start that is not continued
-        steps += _steps(method, speed, pixels, min(method.metal_trial.until, method.iterations))
+        steps += _steps(method, speed, (width, height), min(method.metal_trial.until, method.iterations))
     meshes = 0 if method.mesh is None else method.mesh.extract.count(method.iterations)
     files = views * size[0] * size[1] * DECODING
     steps *= (GROWTH if has_alpha else OPEN_GROWTH) * CAPACITY_TIME ** math.log2(capacity)
     fused = views + (meshes - 1) * min(views, FUSED_VIEWS) if meshes else 0
     seconds = START + files + steps + meshes * speed.mesh + fused * speed.mesh_view
-    return Estimate(seconds, bytes_of(method, views, pixels), width, height)
+    return Estimate(seconds, bytes_of(method, views, (width, height)), width, height)
 
 
-def _steps(method: Method, speed: Speed, pixels: int, last: int) -> float:
-    """Seconds of the iterations up to `last`, on images of so many pixels."""
+def _steps(method: Method, speed: Speed, size: tuple[int, int], last: int) -> float:
+    """Seconds of the iterations up to `last`, on images of a width and height."""
     begin, seconds = 0, 0.0
     for name, stage in method.stages():
-        for block, count in _blocks(method, pixels, begin, min(stage.until, last)):
-            seconds += count * speed.step(name, pixels // block**2)
+        for pixels, count in _resolutions(method, size, begin, min(stage.until, last)):
+            seconds += count * speed.step(name, pixels)
         begin = stage.until
     return seconds
 
 
-def _blocks(method: Method, pixels: int, begin: int, end: int) -> list[tuple[int, int]]:
-    """Block sides of images of so many pixels in the iterations after `begin` to `end`, and how many have
-    each."""
+def _resolutions(method: Method, size: tuple[int, int], begin: int, end: int) -> list[tuple[int, int]]:
+    """Pixels that the iterations after `begin` to `end` render of images of a width and height, and how many
+    iterations render so many."""
     ends = sorted({end, *(coarse.until for coarse in method.data.coarse if begin < coarse.until < end)})
     return [
-        (method.data.block_at(last, pixels), last - first)
+        (method.data.pixels_at(last, *size), last - first)
         for first, last in pairwise([begin, *ends])
         if last > first
     ]

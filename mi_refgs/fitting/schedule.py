@@ -3,6 +3,7 @@ of parameters, lights that steps share."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,6 +12,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.optim import Group
@@ -56,6 +58,27 @@ class FitSetup:
         count = len(self.data.views)
         epoch, place = divmod(iteration - 1, count)
         return int(np.random.default_rng([self.method.seed, epoch, 1]).permutation(count)[place])
+
+    def crop(self, iteration: int, width: int, height: int) -> tuple[int, int, int, int] | None:
+        """Column, row, width and height of the part of an image that an iteration renders; None: all of it.
+
+        A rectangle drawn uniformly among those that overlap the image, then moved into it: pixels at a border
+        are seen half as often as others where a crop is half as wide as the image.
+        """
+        size = self.method.data.crop_of(width, height)
+        if size == (width, height):
+            return None
+        draws, corner = self.rng(iteration, "crop"), []
+        for side, whole in zip(size, (width, height), strict=True):
+            first = draws.integers(-(side // PATCH_EDGE), whole // PATCH_EDGE + 1)
+            corner.append(min(max(PATCH_EDGE * int(first), 0), whole - side))
+        return corner[0], corner[1], *size
+
+    @cached_property
+    def epoch(self) -> float:
+        """Steps that render each pixel of the training views once on average, at full resolution."""
+        sizes = [(view.width, view.height) for view in self.data.views]
+        return sum(math.prod(size) / math.prod(self.method.data.crop_of(*size)) for size in sizes)
 
     def sh_degree(self, iteration: int) -> int:
         """SH degree of the radiance that is in use."""

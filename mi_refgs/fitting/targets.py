@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
@@ -17,27 +19,28 @@ from mi_refgs.kernels.memory import of_fit, require
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.render.display import srgb_from_linear
 from mi_refgs.splat import Camera
-from mi_refgs.types import Bool, Float
+from mi_refgs.types import Array, Bool, Float
 
 BUDGET = 2**30  # bytes of targets that stay on the device: a thousand images of 200², or ten of 2000²
 PIXEL_BYTES = 4 * 4 + 3
 """Bytes per pixel of a target: three colours and alpha as float32, and a mask per colour."""
 
 
-def bytes_of(method: Method, views: int, pixels: int) -> float:
-    """Memory, in bytes, of a fit to so many images of so many pixels each."""
+def bytes_of(method: Method, views: int, size: tuple[int, int]) -> float:
+    """Memory, in bytes, of a fit to so many images of this width and height."""
+    pixels, rendered = math.prod(size), math.prod(method.data.crop_of(*size))
     surfels = method.surfels.most
     surfels += method.surroundings.max_count if method.surroundings is not None else 0
     images = min(views * pixels * 12, CACHE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
-    return of_fit(pixels, surfels, images)
+    return of_fit(rendered, surfels, images)
 
 
 def require_memory(method: Method, data: Dataset) -> None:
     """Raise InputError if the fit requires more memory than there is."""
-    pixels = max((view.width * view.height for view in data.views), default=0)
-    what = f"fit: images of {pixels:,} pixels, {method.surfels.most:,} surfels at most"
+    size = max(((view.width, view.height) for view in data.views), key=math.prod, default=(0, 0))
+    what = f"fit: images of {math.prod(size):,} pixels, {method.surfels.most:,} surfels at most"
     remedy = "read them smaller with --set data.downscale=N, or lower surfels.max_count"
-    require(bytes_of(method, len(data.views), pixels), what, remedy)
+    require(bytes_of(method, len(data.views), size), what, remedy)
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,19 @@ class Target:
         alpha = None if loaded.alpha is None else upload(loaded.alpha)
         clipped = None if view.is_linear_radiance else losses.saturated(image, alpha, map(float, background))
         target = Target(view.camera(), image, clipped, alpha)
+        dr.eval(target.image, target.clipped, target.alpha)
+        return target
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> Target:
+        """The part from column x and row y on."""
+        camera = self.camera.window(x, y, width, height)
+        index = camera.image_index(dr.arange(mi.UInt32, width * height))
+
+        def part(plane: Array) -> Array:
+            return None if plane is None else dr.gather(type(plane), plane, index)
+
+        clipped = None if self.clipped is None else [part(plane) for plane in self.clipped]
+        target = Target(camera, [part(plane) for plane in self.image], clipped, part(self.alpha))
         dr.eval(target.image, target.clipped, target.alpha)
         return target
 

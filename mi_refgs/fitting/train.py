@@ -305,6 +305,8 @@ class Trainer:
         fit, setup, weights = self.fit, self.setup, self.method.loss
         index = setup.view(iteration)
         target = self.targets.at(iteration, index)
+        if (part := setup.crop(iteration, target.camera.width, target.camera.height)) is not None:
+            target = target.cropped(*part)
         camera, surfels, around = target.camera, fit.surfels, fit.surroundings
 
         # Zeros whose gradient is the squared error that each surfel is responsible for: one more feature.

@@ -6,9 +6,11 @@ every window, stage and interval is scaled with it (`methods.read`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.methods.build import FLAT
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.shade.options import ShadingOptions
@@ -252,12 +254,32 @@ class DataOptions:
     background: Literal["white", "black"] = "white"
     downscale: int | None = None  # pixels of a file per pixel, along a side; absent: as the preset allows
     coarse: tuple[CoarseImages, ...] = ()
+    crop: int | None = None  # pixels that a step renders at most, of a larger image; absent: all of it
 
     def block_at(self, iteration: int, pixels: int) -> int:
         """Pixels along a side that a (1-based) iteration averages into one, in an image of so many pixels; 1:
         full resolution."""
         due = [images for images in self.coarse if iteration <= images.until and images.applies(pixels)]
         return min(due, key=lambda images: images.until).block if due else 1
+
+    def crop_of(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of the part of an image that a step renders.
+
+        The rest is whole patches of the splatter, so that crops along every border have the same kernels.
+        """
+        if self.crop is None or self.crop >= width * height:
+            return width, height
+        share = math.sqrt(self.crop / (width * height))
+        wide, high = (
+            size - PATCH_EDGE * math.ceil((1 - share) * size / PATCH_EDGE) for size in (width, height)
+        )
+        return max(wide, 1), max(high, 1)
+
+    def pixels_at(self, iteration: int, width: int, height: int) -> int:
+        """Pixels that a (1-based) iteration renders of an image."""
+        block = self.block_at(iteration, width * height)
+        wide, high = self.crop_of(width // block, height // block)
+        return wide * high
 
 
 @dataclass(frozen=True)
@@ -285,7 +307,7 @@ class Selection:
     surfels: int | None = None  # largest number before any trial, of a preset that allows more
     holdout: int = 8  # every so many training views validate
     gain: float = 0.02  # dB
-    gain_per_doubling: float = 0.5  # dB per doubling of the time per step
+    gain_per_doubling: float = 0.25  # dB per doubling of the time per step: at the end the gain is larger
     gain_per_mb: float = 0.001  # dB per MB of parameters and their moments
 
     @property

@@ -29,6 +29,7 @@ from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE
 
+LEAST_CROP = 64 * 64  # pixels; SSIM compares windows of 11 × 11
 HEIGHT = f"a multiple of 4 from {MIN_HEIGHT}"  # of an environment map
 MAX_TEXT, MAX_LINE = 2**16, 2000
 """Characters of a method and of one of its lines: a parser's time grows with the square of a dotted key."""
@@ -140,8 +141,8 @@ def load(
 def with_components(method: Method, components: Sequence[str]) -> Method:
     """A method with these of its components in place of those that it has, read from its file again.
 
-    What else differs from the file stays, unless a component changes it: the image size, the components that
-    may be tried, and changes of the `Method` in Python.
+    The image size stays, and what else differs from the file, unless a component changes its table: the
+    components that may be tried, and changes of the `Method` in Python.
     """
     if method.select is None or (*components,) == method.components:
         return method
@@ -151,7 +152,8 @@ def with_components(method: Method, components: Sequence[str]) -> Method:
     )
     names = {field.name for field in fields(Method)}
     own = {name for name in names if getattr(method, name) != getattr(then, name) == getattr(made, name)}
-    return replace(made, **{name: getattr(method, name) for name in own})
+    made = replace(made, **{name: getattr(method, name) for name in own})
+    return made.downscaled(method.data.downscale)
 
 
 def load_resolved(path: Path) -> Method:
@@ -452,6 +454,10 @@ def _require_consistent(method: Method, where: str) -> None:
         ]
     blocks = (images.block for images in method.data.coarse)
     ranges += [("data.coarse.block", block, block >= 2, "2 or more") for block in blocks]
+    if method.data.crop is not None:
+        ranges.append(
+            ("data.crop", method.data.crop, method.data.crop >= LEAST_CROP, f"{LEAST_CROP} or more")
+        )
     if light is not None:
         ranges.append(("light.height", light.height, is_height(light.height), HEIGHT))
         ranges.append(("light.every", light.every, light.every >= 1, "1 or more"))

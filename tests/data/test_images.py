@@ -372,6 +372,24 @@ def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPat
     assert lone[3] is lone[3] and lone[4] is not lone[3] and len(lone) == 5
 
 
+def test_crop_of_a_target_is_that_part_of_its_view() -> None:
+    """Pixels, masks and rays are those of the whole image; a linear one has no clipped pixels."""
+    data = ball(24, 1)
+    whole = Targets(data, DataOptions())[0]
+    part = whole.cropped(8, 16, 10, 5)
+    rows = (slice(16, 21), slice(8, 18))
+    assert whole.alpha is not None and part.alpha is not None and whole.clipped is not None
+    assert part.clipped is not None and (part.camera.width, part.camera.height) == (10, 5)
+    pairs = [*zip(whole.image, part.image, strict=True), *zip(whole.clipped, part.clipped, strict=True)]
+    for one, other in [*pairs, (whole.alpha, part.alpha)]:
+        expected = np.array(one).reshape(24, 24)[rows]
+        np.testing.assert_array_equal(np.array(other).reshape(5, 10), expected)
+    rays = np.array(whole.camera.rays()).T.reshape(24, 24, 3)[rows]
+    np.testing.assert_allclose(np.array(part.camera.rays()).T.reshape(5, 10, 3), rays, atol=1e-6)
+    linear = dataclasses.replace(whole, clipped=None, alpha=None).cropped(0, 0, 8, 8)
+    assert linear.clipped is None and linear.alpha is None
+
+
 def test_view_is_decoded_only_by_load(tmp_path: Path, rng: np.random.Generator, decoded: list[str]) -> None:
     """`image` and `alpha` of a view that is not loaded raise; `has_alpha` is from the header."""
     data = photographs(tmp_path / "data", rng)

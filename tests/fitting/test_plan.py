@@ -6,6 +6,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -51,6 +52,11 @@ def test_estimate_is_sum_of_stages(method: Method) -> None:
     partly = plan.estimate(dataclasses.replace(method, data=coarse), SPEED, 7, (20, 20), 1)
     assert partly.seconds == pytest.approx(others + 7 * 400 * plan.DECODING + 8 * 1 + 4 * 2 + 18 * 10)
     assert whole.bytes - found.bytes == pytest.approx(300 * (memory.PER_PIXEL + 7 * (12 + 19)))
+    crop = dataclasses.replace(method, data=DataOptions(coarse=(CoarseImages(6, 2),), crop=200))
+    part = plan.estimate(crop, SPEED, 7, (20, 20), 1)
+    assert part.seconds == pytest.approx(
+        others + 7 * 400 * plan.DECODING + 6 * 1 + 2 * (119 / 75) + 22 * 2 * (119 / 75)
+    )
     around = dataclasses.replace(method, surroundings=SurroundingsOptions(max_count=50))
     more = plan.estimate(around, SPEED, 7, (20, 20), 1).bytes - whole.bytes
     assert more == pytest.approx(50 * memory.PER_SURFEL)
@@ -95,6 +101,31 @@ def test_largest_images_within_time_limit_are_chosen(
     monkeypatch.setattr(plan, "speed_of", lambda *_: pytest.fail("measured"))
     small, nothing = plan.planned(method, data, 1.0)
     assert nothing is None and small.data.downscale == 1
+
+
+def test_images_are_no_larger_than_the_surfels_can_show(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """20 × 20 pixels need 25 surfels, those of optional components included; a size that is given stays."""
+    data = write_data(tmp_path / "data", truth=False)
+    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "SMALL_IMAGE": 399, "LEAST": 5}.items():
+        monkeypatch.setattr(plan, name, value)
+
+    def chosen(surfels: int, capacity: float = 1.0, **data_options: Any) -> tuple[int | None, list[str]]:
+        tried = {"more": MethodComponent(1, 1, {"surfels": {"capacity": capacity}})}
+        wanted = dataclasses.replace(
+            method,
+            select=Selection(tried),
+            surfels=dataclasses.replace(method.surfels, max_count=surfels),
+            data=DataOptions(**data_options),
+        )
+        said: list[str] = []
+        return plan.planned(wanted, data, 1e6, said.append)[0].data.downscale, said
+
+    assert chosen(25) == (1, []) and chosen(13, capacity=2.0) == (1, [])
+    factor, said = chosen(24)
+    assert factor == 2 and "read as 10 × 10, so that 24 surfels can show them" in said[0]
+    assert chosen(24, downscale=1) == (1, [])
 
 
 def test_surfels_beyond_the_time_limit_are_not_tried(

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import train
-from mi_refgs.fitting.control import AdaptiveControl
+from mi_refgs.fitting import refine, train
+from mi_refgs.fitting.control import EPOCHS, AdaptiveControl
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
@@ -48,8 +49,11 @@ def test_loss_falls_and_everything_trains(method: Method) -> None:
 
 
 def with_deferred(method: Method, options: dict[str, Any]) -> Method:
-    """The method with these options of its second stage."""
-    deferred = method.stage["deferred"]
+    """The method with these options of its second stage, and with a `crop` of its images."""
+    options, deferred = dict(options), method.stage["deferred"]
+    method = dataclasses.replace(
+        method, data=dataclasses.replace(method.data, crop=options.pop("crop", None))
+    )
     own = {name: value for name, value in options.items() if name == "samples"}
     shading = dataclasses.replace(deferred.shading, **{n: x for n, x in options.items() if n not in own})
     deferred = dataclasses.replace(deferred, shading=shading, **own)
@@ -62,6 +66,7 @@ def with_deferred(method: Method, options: dict[str, Any]) -> Method:
         ({}, set()),
         ({"diffuse": "irradiance", "ambient_rays": 5}, {"mesh/ambient"}),
         ({"traced_bounces": 2, "samples": 4}, {"mesh/surfels", "mesh/weights", "mesh/normals"}),
+        ({"crop": 12 * 12}, set()),
     ],
 )
 def test_resume_repeats_straight_run_bit_for_bit(
@@ -144,6 +149,64 @@ def test_statistics_distribute_the_squared_error_over_surfels(
     total = float(dr.sum(errors[0] * dr.detach(frames[0].alpha))[0])
     assert total > 0 and found.sum() == pytest.approx(total, rel=1e-4)
     assert ((found > 0) == (trainer.fit.tables[0].unseen.numpy() == 0)).all()
+
+
+def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
+    method: Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a step on the whole image that weighs the pixels of the crop alone."""
+    only = {"only": dataclasses.replace(method.stage["deferred"], until=30)}
+    plain = dataclasses.replace(method, stage=only, mesh=None, data=DataOptions(), loss={})
+    cropped = Trainer(dataclasses.replace(plain, data=DataOptions(crop=12 * 12)), ball())
+    column, row, width, height = cropped.setup.crop(1, SIZE, SIZE) or (0, 0, SIZE, SIZE)
+    assert width == height == 8
+    place = np.zeros((SIZE, SIZE), np.float32)
+    place[row : row + height, column : column + width] = SIZE**2 / (width * height)
+    weight, measure = mi.Float(place.ravel()), train.objective
+
+    def of_part(inputs: Any, *others: Any) -> Any:
+        _, error = measure(inputs, *others)
+        difference = (dr.abs(a - b) for a, b in zip(inputs.image, inputs.target.image, strict=True))
+        return dr.mean(weight * sum(difference)) / 3, error
+
+    losses, gradients = [], []
+    for trainer, loss in ((cropped, measure), (Trainer(plain, ball()), of_part)):
+        monkeypatch.setattr(train, "objective", loss)
+        monkeypatch.setattr(
+            trainer.fit.optimiser,
+            "step",
+            lambda *_, trainer=trainer: gradients.append(
+                {name: dr.grad(tensor).numpy() for name, tensor in trainer.fit.params.items()}
+            ),
+        )
+        trainer.step()
+        losses.append(float(trainer.loss[0]))
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    for name, found in gradients[0].items():
+        largest = np.abs(gradients[1][name]).max()
+        np.testing.assert_allclose(found, gradients[1][name], atol=2e-5 * largest, err_msg=name)
+    assert np.abs(gradients[0]["position"]).max() > 0
+
+
+def test_what_crops_have_not_shown_for_an_epoch_stays(
+    method: Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The epochs after which unseen surfels are removed are those of crops: a ninth of the pixels per step."""
+    trainer = Trainer(dataclasses.replace(method, data=DataOptions(crop=12 * 12)), ball())
+    whole, found = EPOCHS * len(trainer.data.views), []
+    assert trainer.setup.epoch == 9 * len(trainer.data.views)
+
+    def prune(surfels: Any, error: Any, unseen: np.ndarray, *others: Any, **options: Any) -> Any:
+        found.append(unseen.copy())
+        return densify(surfels, error, np.zeros_like(unseen), *others, **options)
+
+    densify = refine.densify_and_prune
+    monkeypatch.setattr(refine, "densify_and_prune", prune)
+    table = trainer.fit.tables[0]
+    for steps in (whole, 9 * whole - 1, 9 * whole):
+        table.unseen = dr.opaque(mi.Float, steps, table.surfels.count)
+        AdaptiveControl(trainer.setup, trainer.fit).refine(12)
+    assert [unseen.any() for unseen in found] == [False, False, True] and found[2].all()
 
 
 def send_in_iteration_7(monkeypatch: pytest.MonkeyPatch, *numbers: signal.Signals) -> list[int]:
@@ -267,7 +330,8 @@ def test_folder_that_cannot_be_written_is_refused_before_first_step(
 
 
 @pytest.mark.parametrize(
-    "options, most", [({}, 80), ({"traced_bounces": 1, "samples": 4, "antialias": True}, 100)]
+    "options, most",
+    [({}, 80), ({"crop": 12 * 12}, 80), ({"traced_bounces": 1, "samples": 4, "antialias": True}, 100)],
 )
 def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: Method) -> None:
     trainer = Trainer(dataclasses.replace(with_deferred(method, options), refine=methods.Refine()), ball())

@@ -245,6 +245,7 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
             ["refine: reset", "'every' above 0"],
         ),
         (f"{STAGE}[data]\ncoarse = [{{until = 5, block = 1}}]", ["data.coarse.block: 1", "2 or more"]),
+        (f"{STAGE}[data]\ncrop = 4000", ["data.crop: 4000", "4096 or more"]),
         (
             f"{STAGE}[surfels]\nchannels = ['albedo']\nattributes = ['tint']",
             ["surfels.channels: is called surfels.attributes now", "remove surfels.channels"],
@@ -478,6 +479,7 @@ def test_components_keep_what_python_changed() -> None:
     alone = methods.with_components(more, ["colour_alone"])
     assert alone.seed == 5 and alone.surfels.capacity == 1 and alone.light is None
     assert alone.rates == methods.load("auto", "quick", [], ["colour_alone"]).rates
+    assert alone.data.downscale == 3 and alone.data.coarse != own.data.coarse
     assert methods.with_components(alone, []) == dataclasses.replace(own, rates=methods.load("auto").rates)
 
 

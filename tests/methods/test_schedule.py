@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mi_refgs import fitting
+from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.fitting.schedule import FitSetup
-from mi_refgs.methods.method import LightOptions, Method, Stage, SurfelOptions
+from mi_refgs.methods.method import DataOptions, LightOptions, Method, Stage, SurfelOptions
 from mi_refgs.methods.window import Window
 from tests.scenes.highlight import ball
 
@@ -21,6 +23,10 @@ def schedule(seed: int = 0) -> FitSetup:
     surfels = SurfelOptions(degree={"radiance_sh": 2}, sh_raise=Window(start=10, until=100, every=10))
     method = Method(iterations=100, stage={"all": Stage(until=100)}, surfels=surfels, seed=seed)
     return FitSetup(method, DATA)
+
+
+def cropped(pixels: int) -> FitSetup:
+    return FitSetup(replace(schedule().method, data=DataOptions(crop=pixels)), DATA)
 
 
 def test_views_come_once_an_epoch_in_an_order_of_its_own() -> None:
@@ -50,6 +56,34 @@ def test_every_operation_of_an_iteration_draws_on_its_own() -> None:
     ]
     names = [name.value for name in calls if isinstance(name, ast.Constant)]
     assert len(names) == len(calls) == len(set(names)) >= 6
+
+
+@pytest.mark.parametrize("size", [(100, 80), (64, 64), (37, 201)])
+def test_crops_cover_an_image_with_its_border(size: tuple[int, int]) -> None:
+    """They begin at whole patches, contain no more than `crop` pixels, and reach every border."""
+    setup = cropped(1_800)
+    parts = [setup.crop(iteration, *size) for iteration in range(400)]
+    assert parts == [setup.crop(iteration, *size) for iteration in range(400)]
+    seen = np.zeros(size[::-1])
+    for part in parts:
+        assert part is not None
+        x, y, width, height = part
+        assert x % PATCH_EDGE == y % PATCH_EDGE == 0 and (size[0] - width) % PATCH_EDGE == 0
+        assert x + width <= size[0] and y + height <= size[1] and 900 < width * height <= 1_800
+        seen[y : y + height, x : x + width] += 1
+    assert seen.min() > 0.05 * seen.max()
+    assert len({*parts}) > 10
+
+
+def test_small_images_are_not_cropped() -> None:
+    assert schedule().crop(1, 1000, 1000) is None and cropped(1_800).crop(1, 45, 40) is None
+    assert schedule().epoch == 7
+
+
+def test_an_epoch_of_crops_is_longer() -> None:
+    """7 images of 64 × 64 pixels, 40 × 40 of them a step."""
+    setup = FitSetup(cropped(1_800).method, ball(size=64, views=7))
+    assert setup.epoch == pytest.approx(7 * 64**2 / 40**2)
 
 
 @pytest.mark.parametrize(
