@@ -191,7 +191,7 @@ def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
 def test_what_crops_have_not_shown_for_an_epoch_stays(
     method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The epochs after which unseen surfels are removed are those of crops: a ninth of the pixels per step."""
+    """The epochs after which unseen surfels are removed are those of crops: a ninth of the pixels each."""
     trainer = Trainer(dataclasses.replace(method, data=DataOptions(crop=12 * 12)), ball())
     whole, found = EPOCHS * len(trainer.data.views), []
     assert trainer.setup.epoch == 9 * len(trainer.data.views)
