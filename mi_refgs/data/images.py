@@ -35,6 +35,7 @@ CACHE_BYTES = 2**30
 photographs of 12 Mpx would need 11 GB."""
 BAND = 256
 """Rows of a file that are converted to floating point at a time; a large image would need half a gigabyte."""
+IMAGES, MASKS = "images", "masks"  # names of folders
 COPIES = (8, 4, 2)  # factors of the smaller copies of images, in `images_8` and so on
 
 
@@ -253,14 +254,14 @@ class ImageFolders:
 
         Raises InputError if there is no folder of images.
         """
-        names = {**{k: f"images_{k}" for k in COPIES}, 1: "images"}
+        names = {**{k: f"{IMAGES}_{k}" for k in COPIES}, 1: IMAGES}
         found = {k: root / name for k, name in names.items() if (root / name).is_dir()}
         if not found and flat and any(map(_is_image, root.iterdir())):
             found[1] = root
         if not found:
             raise InputError(f"{root}: images: no such folder; put the images there")
         folders = {k // min(found): folder for k, folder in found.items()}
-        return cls(root, folders, root / "masks" if (root / "masks").is_dir() else None)
+        return cls(root, folders, root / MASKS if (root / MASKS).is_dir() else None)
 
     def names(self) -> list[str]:
         """Sorted paths of the largest images relative to their folder, those in subfolders included."""
@@ -287,19 +288,20 @@ class ImageFolders:
         return None
 
     def mask(self, name: str) -> Mask | None:
-        """The mask of an image: `a.jpg.png`, `a.jpg` or `a.png` of `a.jpg`; None without a folder of masks.
+        """The mask of an image; None without a folder of masks. Raises InputError as `mask_in`."""
+        return None if self.masks is None else mask_in(self.masks, name)
 
-        Raises InputError if there is none although others have one.
-        """
-        if self.masks is None:
-            return None
-        for candidate in (f"{name}.png", name, str(Path(name).with_suffix(".png"))):
-            file = inside(self.masks, candidate)
-            if file is not None and is_file(file):
-                return Mask(file)
-        raise InputError(
-            f"{self.masks / (name + '.png')}: mask: missing; add it, or remove the folder of masks"
-        )
+
+def mask_in(folder: Path, name: str) -> Mask:
+    """The mask of an image in a folder of masks: `a.jpg.png`, `a.jpg` or `a.png` of `a.jpg`.
+
+    Raises InputError if there is none although others have one.
+    """
+    for candidate in (f"{name}.png", name, str(Path(name).with_suffix(".png"))):
+        file = inside(folder, candidate)
+        if file is not None and is_file(file):
+            return Mask(file)
+    raise InputError(f"{folder / (name + '.png')}: mask: missing; add it, or remove the folder of masks")
 
 
 def _is_image(path: Path) -> bool:

@@ -7,9 +7,10 @@ world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world), `depth
 axis), `albedo_path` (R, G, B, A), `roughness_path` and `metallic_path` (Y, A; A: defined there) as
 `synthesis.make_dataset` writes them. Shiny Blender's maps beside the images are found by their names.
 
-nerfstudio's `mask_path` (bright: object) becomes alpha; `ply_file_path` names points in the frame of the
-poses: `applied_transform` is applied to both. `train_filenames` and `test_filenames` (or `val_filenames`)
-list the images of a split.
+nerfstudio's `mask_path` (bright: object) becomes alpha; without it, and without alpha, the file of the
+image's name in the folder `masks`. `ply_file_path` names points in the frame of the poses:
+`applied_transform` is applied to both. `train_filenames` and `test_filenames` (or `val_filenames`) list the
+images of a split.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
 from mi_refgs.data.ground_truth import ALPHA, beside, block_mean, shiny_blender_maps, unit
-from mi_refgs.data.images import ImageFile, Mask
+from mi_refgs.data.images import IMAGES, MASKS, ImageFile, Mask, mask_in
 from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
@@ -244,8 +245,7 @@ def _view(frame: Frame, options: ReadOptions) -> View:
     """The view of a frame, with its ground truth."""
     file = _image(frame, options.images)
     image = ImageFile.of(file, options.downscale)
-    mask = frame.path("mask_path") or (None if image.has_alpha() else beside(file, ALPHA))
-    image = replace(image, mask=None if mask is None else Mask(mask))
+    image = replace(image, mask=_mask(frame, image))
     view, straight = make_view(
         image,
         options,
@@ -270,6 +270,19 @@ def _view(frame: Frame, options: ReadOptions) -> View:
         normal = None if normal is None else unit(normal)
         depth = None if depth is None else depth[..., 0]
     return replace(view, normal=normal, depth=depth, materials=maps)
+
+
+def _mask(frame: Frame, image: ImageFile) -> Mask | None:
+    """The mask of an image: the frame's, or without alpha a file beside the image, or one of `masks`."""
+    file, masks = image.path, frame.file.parent / MASKS
+    named = frame.path("mask_path") or (None if image.has_alpha() else beside(file, ALPHA))
+    if named is not None:
+        return Mask(named)
+    if image.has_alpha() or not masks.is_dir():
+        return None
+    name = file.relative_to(frame.file.parent)
+    below = name.relative_to(name.parts[0]) if name.parts[0].startswith(IMAGES) else name
+    return mask_in(masks, str(below))
 
 
 def _image(frame: Frame, images: str) -> Path:

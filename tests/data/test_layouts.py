@@ -123,6 +123,36 @@ def test_masks_become_alpha(write: Callable[[Path], Path], tmp_path: Path) -> No
     refused(lambda: read_dataset(data, "train"), "masks/b.png", "missing")
 
 
+@pytest.mark.parametrize("images", ["images", "images_4", "train"])
+def test_masks_beside_transforms_become_alpha(images: str, tmp_path: Path) -> None:
+    """By the path of the image, without its folder if that is one of `images`; `mask_path` comes first."""
+    data = write_nerfstudio(tmp_path)
+    (data / "images").rename(data / images)
+    change_transforms(
+        data,
+        lambda made: [f.update(file_path=f"{images}/{Path(f['file_path']).name}") for f in made["frames"]],
+    )
+    masks = data / "masks" / ("train" if images == "train" else "")
+    masks.mkdir(parents=True)
+    for i, shot in enumerate(SHOTS):
+        mask = np.zeros((72, 96, 3))
+        mask[: 8 * i] = 1
+        write_png(masks / shot.name, mask)
+
+    def rows() -> dict[str, int]:
+        views = [view.load() for view in read_dataset(data, "train").views]
+        return {Path(view.name).name: int(np.all(np.equal(view.alpha, 1), axis=1).sum()) for view in views}
+
+    wanted = {Path(shot.name).stem: 8 * i for i, shot in enumerate(SHOTS)}
+    assert rows() == {name: wanted[name] for name in rows()}
+    named = str((masks / "c.png").relative_to(data))
+    change_transforms(data, lambda made: [f.update(mask_path=named) for f in made["frames"]])
+    assert {*rows().values()} == {16}
+    change_transforms(data, lambda made: [f.pop("mask_path") for f in made["frames"]])
+    (masks / "b.png").unlink()
+    refused(lambda: read_dataset(data, "train"), "b.png.png: mask: missing", "remove the folder")
+
+
 # ---------------- Shiny Blender ----------------
 
 
