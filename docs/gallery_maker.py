@@ -22,7 +22,7 @@ from mi_refgs import __version__, methods
 from mi_refgs.editing.options import EditOptions
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import evaluate as evaluation
-from mi_refgs.evaluation.images import contact_sheet
+from mi_refgs.evaluation.images import contact_sheet, displayed_over
 from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
 from mi_refgs.io.images import read_png, to_8_bits
 from mi_refgs.io.ownership import OutputFolder
@@ -32,7 +32,6 @@ from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.reconstruction import Reconstruction
 from mi_refgs.relighting import relight as relighting
-from mi_refgs.relighting.score import displayed_over
 from mi_refgs.runs.run import Run
 from mi_refgs.synthesis.make_dataset import make_dataset
 

@@ -23,12 +23,11 @@ import numpy as np
 
 from benchmarks.common.report import plain_parser
 from benchmarks.interchange.programs import validated
-from mi_refgs.evaluation.images import image_array
+from mi_refgs.evaluation.images import displayed_over, image_array
 from mi_refgs.evaluation.metrics import psnr
 from mi_refgs.formats import write
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.reconstruction.provenance import Provenance
-from mi_refgs.relighting.score import displayed_over
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene

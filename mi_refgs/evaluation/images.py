@@ -37,6 +37,17 @@ def image_array(array: Array, height: int, width: int) -> np.ndarray:
     return np.broadcast_to(values, height * width).reshape(height, width)
 
 
+def displayed_over(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
+    """Display-encode premultiplied linear RGBA (H, W, 4), scaled, over an encoded background: (H, W, 3)."""
+    alpha = np.clip(rgba[..., 3:], 0, 1)
+    return encoded_over_black(rgba[..., :3] * scale, alpha) + (1 - alpha) * background
+
+
+def encoded_over_black(radiance: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Display-encode premultiplied radiance over black."""
+    return alpha * np.clip(srgb_from_linear(np.maximum(radiance, 0) / np.maximum(alpha, 1e-6)), 0, 1)
+
+
 @dataclass(frozen=True, eq=False)
 class RenderedView:
     """A rendered view as NumPy arrays."""

@@ -1,4 +1,4 @@
-"""Metrics of images, normals and fitted environment maps, in NumPy; and the time of a frame.
+"""Metrics of images, normals, shapes and fitted environment maps, in NumPy; and the time of a frame.
 
 Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the
 mean over its images. Normals are (H, W, 3) world vectors. Environment maps are (h, w, 3) linear lat-long
@@ -14,10 +14,12 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from scipy.ndimage import correlate1d
+from scipy.spatial import cKDTree
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.ssim import WINDOW_RADIUS, WINDOW_SIGMA
+from mi_refgs.fitting.ssim import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
 from mi_refgs.io.images import psnr_of, srgb_from_linear
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
@@ -44,45 +46,56 @@ def psnr(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
     return psnr_of(float(np.mean((image - truth)[where] ** 2)))
 
 
-def ssim(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
+def ssim(
+    image: np.ndarray,  # (H, W, 3)
+    truth: np.ndarray,  # (H, W, 3)
+    where: Any = ...,
+    radius: int = WINDOW_RADIUS,
+    border: str = "constant",
+) -> float:
     """Compute the structural similarity that the loss uses (`fitting.ssim`); `where` as in `psnr`.
 
-    scikit-image reflects at the border and leaves it out of the mean; padding by the window's radius with
-    zeros turns that into the zero padding and the mean over every pixel that 3DGS and Ref-Gaussian report.
+    The Gaussian window has 2 radius + 1 pixels on a side. Outside of the image it reads zeros, as in 3DGS and
+    Ref-Gaussian, or with the border "mirror" the mirrored image; means are over every pixel.
     """
-    from skimage.metrics import structural_similarity
+    weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / WINDOW_SIGMA) ** 2)
+    weights /= weights.sum()
 
-    border = ((WINDOW_RADIUS, WINDOW_RADIUS), (WINDOW_RADIUS, WINDOW_RADIUS), (0, 0))
-    image, truth = (np.pad(array, border) for array in _pair(image, truth))
-    window = {"win_size": 2 * WINDOW_RADIUS + 1, "gaussian_weights": True, "sigma": WINDOW_SIGMA}
-    options = {"use_sample_covariance": False, "data_range": 1.0, "channel_axis": -1, "full": True}
-    _, similar = structural_similarity(image, truth, **window, **options)
-    whole = slice(WINDOW_RADIUS, -WINDOW_RADIUS)
-    return float(similar[whole, whole][where].mean())
+    def blur(values: np.ndarray) -> np.ndarray:
+        return correlate1d(correlate1d(values, weights, 0, mode=border), weights, 1, mode=border)
+
+    x, y = _pair(image, truth)
+    μx, μy = blur(x), blur(y)
+    product, square = blur(x * y) - μx * μy, blur(x * x + y * y) - μx**2 - μy**2
+    similar = (2 * μx * μy + C1) * (2 * product + C2) / ((μx**2 + μy**2 + C1) * (square + C2))
+    return float(similar[where].mean())
 
 
-def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
-    """Return (LPIPS with AlexNet, ""), or (None, reason) without the extra `lpips` or its weights."""
+def lpips(image: np.ndarray, truth: np.ndarray, network: str = "alex") -> tuple[float | None, str]:
+    """Return (LPIPS, ""), or (None, reason) without the extra `lpips` or its weights.
+
+    The network is "alex" or "vgg".
+    """
     try:
         import torch
 
-        network = _lpips_network()
+        measure = _lpips_network(network)
         with torch.no_grad():
             planes = [array.transpose(2, 0, 1)[None] for array in _pair(image, truth)]
             tensors = [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)) * 2 - 1 for p in planes]
-            return float(network(*tensors)), ""
+            return float(measure(*tensors)), ""
     except ImportError:
         return None, "not installed: pip install 'mi_refgs[lpips]'"
     except (OSError, RuntimeError) as error:  # the weights are fetched at first use
         return None, f"cannot run: {error}"
 
 
-@functools.lru_cache(maxsize=1)
-def _lpips_network() -> Any:
+@functools.lru_cache(maxsize=2)
+def _lpips_network(name: str) -> Any:
     import lpips as package
 
-    # The network that its authors recommend for comparing images ("forward" scores).
-    return package.LPIPS(net="alex", verbose=False).eval()
+    # The authors recommend "alex" for comparing images ("forward" scores).
+    return package.LPIPS(net=name, verbose=False).eval()
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
@@ -136,6 +149,36 @@ def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
     cosine = np.sum(normal * truth, axis=-1)
     sine = np.linalg.norm(np.cross(normal, truth), axis=-1)
     return np.where((cosine == 0) & (sine == 0), 90.0, np.degrees(np.arctan2(sine, cosine)))
+
+
+# ---------------- shape ----------------
+
+
+def depth_si_mse(
+    depths: Sequence[np.ndarray],  # (P,) inside of the mask of each view
+    truth: Sequence[np.ndarray],  # (P,)
+    sizes: Sequence[int],  # pixels of each frame
+) -> float:
+    """Compute the scale-invariant squared error of depths along the viewing axis, in scene units², times 10³.
+
+    One scale Σ gt·pred / Σ pred² for all views; the error of a view is its sum inside of the mask over the
+    pixels of the frame, and the result the mean over views. [Stanford-ORB, Kuang et al. 2023]
+    """
+    ours, true = (np.concatenate(parts).astype(np.float64) for parts in (depths, truth))
+    scale = np.sum(ours * true) / max(np.sum(ours**2), 1e-30)
+    errors = (np.sum((scale * a.astype(np.float64) - b) ** 2) for a, b in zip(depths, truth, strict=True))
+    return 1e3 * float(np.mean([error / size for error, size in zip(errors, sizes, strict=True)]))
+
+
+def squared_chamfer(points: np.ndarray, truth: np.ndarray) -> float:
+    """Compute the squared Chamfer distance of points (P, 3) and (Q, 3), in scene units², times 10³.
+
+    It is the sum of the mean squared distances to the nearest point in both directions, as in the tables of
+    Stanford-ORB: 2 · 10³ times the mean of the two that its program computes. That program compares points on
+    the mesh with the vertices of the scan.
+    """
+    both = (points, truth), (truth, points)
+    return 1e3 * sum(float(np.mean(cKDTree(a).query(b)[0] ** 2)) for a, b in both)
 
 
 # ---------------- light ----------------

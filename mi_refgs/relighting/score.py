@@ -13,17 +13,11 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from mi_refgs.evaluation import metrics
-from mi_refgs.io.images import srgb_from_linear
+from mi_refgs.evaluation.images import displayed_over, encoded_over_black
 
 SCALE_REACH = 2.0  # stops around the ratio of the means within which the scale is searched
 INSIDE = 0.99  # alpha from which a pixel is inside the object: the coverage of edges does not depend on light
 SCALE_PIXELS = 200_000  # maximum number of pixels that the scale is fitted to
-
-
-def displayed_over(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
-    """Display-encode premultiplied linear RGBA (H, W, 4), scaled, over an encoded background: (H, W, 3)."""
-    alpha = np.clip(rgba[..., 3:], 0, 1)
-    return _encoded(rgba[..., :3] * scale, alpha) + (1 - alpha) * background
 
 
 def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
@@ -38,22 +32,17 @@ def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.
     a, b = a[chosen], b[chosen]
     scale = np.ones(3)
     for c in range(3):
-        goal, mean = _encoded(b[:, c], b[:, 3]), (a[:, c].sum(), b[:, c].sum())
+        goal, mean = encoded_over_black(b[:, c], b[:, 3]), (a[:, c].sum(), b[:, c].sum())
         if min(mean) <= 0:
             continue
 
         def error(stops: float, c: int = c, goal: np.ndarray = goal) -> float:
-            return float(np.mean((_encoded(a[:, c] * 2**stops, a[:, 3]) - goal) ** 2))
+            return float(np.mean((encoded_over_black(a[:, c] * 2**stops, a[:, 3]) - goal) ** 2))
 
         middle = float(np.log2(mean[1] / mean[0]))
         found = minimize_scalar(error, bounds=(middle - SCALE_REACH, middle + SCALE_REACH))
         scale[c] = 2.0 ** min((0.0, middle, float(found.x)), key=error)
     return scale
-
-
-def _encoded(radiance: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Display-encode premultiplied radiance over black."""
-    return alpha * np.clip(srgb_from_linear(np.maximum(radiance, 0) / np.maximum(alpha, 1e-6)), 0, 1)
 
 
 def score(
