@@ -20,7 +20,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics
 from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
-from mi_refgs.evaluation.surface import TrueSurface, surface_scores
+from mi_refgs.evaluation.protocols import Maps, ProtocolScores, captions, measures_of
+from mi_refgs.evaluation.scores import MAP_SCORES
+from mi_refgs.evaluation.surface import TrueSurface, sample, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
@@ -39,11 +41,18 @@ DECOMPOSITION = "decomposition.png"
 METRICS = "metrics.json"
 LONGEST_STEM = 60  # characters of the view's name in an image's file name; file systems allow 255 bytes
 SHEET_VIEWS = 4  # rows of either sheet, spread evenly over the test views
+CHAMFER_POINTS = 30_000  # on each surface, as Stanford-ORB samples
 MEANS = """psnr psnr_gain ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
     normal_mae_deg_full""".split()  # scores of views whose means are reported
 
 
-def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples: int = 1) -> dict[str, Any]:
+def evaluate(
+    run: Run,
+    data: Path | None = None,
+    progress: bool = False,
+    samples: int = 1,
+    protocol: str = "ours",
+) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
@@ -64,15 +73,18 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     `ms_per_frame`                 median over single synchronised frames of the displayed image without AOVs,
                                    with the environment map prefiltered beforehand
     `pruned`                       null for a scene that was not pruned
+    `protocols`                    scale, mask and frame of these numbers (`ours`), and the same with the
+                                   numbers of a benchmark if `protocol` names one (`evaluation.protocols`)
 
     Renders have `samples` per pixel, box filtered (`render.samples`).
 
     Raises InputError for a folder that is no run or contains neither a scene nor a checkpoint, for data
-    that is gone, and for a foreign file in the run that has the name of a result.
+    that is gone, for a foreign file in the run that has the name of a result, and as `measures_of` does.
     """
     # The scene, its test views, and the files to write.
     method = run.method()
     views = views_of_run(run, method, "test", data)
+    measures = measures_of(protocol, views)
     renders = render_names(views.views)
     outputs = [*renders, SHEET, DECOMPOSITION, METRICS]
     run.output.require_free(outputs)
@@ -82,7 +94,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
 
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
-    measured = _measure(fitted, views, surface, samples, [run.path / name for name in renders], progress)
+    measured = Measured(benchmark=None if measures is None else ProtocolScores(measures))
+    _measure(measured, fitted, views, surface, samples, [run.path / name for name in renders], progress)
 
     # The numbers.
     light_scores, footer = _light(fitted, views)
@@ -93,6 +106,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
         | measured.budget.result()
         | surface_scores(fitted.mesh, surface, views.views)
     )
+    result |= _protocols(protocol, measured.benchmark, fitted, surface, views)
     cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
     result |= {
         "exposure": _exposure(run),
@@ -132,18 +146,20 @@ class Measured:
     per_view: list[dict[str, Any]] = field(default_factory=list)
     errors: decomposition.Decomposition = field(default_factory=decomposition.Decomposition)
     budget: ErrorBudget = field(default_factory=ErrorBudget)
+    benchmark: ProtocolScores | None = None
     panels: list[dict[str, np.ndarray]] = field(default_factory=list)  # rows of SHEET
     materials: list[decomposition.MeasuredView] = field(default_factory=list)  # rows of DECOMPOSITION
 
 
 def _measure(
+    measured: Measured,  # filled in
     fitted: TrainedScene,
     views: Dataset,
     surface: TrueSurface | None,
     samples: int,
     images: Sequence[Path],  # one per view
     progress: bool,
-) -> Measured:
+) -> None:
     """Render and measure the test views one by one, and write their images."""
     render = fitted.renderer(samples=samples)
     object_only = None
@@ -151,7 +167,6 @@ def _measure(
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     material_maps = decomposition.material_maps(fitted, samples)
     in_sheets = evenly_spread(len(views.views), SHEET_VIEWS)
-    measured = Measured()
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
@@ -169,6 +184,9 @@ def _measure(
         )
         measured.errors.add(materials)
         measured.budget.add(rendered, view, classify(view, surface))
+        if measured.benchmark is not None:
+            ours = Maps.rendered(frame, rendered.normal, materials.maps.get("albedo"))
+            measured.benchmark.add(ours, Maps.true(view, views.background))
 
         # Images.
         write_png(images[index], rendered.image)
@@ -178,7 +196,24 @@ def _measure(
                 row["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
             measured.panels.append(row)
             measured.materials.append(materials)
-    return measured
+
+
+def _protocols(
+    name: str,
+    benchmark: ProtocolScores | None,
+    fitted: TrainedScene,
+    surface: TrueSurface | None,
+    views: Dataset,
+) -> dict[str, Any]:
+    """Return `protocols`, and why depth is missing."""
+    found = captions(name, [views.views[0].width, views.views[0].height])
+    known = any(view.depth is not None for view in views.views)
+    if benchmark is not None:
+        found[name] |= dict.fromkeys(score.key for score in MAP_SCORES) | benchmark.result()
+        if surface is not None and fitted.mesh is not None and len(fitted.mesh.faces):
+            points = (sample(mesh, CHAMFER_POINTS)[0] for mesh in (fitted.mesh, surface.mesh))
+            found[name]["chamfer"] = metrics.squared_chamfer(*points)
+    return {"protocols": found, "depth_reason": None if known else "the data set has no ground-truth depth"}
 
 
 def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:

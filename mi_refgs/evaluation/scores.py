@@ -46,6 +46,24 @@ SCORES = (
     Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True, higher=False),
 )
 
+MAP_SCORES = (
+    Score("normal_cosine", "normal error, 1 − cos", "{:.4f}", "", "normal"),
+    Score("normal_deg", "normal error", "{:.2f}", "°", "normal"),
+    Score("depth_si_mse", "depth, SI-MSE × 10³", "{:.4f}", " units²", "depth"),
+    Score("chamfer", "Chamfer, squared × 10³", "{:.4f}", " units²", "surface"),
+    Score("albedo_psnr", "albedo, PSNR after scale", "{:.2f}", " dB", "albedo"),
+)
+"""Numbers of a benchmark that `refgs eval` prints where ground truth is known, units of the scene."""
+PROTOCOL_SCORES = (
+    Score("psnr", "PSNR", "{:.2f}", " dB"),
+    Score("psnr_h", "PSNR-H", "{:.2f}", " dB"),
+    Score("psnr_l", "PSNR-L", "{:.2f}", " dB"),
+    Score("ssim", "SSIM", "{:.4f}"),
+    Score("lpips", "LPIPS", "{:.4f}", "", "lpips"),
+    *MAP_SCORES,
+)
+"""Numbers of a benchmark, `protocols` of metrics.json and relight.json."""
+
 PIXEL_CLASSES = {
     "silhouette": "silhouette, within 2 px",
     "crease": "crease or depth edge",

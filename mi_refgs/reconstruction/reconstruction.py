@@ -264,6 +264,7 @@ class Reconstruction:
         data: str | Path | None = None,
         *,
         samples: int = 1,
+        protocol: str = "ours",
         progress: bool = False,
     ) -> dict[str, Any]:
         """Measure the run on its test views, or on those of `data`, as `refgs eval` does.
@@ -273,7 +274,7 @@ class Reconstruction:
         if self.folder is None:
             raise InputError("evaluate: folder: only in memory; measure what save(folder) returns")
         data = None if data is None else Path(data)
-        return evaluation.evaluate(Run(self.folder), data, progress, samples)
+        return evaluation.evaluate(Run(self.folder), data, progress, samples, protocol)
 
 
 def load(run: str | Path, *, write: bool = True) -> Reconstruction:

@@ -22,7 +22,8 @@ import numpy as np
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import contact_sheet, image_array, tonemap
+from mi_refgs.evaluation.images import contact_sheet, displayed_over, image_array, tonemap
+from mi_refgs.evaluation.protocols import captions, measures_of, relit_scores
 from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
@@ -32,7 +33,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.new_light import NewLight, truth_under
 from mi_refgs.reconstruction.provenance import Provenance
-from mi_refgs.relighting.score import displayed_over, score
+from mi_refgs.relighting.score import score
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import export, write_if_stale
 from mi_refgs.runs.relightable import relightable
@@ -64,6 +65,7 @@ def relight(
     turntable: int = 0,
     data: Path | None = None,
     samples: int = 1,
+    protocol: str = "ours",
     progress: bool = False,
 ) -> Relit:
     """Render the scene of a run under another light into a folder.
@@ -75,10 +77,12 @@ def relight(
     the mesh's shadows and bounces; reflections are traced. The views are the test views of the run's data
     set, or of `data`; with `turntable`, so many cameras on a circle around the object instead. Without a data
     set both are around the object (`Provenance.shots`). If the data set has ground truth under this light
-    (`truth_under`), the test views are compared with it.
+    (`truth_under`), the test views are compared with it, also by a benchmark's `protocol`, a name in
+    `evaluation.protocols.PROTOCOLS`; the scores are `protocols` of relight.json.
 
     Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
-    folder that cannot be written or contains a run, images of another light, or foreign files of these names.
+    folder that cannot be written or contains a run, images of another light, or foreign files of these names;
+    and as `measures_of` does.
     """
     if turntable < 0:
         raise InputError(f"--turntable: {turntable} is out of range; give a number of views from 1")
@@ -89,6 +93,7 @@ def relight(
     requested, truth_folder = light, None
     if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
         truth_folder, light = known
+    measures = measures_of(protocol, None if truth_folder is None else views)
 
     # The scene under the new light.
     fitted = write_if_stale(run, provenance.method, provenance.first_camera)
@@ -139,6 +144,9 @@ def relight(
     if truth_folder is not None and views is not None:
         truth = _truth(provenance.method, truth_folder, light.exposure, views)
         result |= score([view.name for view in views.views], ours, truth, background) | {"score_reason": None}
+        result["protocols"] = captions(protocol, truth[0].shape[1::-1], relit=True)
+        if measures is not None:
+            result["protocols"][protocol] |= relit_scores(measures, ours, truth)
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
     radiance = new_light.radiance().numpy()
     sheet = contact_sheet(rows, {"environment map": tonemap(radiance, radiance)})

@@ -15,6 +15,7 @@ import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
+from mi_refgs.evaluation.images import displayed_over
 from mi_refgs.evaluation.surface import TrueSurface
 from mi_refgs.formats import orbits
 from mi_refgs.formats.orbits import turntable_cameras
@@ -23,7 +24,7 @@ from mi_refgs.io.images import read_png
 from mi_refgs.reconstruction.new_light import NewLight, any_light
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.relighting.relight import relight
-from mi_refgs.relighting.score import common_scale, displayed_over, score
+from mi_refgs.relighting.score import common_scale, score
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -195,7 +196,13 @@ def test_relight_command(known: Path, tmp_path: Path, capfd: pytest.CaptureFixtu
     light, out = known / "dusk.exr", tmp_path / "out"
     command = ["relight", str(known / "run"), "--envmap", str(light), "-o", str(out)]
     assert main([*command, "--json"]) == 0
-    assert json.loads(capfd.readouterr().out)["psnr_scaled"] > 20
+    plain = json.loads(capfd.readouterr().out)
+    assert plain["psnr_scaled"] > 20 and plain["protocols"].keys() == {"ours"}
+    assert main([*command, "--protocol", "tensoir"]) == 0
+    assert "protocol tensoir\nscale: median" in capfd.readouterr().out
+    relit = json.loads((out / "relight.json").read_text())
+    found = relit["protocols"].pop("tensoir")
+    assert relit == plain | {"views": relit["views"]} and abs(found["psnr"] - plain["psnr_scaled"]) < 3
     refused([*command, "--azimuth", "30"], "r_000.png: output: exists, and was not written")
     assert main([*command[:-1], str(tmp_path / "turned"), "--azimuth", "30"]) == 0
     shown = capfd.readouterr()
