@@ -42,6 +42,7 @@ class Maps(NamedTuple):
     normal: np.ndarray | None = None  # (H, W, 3) world, 0 where there is no surface
     depth: np.ndarray | None = None  # (H, W) along the viewing axis, scene units, 0 where there is no surface
     albedo: np.ndarray | None = None  # (H, W, 3) linear; ground truth (H, W, 4): the last is its coverage
+    clipped: bool = False  # radiance of 1 means 1 or more, as in images of 8 bits
 
     @staticmethod
     def rendered(frame: Frame, normal: np.ndarray, albedo: np.ndarray | None) -> Maps:
@@ -59,7 +60,8 @@ class Maps(NamedTuple):
         """Return the ground truth of a loaded view that has alpha."""
         assert view.alpha is not None
         radiance = view.colour(background) * view.alpha[..., None]
-        return Maps(np.dstack([radiance, view.alpha]), view.normal, view.depth, view.materials.get("albedo"))
+        albedo, clipped = view.materials.get("albedo"), not view.is_linear_radiance
+        return Maps(np.dstack([radiance, view.alpha]), view.normal, view.depth, albedo, clipped)
 
 
 # ---------------- masks and scales ----------------
@@ -266,6 +268,7 @@ class ProtocolScores:
     measures: Measures
     values: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by key, per view
     lpips_reason: str = ""
+    psnr_h_reason: str = ""
     depths: list[tuple[np.ndarray, np.ndarray, int]] = field(default_factory=list)
     """Pixels of ours and of the ground truth inside of the mask, and pixels of the frame, per view."""
     albedos: list[tuple[np.ndarray, np.ndarray, int]] = field(default_factory=list)
@@ -277,6 +280,8 @@ class ProtocolScores:
         if not inside.any():
             return
         found, shown = rules.images(ours.radiance, truth.radiance, inside)
+        if truth.clipped and found.pop("psnr_h", None) is not None:
+            self.psnr_h_reason = "ground truth is clipped at 1; EXR images have more (data.images=exr)"
         if not self.lpips_reason:  # a metric that is not installed stays so
             lpips, self.lpips_reason = metrics.lpips(*shown, rules.network)
             found |= {} if lpips is None else {"lpips": lpips}
@@ -298,9 +303,11 @@ class ProtocolScores:
     def result(self) -> dict[str, Any]:
         """Return the measures by key, without those of maps that are unknown; means over views.
 
-        `lpips` is None with a `lpips_reason` if it could not be computed.
+        `lpips` and `psnr_h` are None with a reason, such as `lpips_reason`, if they could not be computed.
         """
         found: dict[str, Any] = {"lpips": None, "lpips_reason": self.lpips_reason or None}
+        if self.psnr_h_reason:
+            found |= {"psnr_h": None, "psnr_h_reason": self.psnr_h_reason}
         found |= {key: float(np.mean(values)) for key, values in self.values.items()}
         if self.depths:
             found["depth_si_mse"] = metrics.depth_si_mse(*zip(*self.depths, strict=True))

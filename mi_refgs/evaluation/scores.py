@@ -56,7 +56,7 @@ MAP_SCORES = (
 """Numbers of a benchmark that `refgs eval` prints where ground truth is known, units of the scene."""
 PROTOCOL_SCORES = (
     Score("psnr", "PSNR", "{:.2f}", " dB"),
-    Score("psnr_h", "PSNR-H", "{:.2f}", " dB"),
+    Score("psnr_h", "PSNR-H", "{:.2f}", " dB", "psnr_h"),
     Score("psnr_l", "PSNR-L", "{:.2f}", " dB"),
     Score("ssim", "SSIM", "{:.4f}"),
     Score("lpips", "LPIPS", "{:.4f}", "", "lpips"),

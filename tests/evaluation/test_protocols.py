@@ -76,6 +76,15 @@ def test_psnr_h_and_psnr_l_over_the_whole_frame() -> None:
     assert found["psnr_l"] == pytest.approx(-10 * np.log10(0.4 * (encoded(0.9) - encoded(0.8)) ** 2))
 
 
+def test_clipped_ground_truth_has_no_psnr_h() -> None:
+    """An image of 8 bits does not say how bright a highlight is."""
+    scores = scores_of("stanford-orb")
+    scores.add(Maps(half_covered(2.0)), Maps(half_covered(1.0), clipped=True))
+    found = scores.result()
+    assert found["psnr_h"] is None and "clipped at 1" in found["psnr_h_reason"] and found["psnr_l"] == 100
+    assert "psnr_h" not in scores_of("tensoir").result()
+
+
 def test_bright_pixels_are_clipped_at_4_and_1() -> None:
     ours, truth = half_covered(0.5), half_covered(0.5)
     truth[:, 0, :3], ours[:, 0, :3] = 100, 50
