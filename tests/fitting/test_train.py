@@ -66,7 +66,7 @@ def with_deferred(method: Method, options: dict[str, Any]) -> Method:
         ({}, set()),
         ({"diffuse": "irradiance", "ambient_rays": 5}, {"mesh/ambient"}),
         ({"traced_bounces": 2, "samples": 4}, {"mesh/surfels", "mesh/weights", "mesh/normals"}),
-        ({"crop": 12 * 12}, set()),
+        ({"visibility_rays": 3, "samples": 4, "antialias": True, "crop": 12 * 12}, set()),
     ],
 )
 def test_resume_repeats_straight_run_bit_for_bit(
