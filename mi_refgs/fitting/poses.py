@@ -73,12 +73,10 @@ def decide(setup: FitSetup, iteration: int, shown: Callable[[int, View], np.ndar
     """
     options, views = setup.cameras, setup.data.views
     assert options is not None
-    chosen = evenly_spread(len(views), JUDGES)
-    found = []
+    chosen, extent, found = evenly_spread(len(views), JUDGES), setup.data.scene_extent, []
     for i in chosen:
         view, fitted = views[i].load(), checkerboard(views[i])
-        distance = float(np.linalg.norm(view.to_world[:3, 3] - setup.focus))
-        moved = registered(view, lambda camera, i=i: shown(i, camera), distance, fitted)  # type: ignore[misc]
+        moved = registered(view, lambda camera, i=i: shown(i, camera), extent, fitted)  # type: ignore[misc]
         found.append([psnr(shown(i, one), view, ~fitted) for one in (view, moved)])
     without, with_it = np.mean(found, axis=0)
     return {

@@ -1,4 +1,4 @@
-"""An open scene in the renderer and in float64: object, surroundings and background, shaded in either order."""
+"""An open scene in the renderer and in float64: object, surroundings and background, in either order."""
 
 from __future__ import annotations
 
