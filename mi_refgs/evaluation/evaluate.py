@@ -15,6 +15,7 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import region_pixels
+from mi_refgs.data.registration import registered
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics
@@ -23,14 +24,14 @@ from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels
 from mi_refgs.evaluation.protocols import Maps, ProtocolScores, captions, measures_of
 from mi_refgs.evaluation.scores import MAP_SCORES
 from mi_refgs.evaluation.surface import TrueSurface, sample, surface_scores
-from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
+from mi_refgs.fitting.exposure import EXPOSURE_FILE, displayed_of, image_of, with_gain
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
 from mi_refgs.kernels.device import machine
 from mi_refgs.progress import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.light_file import read_radiance
@@ -42,7 +43,7 @@ METRICS = "metrics.json"
 LONGEST_STEM = 60  # characters of the view's name in an image's file name; file systems allow 255 bytes
 SHEET_VIEWS = 4  # rows of either sheet, spread evenly over the test views
 CHAMFER_POINTS = 30_000  # on each surface, as Stanford-ORB samples
-MEANS = """psnr psnr_gain ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
+MEANS = """psnr psnr_gain psnr_registered ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
     normal_mae_deg_full""".split()  # scores of views whose means are reported
 
 
@@ -57,8 +58,8 @@ def evaluate(
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
     Every key of the upper level is always present. Where a score does not apply it is null, and `NAME_reason`
-    says why; `exposure` and `pruned` are null if nothing was decided or pruned. An entry of `views` has only
-    the scores of that view.
+    says why; `exposure`, `cameras` and `pruned` are null if nothing was decided or pruned. An entry of
+    `views` has only the scores of that view.
 
     `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
     `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
@@ -67,7 +68,9 @@ def evaluate(
                                    (`evaluation.error_budget`)
     `psnr_gain`                    after one gain per channel and view (`data.exposure.fitted_gain`), which
                                    compares methods on images of different exposure
-    `exposure`                     what the fit decided about its own exposure compensation
+    `psnr_registered`              with the pose at which a render fits the view best (`data.registration`),
+                                   if the fit corrected its cameras: all may have moved with the scene
+    `exposure`, `cameras`          what the fit decided about its own exposure compensation and corrections
     `image_size`                   of the test views as they are read, each pixel the mean of `downscale`²
                                    pixels of the file; scores of different sizes are not comparable
     `ms_per_frame`                 median over single synchronised frames of the displayed image without AOVs,
@@ -94,7 +97,11 @@ def evaluate(
 
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
-    measured = Measured(benchmark=None if measures is None else ProtocolScores(measures))
+    cameras_decided = _decision(run, CAMERAS, "views")
+    measured = Measured(
+        benchmark=None if measures is None else ProtocolScores(measures),
+        registers=cameras_decided is not None and bool(cameras_decided.get("corrected")),
+    )
     _measure(measured, fitted, views, surface, samples, [run.path / name for name in renders], progress)
 
     # The numbers.
@@ -109,7 +116,8 @@ def evaluate(
     result |= _protocols(protocol, measured.benchmark, fitted, surface, views)
     cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
     result |= {
-        "exposure": _exposure(run),
+        "exposure": _decision(run, EXPOSURE_FILE, "gain"),
+        "cameras": cameras_decided,
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
@@ -147,6 +155,7 @@ class Measured:
     errors: decomposition.Decomposition = field(default_factory=decomposition.Decomposition)
     budget: ErrorBudget = field(default_factory=ErrorBudget)
     benchmark: ProtocolScores | None = None
+    registers: bool = False  # whether test views are registered, too
     panels: list[dict[str, np.ndarray]] = field(default_factory=list)  # rows of SHEET
     materials: list[decomposition.MeasuredView] = field(default_factory=list)  # rows of DECOMPOSITION
 
@@ -161,7 +170,7 @@ def _measure(
     progress: bool,
 ) -> None:
     """Render and measure the test views one by one, and write their images."""
-    render = fitted.renderer(samples=samples)
+    render, image_only = fitted.renderer(samples=samples), fitted.renderer(aovs=False, samples=samples)
     object_only = None
     if fitted.surroundings is not None:
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
@@ -175,6 +184,14 @@ def _measure(
         scores = _scores(rendered, view, views, measured.per_view[0] if measured.per_view else {})
         gain, gained = with_gain(frame, view, views)
         scores |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
+        if measured.registers:
+            moved = registered(
+                view,
+                lambda other: image_of(displayed_of(image_only(other.camera()), views), other),
+                views.scene_extent,
+            )
+            shown = image_of(displayed_of(image_only(moved.camera()), views), moved)
+            scores["psnr_registered"] = metrics.psnr(shown, view.displayed)
         measured.per_view.append(scores)
 
         # Errors of materials, of concave pixels and per class of pixels.
@@ -224,6 +241,7 @@ def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:
     for name, key, reason in (
         ("region", "psnr_region", "the data set has no region of interest"),
         ("normal", "normal_mae_deg", "the data set has no ground-truth normals"),
+        ("registered", "psnr_registered", "the fit did not correct its cameras"),
     ):
         result[f"{name}_reason"] = reason if result[key] is None else None
     return result
@@ -246,11 +264,11 @@ def _scores(rendered: RenderedView, view: View, data: Dataset, first: dict[str, 
     return scores
 
 
-def _exposure(run: Run) -> dict[str, Any] | None:
-    """Return what the fit decided about exposure compensation; None if it decided nothing."""
-    if not (run.path / EXPOSURE_FILE).is_file():
+def _decision(run: Run, file: str, per_view: str) -> dict[str, Any] | None:
+    """Return a decision of the fit without its numbers `per_view`; None if it decided nothing."""
+    if not (run.path / file).is_file():
         return None
-    return {name: value for name, value in read_json(run.path / EXPOSURE_FILE).items() if name != "gain"}
+    return {name: value for name, value in read_json(run.path / file).items() if name != per_view}
 
 
 def render_names(views: Sequence[View]) -> list[str]:

@@ -24,6 +24,7 @@ SCORES = (
     Score("downscale", "downscaled by", "{}"),
     Score("psnr", "PSNR", "{:.2f}", " dB", compared=True, higher=True, concave=True),
     Score("psnr_gain", "PSNR, exposure fitted", "{:.2f}", " dB"),
+    Score("psnr_registered", "PSNR, cameras registered", "{:.2f}", " dB", "registered"),
     Score("ssim", "SSIM", "{:.4f}", compared=True, higher=True),
     Score("psnr_region", "PSNR, region of interest", "{:.2f}", " dB"),
     Score("ssim_region", "SSIM, region of interest", "{:.4f}"),

@@ -25,7 +25,7 @@ from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload_tensor
-from mi_refgs.methods.method import GAIN
+from mi_refgs.methods.method import GAIN, CameraOptions, ExposureOptions
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.checkpoint import OPTIMISER, PARAMS
@@ -71,15 +71,26 @@ def gains_of(params: Mapping[str, TensorXf]) -> np.ndarray | None:
 Render = Callable[[View], Frame]  # renders a view of the present state
 
 
-def is_due(setup: FitSetup, state: FitState) -> bool:
-    """Whether the decision is to be made now.
+def is_due(
+    setup: FitSetup,
+    state: FitState,
+    options: ExposureOptions | CameraOptions | None,
+    decision: dict[str, Any] | None,  # that was made
+) -> bool:
+    """Whether the decision about gains, or about the cameras, is to be made now.
 
     A method that selects components is fitted to some of the views until it has selected them: not before.
     """
-    options, select = setup.exposure, setup.method.select
-    if options is None or state.exposure is not None or state.iteration < options.after:
+    select = setup.method.select
+    if options is None or decision is not None or state.iteration < options.after:
         return False
     return select is None or {*select.component} <= {row["component"] for row in state.decisions}
+
+
+def checkerboard(view: View) -> np.ndarray:
+    """Half of the pixels of a view, (H, W) bool: every other square of BLOCK² pixels."""
+    row, column = np.indices((view.height, view.width)) // BLOCK
+    return np.asarray((row + column) % 2 == 0)
 
 
 def decide(setup: FitSetup, iteration: int, render: Render) -> dict[str, Any]:
@@ -100,8 +111,7 @@ def decide(setup: FitSetup, iteration: int, render: Render) -> dict[str, Any]:
 def _judge(view: View, data: Dataset, render: Render) -> tuple[float, float]:
     """PSNR (dB) on half of the pixels of a view, without a gain and with one fitted to the other half."""
     frame = render(view)
-    row, column = np.indices((view.height, view.width)) // BLOCK
-    fitted = (row + column) % 2 == 0
+    fitted = checkerboard(view)
     _, image = with_gain(frame, view, data, fitted)
     found = [psnr(shown, view, ~fitted) for shown in (image_of(displayed_of(frame, data), view), image)]
     return found[0], found[1]

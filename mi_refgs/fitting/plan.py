@@ -81,7 +81,7 @@ def measured(method: Method, has_alpha: bool) -> Speed:
 def _measured(method: Method, has_alpha: bool, size: int) -> tuple[dict[str, float], tuple[float, float]]:
     """Seconds per step by stage; per mesh, and per view of a mesh."""
     whole = replace(method.data, coarse=(), crop=None)
-    still = replace(method, refine=Refine(), exposure=None, select=None, data=whole)
+    still = replace(method, refine=Refine(), exposure=None, cameras=None, select=None, data=whole)
     trainer = Trainer(still, synthetic_data(has_alpha, size))
     every = 1 if method.light is None else method.light.every
     timed = max(TIMED // every, 1) * every

@@ -13,7 +13,7 @@ from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import exposure
+from mi_refgs.fitting import exposure, poses
 from mi_refgs.fitting.metal_trial import install_metal_trial
 from mi_refgs.fitting.objective import require_losses
 from mi_refgs.fitting.plan import Estimate, planned
@@ -23,7 +23,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import MODEL
 from mi_refgs.runs.views import read_views, with_region
 
@@ -230,6 +230,8 @@ def finish(trainer: Trainer, run: Run) -> str | None:
         run.write_json(DECISIONS, trainer.fit.decisions)
     if (gains := exposure.record(trainer.setup, trainer.fit)) is not None:
         run.write_json(exposure.EXPOSURE_FILE, gains)
+    if (cameras := poses.record(trainer.setup, trainer.fit)) is not None:
+        run.write_json(CAMERAS, cameras)
     warning, first = None, trainer.data.views[0]
     try:
         first = read_views(trainer.method, trainer.data.path, "test").views[0]

@@ -14,10 +14,21 @@ import numpy as np
 
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.hull import view_focus
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.optim import Group
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, ExposureOptions, Method
+from mi_refgs.methods.method import (
+    AROUND,
+    BACKGROUND,
+    GAIN,
+    LIGHT,
+    PER_VIEW,
+    POSE,
+    CameraOptions,
+    ExposureOptions,
+    Method,
+)
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.light import Light
@@ -48,6 +59,35 @@ class FitSetup:
         """Options of the per-image exposure compensation, unless the method switches it off."""
         options = self.method.exposure
         return None if options is None or options.gains == "off" else options
+
+    @property
+    def cameras(self) -> CameraOptions | None:
+        """Options of the camera corrections, unless the method switches them off."""
+        options = self.method.cameras
+        return None if options is None or options.corrections == "off" else options
+
+    @cached_property
+    def focus(self) -> np.ndarray:
+        """The point (3,) that the training cameras look at, the region's centre, or else their mean."""
+        views, region = self.data.views, self.data.region
+        if region is not None:
+            return np.array(region.centre)
+        try:
+            return view_focus(views)[0]
+        except InputError:
+            return np.mean([view.to_world[:3, 3] for view in views], axis=0)
+
+    @cached_property
+    def reach(self) -> float:
+        """Half of the width that the median training view shows at the distance of `focus`, scene units."""
+        views = self.data.views
+        distance = [np.linalg.norm(view.to_world[:3, 3] - self.focus) for view in views]
+        return float(np.median([d * v.width / (2 * v.fx) for d, v in zip(distance, views, strict=True)]))
+
+    @cached_property
+    def camera_axes(self) -> Float:
+        """Axes of the training cameras in the world, (9 V,): rows of matrices that map to the world."""
+        return upload(np.concatenate([view.to_world[:3, :3].ravel() for view in self.data.views]))
 
     def rng(self, iteration: int, operation: str) -> np.random.Generator:
         """Generator for one operation, such as "densify", of an iteration; 0 is the initialisation."""
@@ -105,6 +145,8 @@ class FitSetup:
             groups[LIGHT] = Group(*texels, relative=rates.light_relative)
         if self.exposure is not None and GAIN in params:
             groups[GAIN] = Group(self.exposure.rate, 0.1 * self.exposure.rate, iterations)
+        if self.cameras is not None and POSE in params:
+            groups[POSE] = Group(self.cameras.rate, 0.1 * self.cameras.rate, iterations)
         return groups
 
     def _of_table(self, names: tuple[str, ...], extent: float) -> dict[str, Group]:
@@ -119,7 +161,7 @@ class FitSetup:
         return groups
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of every parameter but the gains, without the first axis."""
+        """Shape of every parameter but those per view, without the first axis."""
         surfels, around = self.method.surfels, self.method.surroundings
         found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
         if self.open_scene and around is not None:
@@ -135,7 +177,7 @@ class FitSetup:
         """
         expected, views = self.shapes(), len(self.data.views)
         config = "config.toml" if run is None else str(run / "config.toml")
-        found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name != GAIN}
+        found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name not in PER_VIEW}
         if self.method.surroundings is not None and self.open_scene != (BACKGROUND in found):
             before, now = ("without", "with") if BACKGROUND in found else ("with", "without")
             raise InputError(
@@ -148,12 +190,13 @@ class FitSetup:
                     f"{config}: {name}: the checkpoint has {found.get(name, 'none')}, the method "
                     f"{expected.get(name, 'none')}; undo the change, or start another run"
                 )
-        gains = state.get(f"{PARAMS}{GAIN}")
-        if gains is not None and len(gains) != views:
-            raise InputError(
-                f"{self.data.path}: frames: {views} training views, but the checkpoint has gains of "
-                f"{len(gains)}; resume with the data set that the run began with"
-            )
+        for name, what in ((GAIN, "gains"), (POSE, "camera corrections")):
+            rows = state.get(f"{PARAMS}{name}")
+            if rows is not None and len(rows) != views:
+                raise InputError(
+                    f"{self.data.path}: frames: {views} training views, but the checkpoint has {what} of "
+                    f"{len(rows)}; resume with the data set that the run began with"
+                )
 
 
 GATHERED = "light_gradient"  # name of the gradient of the levels in a checkpoint

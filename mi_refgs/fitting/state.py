@@ -5,7 +5,7 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
     params/NAME  optimiser/NAME/PART       parameters, and Adam's moments and counters of each
     error_sum  unseen                      per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
-    iteration  seconds  held_until  decisions  exposure  light_gradient
+    iteration  seconds  held_until  decisions  exposure  cameras  light_gradient
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class ParameterTable:
 class FitState:
     """What the steps of a fit change; exactly what a checkpoint contains."""
 
-    params: dict[str, TensorXf]  # raw, by name: surfels, AROUND + surfels, LIGHT, BACKGROUND, GAIN
+    params: dict[str, TensorXf]  # raw, by name: surfels, AROUND + surfels, LIGHT, BACKGROUND, GAIN, POSE
     optimiser: Adam
     tables: list[ParameterTable]  # object, and background if there is one
     occluder: Occluder = field(default_factory=Occluder)
@@ -125,6 +125,7 @@ class FitState:
     held_until: int = 0  # iteration before which opacities do not learn
     decisions: list[dict[str, Any]] = field(default_factory=list)  # about components of the method
     exposure: dict[str, Any] | None = None  # decision about the exposure compensation
+    cameras: dict[str, Any] | None = None  # decision about camera corrections
 
     @staticmethod
     def start(setup: FitSetup, gains: Mapping[str, TensorXf]) -> FitState:
@@ -184,8 +185,8 @@ class FitState:
             state[f"{table.prefix}unseen"] = table.unseen.numpy()
         state |= {name: np.array(getattr(self, name)) for name in ("iteration", "seconds", "held_until")}
         state |= self.prefilter.state()
-        for name, value in (("exposure", self.exposure), ("decisions", self.decisions)):
-            if value:
+        for name in ("exposure", "cameras", "decisions"):
+            if value := getattr(self, name):
                 state[name] = np.frombuffer(json.dumps(value).encode(), np.uint8)
         if (mesh := self.occluder.mesh()) is not None:
             state |= {f"{MESH}vertices": mesh.vertices, f"{MESH}faces": mesh.faces}
@@ -207,8 +208,8 @@ class FitState:
         made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
         made.held_until = int(state["held_until"])
         made.decisions = decisions_of(state)
-        if "exposure" in state:
-            made.exposure = json.loads(state["exposure"].tobytes())
+        for name in {"exposure", "cameras"} & state.keys():
+            setattr(made, name, json.loads(state[name].tobytes()))
         made.occluder = _occluder_of(state)
         _, stage = setup.method.stage_at(max(made.iteration, 1))
         made.prefilter.restore(made.light, made.shading(stage), state)

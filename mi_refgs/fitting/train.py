@@ -21,7 +21,7 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.fitting import exposure
+from mi_refgs.fitting import exposure, poses
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
 from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective, require_losses
@@ -166,7 +166,7 @@ class Trainer:
             light, around = shading.light_of(self.light), None if object_only else self.surroundings
             scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around)
             degree = self.setup.sh_degree(self.iteration)
-            return render(scene, camera, Request(scene.all_aovs if aovs else (), sh_degree=degree))
+            return render(scene, camera, Request(scene.all_aovs if aovs else (), not aovs, sh_degree=degree))
 
     def statistics(self) -> dict[str, Any]:
         """One line of the log; waits for the device. `loss` and `psnr` are None before the first step."""
@@ -244,22 +244,27 @@ class Trainer:
             self.check()
         control.refine(iteration)
         self._decide_exposure()
+        self._decide_cameras()
         mesh = self.method.mesh
         if mesh is not None and self.fit.shading(stage).traceable and mesh.extract.due(iteration):
             last = mesh.extract.count(iteration) == mesh.extract.count(self.method.iterations)
             self.extract_mesh(None if last else self._few_cameras())
 
+    def camera(self, index: int) -> Camera:
+        """The camera of a training view, with the correction that was fitted."""
+        return poses.camera_of(self.setup, self.fit.params, index)
+
     def _few_cameras(self) -> list[Camera]:
         """Cameras of FUSED_VIEWS training views, spread over all of them."""
-        views = self.data.views
-        return [views[i].camera() for i in evenly_spread(len(views), FUSED_VIEWS)]
+        return [self.camera(i) for i in evenly_spread(len(self.data.views), FUSED_VIEWS)]
 
     def extract_mesh(self, cameras: Sequence[Camera] | None = None) -> Mesh:
         """Fuse the rendered depth of all training views, or of `cameras`, into a mesh: the new occluder."""
         self.check()
         options, around = self.method.mesh, self.surroundings
         assert options is not None
-        cameras = [view.camera() for view in self.data.views] if cameras is None else cameras
+        if cameras is None:
+            cameras = [self.camera(i) for i in range(len(self.data.views))]
         far = around.surfels.detach() if around is not None and options.unbounded else None
         mesh = surface_of(self.surfels.detach(), cameras, options.resolution, far, self.data.region)
         self.fit.occluder.update(mesh)
@@ -286,7 +291,7 @@ class Trainer:
         light = setup.method.light
         if light is not None and not share_light:
             light = replace(light, every=1)
-        still = replace(setup.method, refine=Refine(), mesh=None, exposure=None, light=light)
+        still = replace(setup.method, refine=Refine(), mesh=None, exposure=None, cameras=None, light=light)
         self.setup = FitSetup(still, setup.data)
         self.fit.prefilter.close()
 
@@ -307,7 +312,9 @@ class Trainer:
         target = self.targets.at(iteration, index)
         if (part := setup.crop(iteration, target.camera.width, target.camera.height)) is not None:
             target = target.cropped(*part)
-        camera, surfels, around = target.camera, fit.surfels, fit.surroundings
+        camera = poses.corrected(setup, fit.params, index, target.camera)
+        target = replace(target, camera=camera)
+        surfels, around = fit.surfels, fit.surroundings
 
         # Zeros whose gradient is the squared error that each surfel is responsible for: one more feature.
         attribution = None
@@ -346,11 +353,11 @@ class Trainer:
 
     def _decide_exposure(self) -> None:
         """Decide about gains, if that is due, and continue with them or without."""
-        if not exposure.is_due(self.setup, self.fit):
+        if not exposure.is_due(self.setup, self.fit, self.setup.exposure, self.fit.exposure):
             return
 
         def shown(view: View) -> Frame:
-            return self.view(view.camera(), aovs=False)
+            return self.view(self.camera(self.data.views.index(view)), aovs=False)
 
         decision = exposure.decide(self.setup, self.iteration, shown)
         self.fit.exposure = decision
@@ -363,6 +370,23 @@ class Trainer:
                 )
             self.check()
             self.restore(exposure.with_gains(self.state(), log))
+
+    def _decide_cameras(self) -> None:
+        """Decide about corrections of the cameras, if that is due, and continue with them or without."""
+        if not exposure.is_due(self.setup, self.fit, self.setup.cameras, self.fit.cameras):
+            return
+        gains = exposure.gains_of(self.fit.params)
+
+        def shown(index: int, view: View) -> np.ndarray:
+            frame, gain = self.view(view.camera(), aovs=False), None if gains is None else gains[index]
+            return exposure.image_of(exposure.displayed_of(frame, self.data, gain), view)
+
+        decision = poses.decide(self.setup, self.iteration, shown)
+        self.fit.cameras = decision
+        self.tell(poses.sentence(decision))
+        if decision["corrected"]:
+            self.check()
+            self.restore(poses.with_corrections(self.setup, self.state()))
 
 
 def surface_of(

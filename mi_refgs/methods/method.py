@@ -20,8 +20,10 @@ from mi_refgs.surfels.primitives import PRIMITIVES
 # Names among the parameters of a fit, beside the attributes of the surfels:
 LIGHT, BACKGROUND = "light", "background"  # the environment maps
 GAIN = "gain"  # log exposure gains of the training views
+POSE = "pose"  # corrections of their cameras
+PER_VIEW = (GAIN, POSE)  # parameters with a row per training view, which a fit may lack
 AROUND = "surroundings/"  # prefix of the background Gaussians' attributes
-APART = (LIGHT, GAIN, BACKGROUND)  # parameters that are not attributes of surfels
+APART = (LIGHT, BACKGROUND, *PER_VIEW)  # parameters that are not attributes of surfels
 AT_ONCE = Window(0, 3, 1)  # one SH degree more in each of the first three iterations
 MESH_WINDOW = Window(20_000, 50_000, 2_000)  # that of the released Ref-Gaussian code on synthetic scenes
 
@@ -234,6 +236,16 @@ class ExposureOptions:
 
 
 @dataclass(frozen=True)
+class CameraOptions:
+    """Rigid corrections of the training cameras (`fitting.poses`)."""
+
+    corrections: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
+    after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
+    worth: float = 0.3  # dB gained on pixels of the training views that the poses were not registered with
+    rate: float = 1e-3  # learning rate, radians per step; a tenth of it at the end
+
+
+@dataclass(frozen=True)
 class CoarseImages:
     """Downscaled images for the iterations up to `until`; the table that ends first applies."""
 
@@ -339,6 +351,7 @@ class Method:
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
     exposure: ExposureOptions | None = None
+    cameras: CameraOptions | None = None
     seed: int = 0
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
     preview_every: int = 1_000  # iterations

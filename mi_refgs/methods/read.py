@@ -463,6 +463,8 @@ def _require_consistent(method: Method, where: str) -> None:
         ranges.append(("light.every", light.every, light.every >= 1, "1 or more"))
     if method.exposure is not None:
         ranges.append(("exposure.rate", method.exposure.rate, method.exposure.rate >= 0, "0 or more"))
+    if method.cameras is not None:
+        ranges.append(("cameras.rate", method.cameras.rate, method.cameras.rate >= 0, "0 or more"))
     ranges.append(("surfels.capacity", surfels.capacity, surfels.capacity > 0, "more than 0"))
     ranges.append(("refine.grow", method.refine.grow, method.refine.grow >= 0, "0 or more"))
     if relocate is not None:

@@ -53,4 +53,4 @@ def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any
     valid = inside & (sum(around[1:], around[0]) > 4.5) & (dr.detach(length2) > NORM_FLOOR)
     valid &= dr.square(cosine) > DEPTH_EDGE_COSINE**2 * dr.detach(length2) * dr.squared_norm(ray)
     normal = normal * dr.rsqrt(dr.select(valid, length2, 1.0))
-    return dr.select(valid, camera.rotation.T @ normal, 0.0), valid
+    return dr.select(valid, camera.rotate_to_world(normal), 0.0), valid

@@ -4,7 +4,8 @@
     deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.shaded_at` is "pixel")
 
 Both use the same splatter and the same `shade`. Everything is traced by Dr.Jit. No derivative: visibility,
-the side to which a normal is turned, the camera, and those that `mi_refgs.splat.composite` lists.
+the side to which a normal is turned, rays that are traced, and those that `mi_refgs.splat.composite` lists;
+cameras have derivatives if they have a `motion`.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ from mi_refgs.methods.read import dump, load_resolved
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"  # the folder of the data set, and its region of interest
+CAMERAS = "cameras.json"  # the decision about camera corrections, and the corrected poses
 LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
 LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
@@ -37,7 +38,7 @@ RUN_FILES = (
     *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png", "points.npz"),
     *("surfels.ply", "envmap.exr", "mesh.ply", "surroundings.ply", "background.exr"),
     *("scene.xml", "model.json"),
-    *("exposure.json", "decisions.json", "edit.json", "preview.png"),
+    *("exposure.json", CAMERAS, "decisions.json", "edit.json", "preview.png"),
     *("metrics.json", "contact_sheet.png", "decomposition.png", "eval/*.png"),
     *("job.json", "failed.json", "job.log"),
 )

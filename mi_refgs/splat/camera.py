@@ -21,8 +21,8 @@ class Camera:
     """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
 
     In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. All numbers but the image size
-    are opaque Dr.Jit values, so that every view of a data set uses one compiled kernel. Cameras have no
-    derivatives.
+    are opaque Dr.Jit values, so that every view of a data set uses one compiled kernel. Numbers have no
+    derivatives; a camera that was `displaced` under AD has those of its `motion`.
     """
 
     width: int  # pixels
@@ -38,6 +38,9 @@ class Camera:
     focal: float  # |fx| on the host, decides the size of tiles
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film; tiles are those of the film
     film: tuple[int, int] | None = None  # pixels, size of the film; None: the camera has all of it
+    motion: Float | None = None
+    """(6,) zeros whose gradient is that of rotating the camera about its origin (3, radians about the world's
+    axes) and of moving it (3, scene units); None: without derivatives."""
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -166,11 +169,31 @@ class Camera:
 
     def towards(self, point: Point3f) -> Vector3f:
         """Vector in the world from the camera to a point, with the precision of float32 of the vector."""
-        return (mi.Vector3f(point) - mi.Vector3f(self.origin)) - self.origin_rest
+        vector = (mi.Vector3f(point) - mi.Vector3f(self.origin)) - self.origin_rest
+        return vector if self.motion is None else vector - self._motion(3, vector)
 
     def to_camera(self, point: Point3f) -> Vector3f:
         """World point to camera frame."""
-        return self.rotation @ self.towards(point)
+        return self.rotate_to_camera(self.towards(point))
+
+    def rotate_to_camera(self, vector: Vector3f) -> Vector3f:
+        """World vector to camera frame."""
+        if self.motion is not None:
+            vector = vector - dr.cross(self._motion(0, vector), vector)
+        return self.rotation @ vector
+
+    def rotate_to_world(self, vector: Vector3f) -> Vector3f:
+        """Vector of the camera frame to the world."""
+        vector = self.rotation.T @ vector
+        return vector if self.motion is None else vector + dr.cross(self._motion(0, vector), vector)
+
+    def _motion(self, first: int, vector: Vector3f) -> Vector3f:
+        """Three numbers of `motion` for each vector. Gathered: the adjoint is then one sum in the kernel of
+        the adjoints of the vectors, where that of a broadcast is a kernel per use."""
+        assert self.motion is not None
+        index = dr.full(mi.UInt32, first, dr.width(vector))
+        mode = dr.ReduceMode.Expand
+        return mi.Vector3f(*(dr.gather(mi.Float, self.motion, index + i, mode=mode) for i in range(3)))
 
     def pixel_centres(self, raster: UInt32 | None = None) -> Point2f:
         """Centres (i + ½, j + ½) of pixels, by their index in the image; of all pixels by default."""
@@ -181,7 +204,7 @@ class Camera:
         """World directions through `pixel_centres` + `offset`, pixels: 1 along the viewing axis, not unit."""
         pixel = self.pixel_centres(raster) + mi.Vector2f(*offset)
         local = mi.Vector3f((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1)
-        return self.rotation.T @ local
+        return self.rotate_to_world(local)
 
     def pose(self) -> np.ndarray:
         """The rigid world-from-camera matrix (4, 4) float64."""
@@ -194,6 +217,26 @@ class Camera:
         """The same lens at another pose (4, 4); raises InputError as `from_pose` does."""
         fx, fy, cx, cy, near = (float(x[0]) for x in (self.fx, self.fy, self.cx, self.cy, self.near))
         return Camera.from_pose(self.width, self.height, fx, fy, cx, cy, to_world, near)
+
+    def displaced(self, rotation: mi.Matrix3f, centre: Point3f, translation: Vector3f) -> Camera:
+        """The camera after a rotation of the world about `centre` and a translation, all of width 1.
+
+        Under AD, gradients of the new camera's images flow to both through its `motion`.
+        """
+        lever = -self.towards(centre)
+        change = rotation @ lever - lever + translation  # of the origin; small, so it keeps its digits
+        origin = dr.detach(mi.Point3f(self.origin + self.origin_rest + change))
+        rest = (mi.Vector3f(self.origin) - mi.Vector3f(origin)) + self.origin_rest + dr.detach(change)
+        motion = None
+        if dr.grad_enabled(rotation, translation):
+            turned = rotation @ dr.detach(rotation).T  # the identity; its antisymmetric part is the motion
+            pairs = ((2, 1), (0, 2), (1, 0))
+            angles = [0.5 * (turned[i, j] - turned[j, i]) for i, j in pairs]
+            motion = dr.concat([*angles, *(change - dr.detach(change))])
+            motion -= dr.detach(motion)  # rounding
+        matrix = self.rotation @ dr.detach(rotation).T
+        dr.eval(matrix, origin, rest, motion)
+        return replace(self, rotation=matrix, origin=origin, origin_rest=rest, motion=motion)
 
     def resized(self, size: int | tuple[int, int]) -> Camera:
         """The same view with another resolution: width and height, or the longer side, pixels.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -12,75 +10,16 @@ import numpy as np
 import pytest
 
 from benchmarks.stability import exact
-from benchmarks.stability.cases import camera, plain
-from mi_refgs.kernels.device import upload, upload_tensor
-from mi_refgs.reference import image as oracle
+from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.render.display import displayed, srgb_from_linear
-from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
+from mi_refgs.render.pipeline import Frame, SurfelScene, render
 from mi_refgs.render.samples import box_mean, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import scattered_discs
-
-CASES = [("pixel", "sh"), ("surfel", "irradiance")]
-MAPS = ["radiance", "alpha", "depth", "normal", "object_alpha", "albedo", "metallic", "roughness"]
-MAPS += ["background"]
-
-
-@dataclass(frozen=True)
-class Pair:
-    """The plain case with surroundings: the renderer and the float64 reference."""
-
-    at: str
-    diffuse: str
-
-    @cached_property
-    def case(self) -> Any:
-        case = plain("open", at=self.at, diffuse=self.diffuse, camera=camera())
-        return replace(case, raw={n: x for n, x in case.raw.items() if n != "indirect_sh"}).rounded()
-
-    @cached_property
-    def values(self) -> dict[str, np.ndarray]:
-        """Every parameter (float32) by name, as in a fit."""
-        rng = np.random.default_rng(9)
-        found = {name: np.asarray(x, np.float32) for name, x in self.case.raw.items()}
-        found |= {f"surroundings/{name}": x for name, x in scattered_discs().items()}
-        background = rng.normal(size=(8, 16, 3)).astype(np.float32)
-        return found | {"light": np.asarray(self.case.light, np.float32), "background": background}
-
-    @cached_property
-    def order(self) -> np.ndarray:
-        others = {n: x for n, x in scattered_discs().items() if n != "radiance_sh"}
-        raw = {n: np.concatenate([self.case.raw[n], x]) for n, x in others.items()}
-        pixels = np.arange(self.case.camera.width * self.case.camera.height)
-        colour = np.zeros((len(raw["scale"]), 3))
-        return exact.product_order(replace(self.case, raw=raw | {"radiance_sh": colour}), pixels)
-
-    def truth(self, values: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        case = replace(self.case, raw={n: values[n] for n in self.case.raw})
-        pixels = np.arange(case.camera.width * case.camera.height)
-        scene = exact.scene_of(case, pixels, self.order, exact.light_of(values["light"]))
-        others = {name: values[f"surroundings/{name}"] for name in scattered_discs()}
-        return oracle.render_open(oracle.OpenScene(scene, others, values["background"]))
-
-    def frame(self, params: dict[str, Any], eye: Camera | None = None) -> Frame:
-        surfels = Surfels({name: params[name] for name in self.case.raw})
-        others = Surfels({name: params[f"surroundings/{name}"] for name in scattered_discs()})
-        behind = Surroundings(others, EnvironmentLight(params["background"]))
-        light = EnvironmentLight(params["light"]).prefilter()
-        shading = Shading(self.at, "split_sum", self.diffuse)  # type: ignore[arg-type]
-        eye = eye or exact.fast_camera(self.case)
-        scene = SurfelScene(surfels, shading, light, surroundings=behind)
-        return render(scene, eye, Request(scene.all_aovs))
-
-    def planes(self, params: dict[str, Any]) -> dict[str, list[Any]]:
-        frame = self.frame(params)
-        named = {name: getattr(frame, name) for name in MAPS if hasattr(frame, name)} | frame.maps
-        found = {name: [*value] if dr.depth_v(value) > 1 else [value] for name, value in named.items()}
-        return {name: found[name] for name in MAPS}
+from tests.scenes.open_pair import CASES, MAPS, Pair, weighted
 
 
 @pytest.fixture(scope="module", params=CASES, ids=lambda case: " ".join(case))
@@ -137,14 +76,6 @@ def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[st
         dr.enqueue(dr.ADMode.Forward, fresh[name])
         dr.traverse(dr.ADMode.Forward)
         assert dr.grad(total).numpy()[0] == pytest.approx(expected, abs=0.01 * size), name
-
-
-def weighted(planes: dict[str, list[Any]], weights: dict[str, np.ndarray]) -> Any:
-    total = mi.Float(0)
-    for name, table in weights.items():
-        for plane, w in zip(planes[name], table.T, strict=True):
-            total += dr.sum(plane * upload(np.ascontiguousarray(w, np.float32)))
-    return total
 
 
 # ---------------- what a camera shows of it ----------------

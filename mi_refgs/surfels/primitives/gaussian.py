@@ -67,7 +67,7 @@ class Gaussian(Primitive):
         Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
         """
         p = camera.to_camera(surfels.position())
-        axes = [camera.rotation @ t for t in surfels.frame()]
+        axes = [camera.rotate_to_camera(t) for t in surfels.frame()]
         s, opacity = surfels.scale(), surfels.opacity()
         ahead = dr.detach((p.z > camera.near) & (p.z > 0))
         # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.

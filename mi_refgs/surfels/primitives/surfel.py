@@ -80,7 +80,7 @@ class Surfel(Primitive):
         non-finite.
         """
         p = camera.to_camera(surfels.position())
-        t_u, t_v, n = (camera.rotation @ t for t in surfels.frame())
+        t_u, t_v, n = (camera.rotate_to_camera(t) for t in surfels.frame())
         s, opacity = surfels.scale(), surfels.opacity()
 
         ahead = dr.detach((p.z > camera.near) & (p.z > 0))

@@ -1,0 +1,157 @@
+"""Cameras that are displaced: their numbers, and derivatives of images against float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.stability import exact
+from benchmarks.stability.cases import camera, plain
+from mi_refgs.kernels.device import upload, upload_tensor
+from mi_refgs.reference import image as oracle
+from mi_refgs.render.depth_normals import normals_from_depth
+from mi_refgs.render.pipeline import SurfelScene, render
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.open_pair import CASES, MAPS, Pair, weighted
+
+CENTRE = np.array([0.3, -0.2, 0.1])
+STEP = 1e-6
+
+
+def moved_pose(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """A pose rotated (3, axis times 2 tan(θ/2)) about CENTRE, then moved (3)."""
+    change = np.eye(4)
+    change[:3, :3] = Rotation.from_quat([*(0.5 * motion[:3]), 1]).as_matrix()
+    change[:3, 3] = CENTRE - change[:3, :3] @ CENTRE + motion[3:]
+    return np.asarray(change @ pose)
+
+
+def displaced(eye: Camera, motion: mi.Float) -> Camera:
+    """A camera that is moved in this way, by (6,) numbers under AD."""
+    x = [dr.gather(mi.Float, motion, dr.opaque(mi.UInt32, i)) for i in range(6)]
+    q = dr.normalize(mi.Quaternion4f(0.5 * x[0], 0.5 * x[1], 0.5 * x[2], 1))
+    return eye.displaced(dr.quat_to_matrix(mi.Matrix3f, q), mi.Point3f(CENTRE), mi.Vector3f(*x[3:]))
+
+
+@pytest.fixture(params=[0.0, 0.2], ids=["at zero", "away from zero"])
+def motion(request: pytest.FixtureRequest) -> np.ndarray:
+    """Where derivatives are taken: at the pose itself, and far from it."""
+    return (request.param * np.array([0.3, -0.5, 0.4, 0.2, 0.3, -0.1])).astype(np.float32)
+
+
+@pytest.mark.parametrize("far", [0.0, 1e4])
+def test_displaced_camera_is_at_its_pose(far: float, motion: np.ndarray) -> None:
+    """In float64; also far from the world's origin, where float32 resolves a thousandth."""
+    pose = camera().to_world.copy()
+    pose[:3, 3] += far
+    eye = Camera.from_pose(8, 8, -9, -9, 4, 4, pose)
+    x = np.array(motion, np.float64)
+    centre = mi.Point3f(CENTRE + far)
+    q = Rotation.from_quat([*(0.5 * x[:3]), 1]).as_matrix()
+    found = eye.displaced(mi.Matrix3f(q), centre, mi.Vector3f(x[3:]))
+    change = np.eye(4)
+    change[:3, :3] = q
+    about = np.array(centre, np.float64).ravel()
+    change[:3, 3] = about - q @ about + x[3:]
+    np.testing.assert_allclose(found.pose(), change @ eye.pose(), atol=2e-6)
+    assert found.motion is None
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: " ".join(case))
+def test_derivatives_of_open_scene_are_those_of_float64(case: tuple[str, str], motion: np.ndarray) -> None:
+    """Both modes, for every map of object, surroundings and background, shaded in either order."""
+    pair = Pair(*case)
+    start = np.linalg.inv(moved_pose(np.eye(4), motion.astype(np.float64))) @ pair.case.camera.to_world
+    eye = exact.fast_camera(pair.case).moved(start)
+    rng = np.random.default_rng(11)
+    maps, band = pair.truth(pair.values)
+    weights = {
+        name: np.where(band[:, None], 0, rng.normal(size=maps[name].shape) / np.abs(maps[name]).max())
+        for name in MAPS
+    }
+
+    def define(at: np.ndarray) -> float:
+        maps, _ = pair.truth(pair.values, moved_pose(start, at))
+        return sum(float(np.sum(w * maps[key])) for key, w in weights.items())
+
+    def total(leaf: mi.Float) -> mi.Float:
+        params = {name: upload_tensor(x) for name, x in pair.values.items()}
+        return weighted(pair.planes(params, displaced(eye, leaf)), weights)
+
+    require_slopes(total, define, motion)
+
+
+@pytest.mark.parametrize("primitive", ["surfel", "gaussian"])
+def test_derivatives_of_radiance_are_those_of_float64(primitive: str, motion: np.ndarray) -> None:
+    """Spherical harmonics of degree 1, which depend on the direction, on either primitive."""
+    case = plain("sh", at="surfel", reflectance="radiance", camera=camera()).rounded()
+    raw = {name: case.raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
+    if primitive == "gaussian":
+        raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1] - 1], axis=1)
+    start = np.linalg.inv(moved_pose(np.eye(4), motion.astype(np.float64))) @ case.camera.to_world
+    pixels = np.arange(case.camera.width * case.camera.height)
+    case = replace(case, raw=raw)
+    order = exact.product_order(case, pixels)
+
+    def maps(pose: np.ndarray) -> oracle.Image:
+        moved = replace(case, camera=replace(case.camera, to_world=pose))
+        return oracle.render(exact.scene_of(moved, pixels, order))
+
+    image = maps(case.camera.to_world)
+    weight = np.random.default_rng(3).normal(size=image.maps["radiance"].shape)
+    weight[image.band] = 0
+    eye, surfels = exact.fast_camera(case).moved(start), Surfels.from_numpy(raw)
+    scene = SurfelScene(surfels, Shading(at="surfel", reflectance="radiance"))
+
+    def total(leaf: mi.Float) -> mi.Float:
+        return weighted({"radiance": [*render(scene, displaced(eye, leaf)).radiance]}, {"radiance": weight})
+
+    def define(at: np.ndarray) -> float:
+        return float(np.sum(weight * maps(moved_pose(start, at)).maps["radiance"]))
+
+    require_slopes(total, define, motion)
+
+
+def test_normals_of_depth_turn_with_camera(motion: np.ndarray) -> None:
+    """Those of a fixed depth map."""
+    rng = np.random.default_rng(4)
+    depth = (3 + 0.05 * rng.normal(size=(8, 9))).astype(np.float32).ravel()
+    eye = Camera.from_pose(9, 8, -9, -9, 4.5, 4, camera().to_world)
+    weight = rng.normal(size=(3, 72)).astype(np.float32)
+
+    def total(leaf: mi.Float) -> mi.Float:
+        normal, _ = normals_from_depth(upload(depth), mi.Float(1), displaced(eye, leaf))
+        return sum((dr.sum(x * upload(w)) for x, w in zip(normal, weight, strict=True)), mi.Float(0))
+
+    still, _ = normals_from_depth(upload(depth), mi.Float(1), eye)
+
+    def define(at: np.ndarray) -> float:
+        turn = Rotation.from_quat([*(0.5 * at[:3]), 1]).as_matrix()
+        return float(np.sum(weight * (turn @ np.array(still, np.float64))))
+
+    require_slopes(total, define, motion)
+
+
+def require_slopes(total: Any, define: Any, motion: np.ndarray) -> None:
+    """The gradient of `total`, and its forward derivative, are the differences of `define`."""
+    at = motion.astype(np.float64)
+    sides = [[define(at + sign * STEP * axis) for sign in (1, -1)] for axis in np.eye(6)]
+    expected = np.array([(above - below) / (2 * STEP) for above, below in sides])
+    leaf = mi.Float(motion)
+    dr.enable_grad(leaf)
+    dr.backward(total(leaf))
+    np.testing.assert_allclose(np.array(dr.grad(leaf)), expected, atol=2e-3 * np.abs(expected).max())
+    tangent = np.array([0.5, -1, 0.7, 0.3, 1, -0.4], np.float32)
+    leaf = mi.Float(motion)
+    dr.enable_grad(leaf)
+    dr.set_grad(leaf, mi.Float(tangent))
+    found = dr.forward_to(total(leaf))
+    assert float(found[0]) == pytest.approx(expected @ tangent, abs=4e-3 * np.abs(expected).max())
