@@ -146,7 +146,7 @@ class FitSetup:
         if self.exposure is not None and GAIN in params:
             groups[GAIN] = Group(self.exposure.rate, 0.1 * self.exposure.rate, iterations)
         if self.cameras is not None and POSE in params:
-            groups[POSE] = Group(self.cameras.rate, 0.1 * self.cameras.rate, iterations)
+            groups[POSE] = Group(self.cameras.rate, 0.03 * self.cameras.rate, iterations)
         return groups
 
     def _of_table(self, names: tuple[str, ...], extent: float) -> dict[str, Group]:

@@ -28,7 +28,9 @@ def render(view: View) -> np.ndarray:
 def disturbed(rng: np.random.Generator) -> tuple[View, np.ndarray]:
     """A view whose pose is wrong by 1° and by 1 % of the distance, and the pose of its image."""
     pose = look_at(DISTANCE * np.array([0.6, 0.7, 0.4]), np.zeros(3))
-    view = View("a", SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose, Pixels(np.zeros((SIZE, SIZE, 3), np.float32)))
+    view = View(
+        "a", SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose, Pixels(np.zeros((SIZE, SIZE, 3), np.float32))
+    )
     view = replace(view, pixels=Pixels(render(view).astype(np.float32)))
     axis, shift = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
     wrong = pose.copy()

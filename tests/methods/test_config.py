@@ -251,6 +251,8 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
             ["surfels.channels: is called surfels.attributes now", "remove surfels.channels"],
         ),
         (f"{STAGE}[light]\nevery = 0", ["light.every: 0", "1 or more"]),
+        (f"{STAGE}[cameras]\nrate = -1", ["cameras.rate: -1", "0 or more"]),
+        (f"{STAGE}[cameras]\ncorrections = 'maybe'", ["cameras: corrections: 'maybe'", "judged, on, off"]),
     ],
 )
 def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> None:
