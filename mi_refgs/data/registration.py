@@ -1,6 +1,6 @@
 """Registration of a camera: the rigid correction of its pose that fits renders to its image.
 
-Gauss-Newton from coarse images to fine ones, on differences as displayed; derivatives are differences of
+Gauss-Newton from averaged images to whole ones, on differences as displayed; derivatives are differences of
 renders. [Lucas and Kanade 1981; coarse to fine: Bergen et al. 1992]
 """
 
@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from mi_refgs.data.view import View
+from mi_refgs.io.images import box_downscale
 
 STEP = 0.1
-"""Pixels that the image moves by for a difference."""
-COARSEST = 48  # pixels along the shorter side of the coarsest image at least
+"""Pixels of the averaged image that the image moves by for a difference."""
+COARSEST = 48  # pixels along the shorter side of the image that is averaged most, at least
 ROUNDS = 5  # Gauss-Newton steps per image size
 DAMPING = 1e-3
 """Of the diagonal [Levenberg 1944]: a flat scene hardly distinguishes rotation from translation."""
@@ -28,34 +29,44 @@ def registered(view: View, render: Render, distance: float, where: np.ndarray | 
     """The view with the pose whose render differs least from its image.
 
     `distance`: of what the camera looks at, scene units. `where` (H, W) bool: pixels that count, by default
-    all. `render` is called with views of smaller images too. The pose stays if no other is better.
+    all. The pose stays if no other is better.
     """
-    view, block = view.load(), 1
+    view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
     pixels = np.ones((view.height, view.width), bool) if where is None else where
-    while min(view.width, view.height) // (2 * block) >= COARSEST:
-        block *= 2
-    while block:
-        level = view if block == 1 else view.averaged(block)
-        chosen = pixels[::block, ::block][: level.height, : level.width]
-        view = replace(view, to_world=_fitted(level, render, distance, chosen).to_world)
-        block //= 2
-    return view
+    while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
+        blocks.insert(0, 2 * blocks[0])
+    found = view
+    for block in blocks:
+        found = _fitted(found, render, distance, pixels, block)
+    errors = [np.mean(_difference(one, render, pixels, 1) ** 2) for one in (view, found)]
+    return found if errors[1] < errors[0] else view
 
 
-def _fitted(view: View, render: Render, distance: float, where: np.ndarray) -> View:
-    """The view with its pose fitted at the size of its image."""
-    truth = np.clip(view.displayed[where], 0, 1)
+def _difference(view: View, render: Render, where: np.ndarray, block: int) -> np.ndarray:
+    """Render minus image of the pixels that count, both averaged over block × block pixels as displayed.
+
+    Renders are averaged, too: a smaller render would show other details, and fit best at another pose.
+    """
+    shown, truth = (box_downscale(np.clip(image, 0, 1), block) for image in (render(view), view.displayed))
+    chosen = where[::block, ::block][: truth.shape[0], : truth.shape[1]]
+    return np.asarray((shown - truth)[chosen], np.float64).ravel()
+
+
+def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> View:
+    """The view with its pose fitted to the image averaged over block × block pixels."""
+    unit = np.repeat([1.0, distance], 3) * block / view.fx  # moves what the camera looks at by such a pixel
 
     def difference(moved: View) -> np.ndarray:
-        return (np.clip(render(moved)[where], 0, 1) - truth).ravel().astype(np.float64)
+        return _difference(moved, render, where, block)
 
-    unit = np.repeat([1.0, distance], 3) / view.fx  # moves what the camera looks at by a pixel
+    # Derivatives are those of the first pose: taken anew after every change, they cost most of the time.
     now = difference(view)
+    shifts = [difference(_moved(view, STEP * unit * axis)) - now for axis in np.eye(6)]
+    slope = np.stack(shifts, axis=1) / STEP
+    normal = slope.T @ slope
+    normal += DAMPING * np.diag(np.diag(normal))
     for _ in range(ROUNDS):
-        shifts = [difference(_moved(view, STEP * unit * axis)) - now for axis in np.eye(6)]
-        slope = np.stack(shifts, axis=1) / STEP
-        normal = slope.T @ slope
-        change, *_ = np.linalg.lstsq(normal + DAMPING * np.diag(np.diag(normal)), -slope.T @ now, rcond=None)
+        change, *_ = np.linalg.lstsq(normal, -slope.T @ now, rcond=None)
         candidate = _moved(view, unit * change)
         after = difference(candidate)
         before, now_squared = float(now @ now), float(after @ after)
