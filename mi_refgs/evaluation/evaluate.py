@@ -20,7 +20,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics
 from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
-from mi_refgs.evaluation.protocols import Maps, ProtocolScores, captions, measures_of
+from mi_refgs.evaluation.protocols import Maps, Measures, ProtocolScores, captions, measures_of
 from mi_refgs.evaluation.scores import MAP_SCORES
 from mi_refgs.evaluation.surface import TrueSurface, sample, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, with_gain
@@ -94,8 +94,8 @@ def evaluate(
 
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
-    measured = Measured(benchmark=None if measures is None else ProtocolScores(measures))
-    _measure(measured, fitted, views, surface, samples, [run.path / name for name in renders], progress)
+    files = [run.path / name for name in renders]
+    measured = _measure(fitted, views, surface, samples, files, progress, measures)
 
     # The numbers.
     light_scores, footer = _light(fitted, views)
@@ -152,14 +152,14 @@ class Measured:
 
 
 def _measure(
-    measured: Measured,  # filled in
     fitted: TrainedScene,
     views: Dataset,
     surface: TrueSurface | None,
     samples: int,
     images: Sequence[Path],  # one per view
     progress: bool,
-) -> None:
+    measures: Measures | None,  # of a benchmark
+) -> Measured:
     """Render and measure the test views one by one, and write their images."""
     render = fitted.renderer(samples=samples)
     object_only = None
@@ -167,6 +167,7 @@ def _measure(
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     material_maps = decomposition.material_maps(fitted, samples)
     in_sheets = evenly_spread(len(views.views), SHEET_VIEWS)
+    measured = Measured(benchmark=None if measures is None else ProtocolScores(measures))
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
@@ -196,6 +197,7 @@ def _measure(
                 row["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
             measured.panels.append(row)
             measured.materials.append(materials)
+    return measured
 
 
 def _protocols(
