@@ -274,11 +274,14 @@ def _view(frame: Frame, options: ReadOptions) -> View:
 
 def _mask(frame: Frame, image: ImageFile) -> Mask | None:
     """The mask of an image: the frame's, or without alpha a file beside the image, or one of `masks`."""
-    file, masks = image.path, frame.file.parent / MASKS
-    named = frame.path("mask_path") or (None if image.has_alpha() else beside(file, ALPHA))
-    if named is not None:
+    if (named := frame.path("mask_path")) is not None:
         return Mask(named)
-    if image.has_alpha() or not masks.is_dir():
+    if image.has_alpha():
+        return None
+    file, masks = image.path, frame.file.parent / MASKS
+    if (found := beside(file, ALPHA)) is not None:
+        return Mask(found)
+    if not masks.is_dir():
         return None
     name = file.relative_to(frame.file.parent)
     below = name.relative_to(name.parts[0]) if name.parts[0].startswith(IMAGES) else name

@@ -21,7 +21,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics
 from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
-from mi_refgs.evaluation.protocols import Maps, ProtocolScores, captions, measures_of
+from mi_refgs.evaluation.protocols import Maps, Measures, ProtocolScores, captions, measures_of
 from mi_refgs.evaluation.scores import MAP_SCORES
 from mi_refgs.evaluation.surface import TrueSurface, sample, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, displayed_of, image_of, with_gain
@@ -97,12 +97,11 @@ def evaluate(
 
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
+    files = [run.path / name for name in renders]
+    measured = _measure(fitted, views, surface, samples, files, progress, measures)
     cameras_decided = _decision(run, CAMERAS, "views")
-    measured = Measured(
-        benchmark=None if measures is None else ProtocolScores(measures),
-        registers=cameras_decided is not None and bool(cameras_decided.get("corrected")),
-    )
-    _measure(measured, fitted, views, surface, samples, [run.path / name for name in renders], progress)
+    if cameras_decided is not None and cameras_decided["corrected"]:
+        _register(measured.per_view, fitted, views, samples, progress)
 
     # The numbers.
     light_scores, footer = _light(fitted, views)
@@ -155,27 +154,27 @@ class Measured:
     errors: decomposition.Decomposition = field(default_factory=decomposition.Decomposition)
     budget: ErrorBudget = field(default_factory=ErrorBudget)
     benchmark: ProtocolScores | None = None
-    registers: bool = False  # whether test views are registered, too
     panels: list[dict[str, np.ndarray]] = field(default_factory=list)  # rows of SHEET
     materials: list[decomposition.MeasuredView] = field(default_factory=list)  # rows of DECOMPOSITION
 
 
 def _measure(
-    measured: Measured,  # filled in
     fitted: TrainedScene,
     views: Dataset,
     surface: TrueSurface | None,
     samples: int,
     images: Sequence[Path],  # one per view
     progress: bool,
-) -> None:
+    measures: Measures | None,  # of a benchmark
+) -> Measured:
     """Render and measure the test views one by one, and write their images."""
-    render, image_only = fitted.renderer(samples=samples), fitted.renderer(aovs=False, samples=samples)
+    render = fitted.renderer(samples=samples)
     object_only = None
     if fitted.surroundings is not None:
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     material_maps = decomposition.material_maps(fitted, samples)
     in_sheets = evenly_spread(len(views.views), SHEET_VIEWS)
+    measured = Measured(benchmark=None if measures is None else ProtocolScores(measures))
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
@@ -184,14 +183,6 @@ def _measure(
         scores = _scores(rendered, view, views, measured.per_view[0] if measured.per_view else {})
         gain, gained = with_gain(frame, view, views)
         scores |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
-        if measured.registers:
-            moved = registered(
-                view,
-                lambda other: image_of(displayed_of(image_only(other.camera()), views), other),
-                views.scene_extent,
-            )
-            shown = image_of(displayed_of(image_only(moved.camera()), views), moved)
-            scores["psnr_registered"] = metrics.psnr(shown, view.displayed)
         measured.per_view.append(scores)
 
         # Errors of materials, of concave pixels and per class of pixels.
@@ -213,6 +204,24 @@ def _measure(
                 row["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
             measured.panels.append(row)
             measured.materials.append(materials)
+    return measured
+
+
+def _register(
+    per_view: list[dict[str, Any]], fitted: TrainedScene, views: Dataset, samples: int, progress: bool
+) -> None:
+    """Add `psnr_registered` to the scores of the test views."""
+    render = fitted.renderer(aovs=False, samples=samples)
+
+    def shown(view: View) -> np.ndarray:
+        return image_of(displayed_of(render(view.camera()), views), view)
+
+    rows = with_bar(
+        list(zip(per_view, views.views, strict=True)), "register", unit="view", disable=not progress
+    )
+    for scores, view in rows:
+        moved = registered(view, shown, views.scene_extent)
+        scores["psnr_registered"] = metrics.psnr(shown(moved), moved.displayed)
 
 
 def _protocols(

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.ssim import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
+from mi_refgs.fitting.ssim import C1, C2, WINDOW_RADIUS, window
 from mi_refgs.io.images import psnr_of, srgb_from_linear
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
@@ -58,8 +58,7 @@ def ssim(
     The Gaussian window has 2 radius + 1 pixels on a side. Outside of the image it reads zeros, as in 3DGS and
     Ref-Gaussian, or with the border "mirror" the mirrored image; means are over every pixel.
     """
-    weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / WINDOW_SIGMA) ** 2)
-    weights /= weights.sum()
+    weights = window(radius)
 
     def blur(values: np.ndarray) -> np.ndarray:
         return correlate1d(correlate1d(values, weights, 0, mode=border), weights, 1, mode=border)

@@ -224,18 +224,13 @@ def planned(
         factor += 1
     chosen = at(factor)
     if factor > 1:
-        reason = (
-            f"the fit takes {minutes(limit)} at most; --set data.downscale=1 reads them whole "
-            f"({minutes(at(1).seconds)}), --minutes M gives it other time"
-        )
+        reason, remedy = f"the fit takes {minutes(limit)} at most", "--minutes M gives it other time"
         if factor == shown:
-            reason = (
-                f"{surfels:,.0f} surfels can show them; --set data.downscale=1 reads them whole "
-                f"({minutes(at(1).seconds)}), surfels.max_count gives it more surfels"
-            )
+            reason = f"{surfels:,.0f} surfels can show them"
+            remedy = "surfels.max_count gives it more surfels"
         tell(
             f"{path}: images of {width} × {height} pixels are read as {chosen.width} × {chosen.height}, so "
-            f"that {reason}"
+            f"that {reason}; --set data.downscale=1 reads them whole ({minutes(at(1).seconds)}), {remedy}"
         )
     if chosen.seconds > limit:
         tell(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
+from mi_refgs.cli.command import Protocol
 from mi_refgs.cli.evaluate import benchmark_tables
 from mi_refgs.evaluation import metrics, protocols
 from mi_refgs.evaluation.protocols import PROTOCOLS, Maps, ProtocolScores
@@ -269,3 +270,8 @@ def test_unknown_protocols_and_images_without_alpha_are_refused() -> None:
     refused(lambda: protocols.measures_of("orb", None), "--protocol: orb", "stanford-orb, tensoir")
     refused(lambda: protocols.measures_of("tensoir", opaque), "photographs: alpha", "give RGBA")
     assert protocols.measures_of("ours", opaque) is None
+
+
+def test_the_command_line_offers_every_protocol() -> None:
+    choices, _ = get_args(Protocol)
+    assert get_args(choices) == tuple(PROTOCOLS)

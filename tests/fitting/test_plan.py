@@ -39,6 +39,14 @@ def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
     return dataclasses.replace(small_method(tmp_path), data=DataOptions())
 
 
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Images of 20 × 20 pixels that may be downscaled, on a machine of SPEED."""
+    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "SMALL_IMAGE": 399}.items():
+        monkeypatch.setattr(plan, name, value)
+    return write_data(tmp_path / "data", truth=False)
+
+
 def test_estimate_is_sum_of_stages(method: Method) -> None:
     """8 iterations of the first, 22 of the second, three meshes of 7 views, the files; coarse ones apart."""
     at_100 = 8 * 1 + 22 * 2
@@ -69,12 +77,9 @@ def test_estimate_is_sum_of_stages(method: Method) -> None:
 
 
 def test_largest_images_within_time_limit_are_chosen(
-    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    method: Method, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Images have 20 × 20 pixels; a size that the method says stays."""
-    data = write_data(tmp_path / "data", truth=False)
-    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "SMALL_IMAGE": 399}.items():
-        monkeypatch.setattr(plan, name, value)
     seconds = [plan.estimate(method, SPEED, 3, (20, 20), factor).seconds for factor in (1, 2, 3, 4)]
     assert sorted(seconds, reverse=True) == seconds
 
@@ -103,13 +108,8 @@ def test_largest_images_within_time_limit_are_chosen(
     assert nothing is None and small.data.downscale == 1
 
 
-def test_images_are_no_larger_than_the_surfels_can_show(
-    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_are_no_larger_than_the_surfels_can_show(method: Method, data: Path) -> None:
     """20 × 20 pixels need 25 surfels, those of optional components included; a size that is given stays."""
-    data = write_data(tmp_path / "data", truth=False)
-    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "SMALL_IMAGE": 399, "LEAST": 5}.items():
-        monkeypatch.setattr(plan, name, value)
 
     def chosen(surfels: int, capacity: float = 1.0, **data_options: Any) -> tuple[int | None, list[str]]:
         tried = {"more": MethodComponent(1, 1, {"surfels": {"capacity": capacity}})}
@@ -128,13 +128,8 @@ def test_images_are_no_larger_than_the_surfels_can_show(
     assert chosen(24, downscale=1) == (1, [])
 
 
-def test_surfels_beyond_the_time_limit_are_not_tried(
-    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_surfels_beyond_the_time_limit_are_not_tried(method: Method, data: Path) -> None:
     """The image size is chosen first; twice or four times the surfels have to fit into what is left."""
-    data = write_data(tmp_path / "data", truth=False)
-    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "SMALL_IMAGE": 399}.items():
-        monkeypatch.setattr(plan, name, value)
     tried = {
         "colour": MethodComponent(1, 1),
         "twice": MethodComponent(1, 1, {"surfels": {"capacity": 2}}),
@@ -158,12 +153,10 @@ def test_surfels_beyond_the_time_limit_are_not_tried(
 @pytest.mark.parametrize("preset", ["", *PRESETS])
 @pytest.mark.parametrize("limit", [None, 1e-3])
 def test_small_images_are_never_downscaled_unasked(
-    preset: str, limit: float | None, method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    preset: str, limit: float | None, method: Method, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """400 pixels where that many are small, whatever the preset and the time; where 399 are, they are."""
-    data = write_data(tmp_path / "data", truth=False)
-    for name, value in {"speed_of": lambda *_: SPEED, "WORTH": 0, "LEAST": 5, "SMALL_IMAGE": 400}.items():
-        monkeypatch.setattr(plan, name, value)
+    monkeypatch.setattr(plan, "SMALL_IMAGE", 400)
     method = dataclasses.replace(method, preset=preset)
     said: list[str] = []
     chosen, expected = plan.planned(method, data, limit, said.append)
