@@ -108,9 +108,7 @@ class ProfileCommand:
             method = folder.method()
             if not folder.checkpoints():
                 raise InputError(f"{self.path}: checkpoints: none yet; train on, or profile its data set")
-            trainer = Trainer(
-                method, views_of_run(folder, method, "train", self.data, corrected=False), folder
-            )
+            trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)
             return trainer, [method.stage_at(max(trainer.iteration, 1))[0]]
         if self.data is not None:
             raise InputError(f"--data: {self.path} is no run; drop --data")

@@ -99,8 +99,8 @@ def evaluate(
     surface = TrueSurface.read(views.path, views.offset)
     files = [run.path / name for name in renders]
     measured = _measure(fitted, views, surface, samples, files, progress, measures)
-    cameras_decided = _decision(run, CAMERAS, "views")
-    if cameras_decided is not None and cameras_decided["corrected"]:
+    cameras_decided = _decision(run, CAMERAS, "to_world")
+    if cameras_decided is not None and cameras_decided.get("corrected"):
         _register(measured.per_view, fitted, views, samples, progress)
 
     # The numbers.

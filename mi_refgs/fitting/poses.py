@@ -99,13 +99,11 @@ def record(setup: FitSetup, state: FitState) -> dict[str, Any] | None:
     """The decision and the corrected poses, as a run records them; None if nothing was decided."""
     if state.cameras is None:
         return None
-    poses = []
+    poses = {}
     if POSE in state.params:
-        poses = [
-            {"name": view.name, "to_world": camera_of(setup, state.params, i).pose().tolist()}
-            for i, view in enumerate(setup.data.views)
-        ]
-    return state.cameras | {"views": poses}
+        for i, view in enumerate(setup.data.views):
+            poses[view.name] = camera_of(setup, state.params, i).pose().tolist()
+    return state.cameras | {"to_world": poses}
 
 
 def sentence(decision: Mapping[str, Any]) -> str:

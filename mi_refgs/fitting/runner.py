@@ -232,12 +232,12 @@ def finish(trainer: Trainer, run: Run) -> str | None:
         run.write_json(exposure.EXPOSURE_FILE, gains)
     if (cameras := poses.record(trainer.setup, trainer.fit)) is not None:
         run.write_json(CAMERAS, cameras)
-    warning, first = None, trainer.data.views[0]
+    warning, camera = None, trainer.camera(0)
     try:
-        first = read_views(trainer.method, trainer.data.path, "test").views[0]
+        camera = read_views(trainer.method, trainer.data.path, "test").views[0].camera()
     except InputError as error:
         warning = f"{error} (scene.xml gets a training camera, and `refgs eval` will need test views)"
-    write_if_stale(run, trainer.method, lambda _: first.camera())
+    write_if_stale(run, trainer.method, lambda _: camera)
     return warning
 
 

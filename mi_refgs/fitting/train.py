@@ -70,7 +70,7 @@ class Trainer:
         """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start.
 
         `targets` of another fit are shared if they are of the same data. `tell` is called with decisions
-        about the exposure, `warn` with steps that failed.
+        about exposure and cameras, `warn` with steps that failed.
         """
         self.run, self.tell, self.warn = run, tell, warn
         self.before_step: Callable[[Trainer], None] | None = None  # is called before each step of `train`

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,9 @@ from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import save
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.runs.views import read_views, with_region
+from mi_refgs.runs.views import read_views, with_poses, with_region
 from mi_refgs.splat import Camera
 
 EDITS = "edit.json"
@@ -32,6 +32,7 @@ class Provenance:
     data: Path | None = None
     region: Region | None = None  # in images without alpha
     edits: tuple[dict[str, Any], ...] = ()  # made since, in order: `editing.Edited.record`
+    cameras: dict[str, Any] = field(default_factory=dict)  # `Run.cameras`
 
     @staticmethod
     def of(run: Run) -> Provenance:
@@ -39,11 +40,12 @@ class Provenance:
         method = run.method()
         record = run.path / EDITS
         edits = read_json(record).get("edits", []) if record.is_file() else []
-        return Provenance(method, run.dataset(), run.region(), tuple(edits))
+        return Provenance(method, run.dataset(), run.region(), tuple(edits), run.cameras())
 
     def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
         """Write a scene as a run folder (`runs.export.save`); raises InputError as that does."""
-        records = {EDITS: {"edits": self.edits}} if self.edits else None
+        records = {EDITS: {"edits": self.edits} if self.edits else {}, CAMERAS: self.cameras}
+        records = {name: record for name, record in records.items() if record}
         save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
     def with_data(self, folder: Path | None) -> Provenance:
@@ -69,7 +71,8 @@ class Provenance:
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(f"views: {split}: {gone}; use cameras(), or restore the data set")
-        return with_region(read_views(self.method, self.data, split, decode=decode), self.region)
+        views = with_region(read_views(self.method, self.data, split, decode=decode), self.region)
+        return with_poses(views, self.cameras)
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
         """Return the named cameras of some splits; without a data set, cameras around the surfels.
@@ -80,7 +83,8 @@ class Provenance:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
         shots = []
         for split in splits:
-            views = originals = read_views(self.method, self.data, split, truth=False, decode=False).views
+            data = read_views(self.method, self.data, split, truth=False, decode=False)
+            views, originals = with_poses(data, self.cameras).views, data.views
             if (self.method.data.downscale or 1) > 1:  # image files are those on disk
                 whole = self.method.downscaled(1)
                 originals = read_views(whole, self.data, split, truth=False, decode=False).views

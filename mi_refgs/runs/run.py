@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.data.poses import rigid
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
@@ -127,6 +128,22 @@ class Run:
         record = self.path / DATASET
         found = read_json(record).get("region") if record.is_file() else None
         return None if found is None else Region.of(found, record)
+
+    def cameras(self) -> dict[str, Any]:
+        """The decision about camera corrections, with the corrected poses by view; {} if nothing was decided.
+
+        Raises InputError for a record that cannot be used.
+        """
+        record = self.path / CAMERAS
+        found = read_json(record) if record.is_file() else {}
+        try:
+            for name, pose in found.get("to_world", {}).items():
+                rigid(np.array(pose, dtype=np.float64).reshape(4, 4), f"{record}: to_world: {name}")
+        except (AttributeError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{record}: to_world: cannot be read ({error}); restore or remove the file"
+            ) from error
+        return found
 
     # ---------------- checkpoints ----------------
 

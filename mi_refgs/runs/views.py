@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.data.poses import rigid
 from mi_refgs.data.region import Region
-from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
-from mi_refgs.runs.run import CAMERAS, DATASET, Run
+from mi_refgs.runs.run import DATASET, Run
 
 SAME_REGION = 1e-6
 """Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""
@@ -38,18 +36,12 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True, decod
 
 
 def views_of_run(
-    run: Run,
-    method: Method,
-    split: str,
-    path: Path | None = None,
-    decode: bool = True,
-    corrected: bool = True,
+    run: Run, method: Method, split: str, path: Path | None = None, decode: bool = True
 ) -> Dataset:
     """Read a split of the data set of a run, or of the one at `path`, with the options of the method.
 
-    Its region of interest is the run's, and so are the poses of its training views, if they are `corrected`.
-    Raises InputError as `read_dataset` and `Run.region` do, and if the run records no data set or the data
-    set is gone.
+    Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
+    run records no data set or the data set is gone.
     """
     if path is None:
         record, path = run.path / DATASET, run.dataset()
@@ -57,23 +49,16 @@ def views_of_run(
             raise InputError(f"{record}: path: the run records no data set; name one with --data")
         if not os.path.isdir(path):  # False for impossible names too
             raise InputError(f"{record}: path: {path} is gone; name the data set's folder with --data")
-    views = with_region(read_views(method, path, split, decode=decode), run.region())
-    if corrected and split == "train":
-        views = replace(views, views=_corrected(views.views, run.path / CAMERAS))
-    return views
+    return with_region(read_views(method, path, split, decode=decode), run.region())
 
 
-def _corrected(views: tuple[View, ...], record: Path) -> tuple[View, ...]:
-    """The views with the poses of a record of these very views; themselves without one."""
-    rows = read_json(record).get("views", ()) if record.is_file() else ()
-    try:
-        if [row["name"] for row in rows] != [view.name for view in views]:
-            return views
-        poses = [np.array(row["to_world"], dtype=np.float64).reshape(4, 4) for row in rows]
-    except (TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{record}: views: cannot be read ({error}); restore or remove the file") from error
-    rigid_poses = [rigid(pose, f"{record}: to_world") for pose in poses]
-    return tuple(replace(view, to_world=pose) for view, pose in zip(views, rigid_poses, strict=True))
+def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:
+    """Replace the poses by those that a fit corrected (`Run.cameras`), if these are its training views."""
+    poses = cameras.get("to_world", {})
+    if views.split != "train" or [*poses] != [view.name for view in views.views]:
+        return views
+    corrected = (replace(view, to_world=np.array(poses[view.name], np.float64)) for view in views.views)
+    return replace(views, views=tuple(corrected))
 
 
 def with_region(

@@ -15,7 +15,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.runs.export import newest
 from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.runs.views import views_of_run
+from mi_refgs.runs.views import views_of_run, with_poses
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.comparison import add_comparison
 from mi_refgs.viewer.loop import added
@@ -85,7 +85,8 @@ def splits_of(run: Run, data: Path | None, tell: Tell) -> dict[str, Dataset]:
     if data is not None or (run.path / DATASET).is_file():
         for split in ("train", "test"):
             try:
-                found[split] = views_of_run(run, method, split, data, decode=False)
+                views = views_of_run(run, method, split, data, decode=False)
+                found[split] = with_poses(views, run.cameras())
             except InputError as error:
                 if data is not None:
                     raise

@@ -25,7 +25,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import read_png
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.ply import write_ply
 from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
@@ -96,6 +96,20 @@ def test_metrics_equal_those_of_the_trainer(run: Run, trainer: Trainer, views: D
         scores.append(metrics.psnr(images.image_array(planes, SIZE, SIZE), view.image))
     assert math.isclose(result["psnr"], np.mean(scores), abs_tol=1e-4)
     assert [view["psnr"] for view in result["views"]] == pytest.approx(scores, abs=1e-4)
+
+
+def test_test_cameras_are_registered_if_fit_corrected_its_own(run: Run) -> None:
+    """Both scores are there: with the cameras as they are, and registered."""
+    result = evaluate(run)
+    assert result["psnr_registered"] is None and "did not correct" in result["registered_reason"]
+    assert result["cameras"] is None
+    decision = {"iteration": 3, "corrected": True, "psnr": 20.0, "psnr_registered": 22.0, "judges": 3}
+    run.write_json(CAMERAS, decision | {"to_world": {}})
+    registered = evaluate(run)
+    assert registered["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
+    assert registered["cameras"] == decision and registered["registered_reason"] is None
+    assert all(view["psnr_registered"] >= view["psnr"] for view in registered["views"])
+    assert registered["psnr_registered"] > registered["psnr"]
 
 
 def test_evaluate_measures_the_scene_files(run: Run) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.common.scenes import discs
+from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.poses import poses_around
@@ -26,8 +28,9 @@ from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import POSE, CameraOptions, DataOptions, Method, Refine
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Request, SurfelScene, render
+from mi_refgs.render.samples import supersampled
 from mi_refgs.runs.run import CAMERAS, Run
-from mi_refgs.runs.views import _corrected
+from mi_refgs.runs.views import with_poses
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.highlight import ball, require_same_state, run_folder, small_method, step_to
@@ -111,12 +114,13 @@ def opposed(trainer: Trainer, rows: np.ndarray, index: int, i: int, change: floa
     return moved
 
 
-@pytest.mark.parametrize("stage", ["initial", "deferred"])
+@pytest.mark.parametrize(("stage", "cropped"), [("initial", False), ("deferred", False), ("deferred", True)])
 def test_gradient_of_step_is_that_of_moved_camera(
-    stage: str, method: Method, rng: np.random.Generator
+    stage: str, cropped: bool, method: Method, rng: np.random.Generator
 ) -> None:
-    """All losses of a step, in either shading order, within what differences of a float32 loss with the kinks
-    of L1 and the cut of footprints resolve; `test_camera_motion` compares images with float64."""
+    """All losses of a step, in either shading order, also of a supersampled part of the view, within what
+    differences of a float32 loss with the kinks of L1 and the cut of footprints resolve; `test_camera_motion`
+    compares images with float64."""
     trainer = step_to(Trainer(dataclasses.replace(method, cameras=None), ball(48)), 4)
     trainer.setup = type(trainer.setup)(method, trainer.data)
     rows, index = 0.01 * rng.normal(size=(6, 6)), 2
@@ -127,9 +131,12 @@ def test_gradient_of_step_is_that_of_moved_camera(
 
     def loss(table: Any) -> Any:
         target = trainer.targets[index]
+        if cropped:
+            target = target.cropped(PATCH_EDGE, 0, 3 * PATCH_EDGE, 2 * PATCH_EDGE)
         camera = poses.corrected(trainer.setup, {POSE: table}, index, target.camera)
         target = dataclasses.replace(target, camera=camera)
-        frame = render(scene, camera, Request(("normal",)))
+        view = partial(render, scene, request=Request(("normal",)))
+        frame = supersampled(view, camera, 4 if cropped else 1)
         return objective(LossInputs.of(frame, target, trainer.data, light), method.loss, 10)[0]
 
     leaf = upload_tensor(rows.astype(np.float32))
@@ -178,10 +185,11 @@ def test_fit_with_corrections_resumes_bit_for_bit(
     record = poses.record(second.setup, second.fit)
     assert record is not None and record["corrected"]
     run.write_json(CAMERAS, record)
-    for i, view in enumerate(_corrected(second.data.views, run.path / CAMERAS)):
+    for i, view in enumerate(with_poses(second.data, run.cameras()).views):
         np.testing.assert_array_equal(view.to_world, second.camera(i).pose())
     fewer = dataclasses.replace(ball(), views=ball().views[1:])
-    assert _corrected(fewer.views, run.path / CAMERAS) is fewer.views  # of another data set
+    for others in (fewer, dataclasses.replace(ball(), split="test")):
+        assert with_poses(others, run.cameras()) is others
     second.save()
     with pytest.raises(InputError, match="5 training views, but the checkpoint has camera corrections of 6"):
         Trainer(method, fewer, Run(tmp_path / "run"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.methods.read import assignments, load_resolved
 from mi_refgs.render.surroundings import Surroundings, nothing_around
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import CAMERAS, Run
 from tests.helpers import refused
 from tests.scenes.integrator import sky
 from tests.scenes.known import CENTRES, SIZE, with_background
@@ -109,6 +110,31 @@ def test_cameras_without_data_set_surround_the_object(balls: Reconstruction, tmp
     spread = np.ptp([camera.pose()[:3, 3] for camera in lost.turntable(4)], axis=0)
     assert spread[2] < 1e-6 and spread[0] > 1
     refused(lost.views, "gone is gone; use cameras")
+
+
+def test_training_cameras_are_those_that_the_fit_corrected(balls: Reconstruction, tmp_path: Path) -> None:
+    """Cameras, views and exported cameras, also of a saved copy; test cameras stay."""
+    run = Run(shutil.copytree(balls.folder or Path(), tmp_path / "run"))
+    names = [view.name for view in balls.views("train").views]
+    poses = [camera.pose() for camera in balls.cameras("train")]
+    poses[1][:3, 3] += [0.25, 0, 0]
+    record = dict(zip(names, [pose.tolist() for pose in poses], strict=True))
+    run.write_json(CAMERAS, {"corrected": True, "to_world": record})
+    corrected = mi_refgs.load(run.path).save(tmp_path / "copy")
+    for camera, view, pose in zip(
+        corrected.cameras("train"), corrected.views("train").views, poses, strict=True
+    ):
+        np.testing.assert_array_equal(view.to_world, pose)
+        np.testing.assert_allclose(camera.pose(), pose, atol=1e-6)
+    np.testing.assert_array_equal(corrected.cameras()[1].pose(), balls.cameras()[1].pose())
+    frames: list[Any] = []
+    for made in (balls, corrected):
+        files = made.export("cameras", tmp_path / str(len(frames)))
+        frames.append(json.loads(files[0].read_text())["frames"])
+    moved = [new["file_path"] for old, new in zip(*frames, strict=True) if old != new]
+    assert moved == ["train/r_001.png"]
+    run.write_json(CAMERAS, {"corrected": True, "to_world": {names[0]: [1, 2]}})
+    refused(lambda: mi_refgs.load(run.path), "cameras.json: to_world: cannot be read")
 
 
 def test_turntable_of_an_open_scene_follows_a_moved_object(balls: Reconstruction) -> None:
