@@ -19,7 +19,8 @@ STEP = 0.1
 COARSEST = 48  # pixels along the shorter side of the image that is averaged most, at least
 ROUNDS = 5  # Gauss-Newton steps per image size
 DAMPING = 1e-3
-"""Of the diagonal [Levenberg 1944]: a flat scene hardly distinguishes rotation from translation."""
+"""Fraction of the diagonal that is added to it [Levenberg 1944]: flat scenes hardly distinguish rotation from
+translation."""
 ENOUGH = 1e-3  # relative decrease of the squared error below which a size is finished
 
 Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a view's camera
