@@ -9,13 +9,15 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import metal_trial
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.runs.run import Run
+from mi_refgs.splat import splat
 from mi_refgs.surfels.attributes import sigmoid
-from tests.scenes.tiny import SETTINGS, write_data, write_method
+from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
 TRIAL = "metal_trial.until=4"
 
@@ -39,27 +41,36 @@ def metallic(trainer: Trainer) -> np.ndarray:
     return np.asarray(sigmoid(trainer.surfels.raw["metallic"].numpy()))
 
 
+def judged(
+    monkeypatch: pytest.MonkeyPatch, dielectric: np.ndarray | float, metal: np.ndarray | float
+) -> list[Trainer]:
+    """Replace the errors of both trials, (H, W) each; returns the trials, when they have run."""
+    trials: list[Trainer] = []
+
+    def error(trainer: Trainer, view: View) -> np.ndarray:
+        if trainer not in trials:
+            trials.append(trainer)
+        return np.broadcast_to(
+            metal if trainer is trials[-1] and len(trials) == 2 else dielectric, (SIZE, SIZE)
+        )
+
+    monkeypatch.setattr(metal_trial, "_squared_error", error)
+    return trials
+
+
 @pytest.mark.parametrize("better", ["dielectric", "metal"])
 def test_the_gain_of_metal_decides(
     better: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Metal has to gain enough; metallic is held during the trial and learns afterwards."""
     held = metal_trial.METAL if better == "metal" else metal_trial.DIELECTRIC
-    ends: list[np.ndarray] = []
-    begun = metal_trial._begun
-
-    def scored(trainer: Trainer, value: float, steps: int) -> tuple[float, Trainer]:
-        _, end = begun(trainer, value, steps)
-        ends.append(metallic(end))
-        assert end.iteration == steps == 4
-        gain = metal_trial.METAL_GAIN * (1.01 if better == "metal" else 0.99)
-        return 20.0 + gain * (value == metal_trial.METAL), end
-
-    monkeypatch.setattr(metal_trial, "_begun", scored)
+    gain = metal_trial.METAL_GAIN * (1.01 if better == "metal" else 0.99)
+    trials = judged(monkeypatch, 0.01, 0.01 * 10 ** (-gain / 10))
     trainer, said = fitted(views, tmp_path, TRIAL)
-    np.testing.assert_allclose(ends[0], metal_trial.DIELECTRIC, atol=1e-6)
-    np.testing.assert_allclose(ends[1], metal_trial.METAL, atol=1e-6)
-    assert f"metallic starts as {better}: " in " ".join(said)
+    assert [trial.iteration for trial in trials] == [4, 4]
+    np.testing.assert_allclose(metallic(trials[0]), metal_trial.DIELECTRIC, atol=1e-6)
+    np.testing.assert_allclose(metallic(trials[1]), metal_trial.METAL, atol=1e-6)
+    assert f"continues as {better}: " in " ".join(said)
     (row,) = trainer.fit.decisions
     assert row["component"] == "metal" and row["stays"] == (better == "metal") and "as metal" in row["reason"]
     assert trainer.method.components == ()
@@ -67,11 +78,61 @@ def test_the_gain_of_metal_decides(
     assert trainer.iteration == 6 and np.abs(found - held).max() > 1e-4 and np.abs(found - held).mean() < 0.1
 
 
-def test_images_of_a_fit_decide(views: Dataset, tmp_path: Path, one_thread: None) -> None:
-    """The fit ends where one with that metallic and the same seed does."""
+def test_each_region_starts_as_what_explains_it_better(
+    views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All images are better as metal in their upper half, so the upper half of the ball starts as metal."""
+    upper = (np.arange(SIZE) < SIZE // 2)[:, None]
+    judged(monkeypatch, np.where(upper, 0.02, 0.01), np.where(upper, 0.01, 0.02))
     trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4")
-    sentence = next(one for one in said if "metallic starts" in one)
-    metal, dielectric = (float(part.split(" dB")[0].split()[-1]) for part in sentence.split(","))
+    is_metal = metallic(trainer)[:, 0] > 0.5
+    height = trainer.surfels.to_numpy()["position"][:, 2]
+    upwards = views.views[0].to_world[2, 1]  # of the cameras' up axis, along z
+    assert upwards > 0.5 and {*np.round(metallic(trainer).ravel(), 6)} == {0.1, 0.9}
+    clear = np.abs(height) > 0.2
+    assert clear.sum() > 20 and ((height > 0) == is_metal)[clear].mean() > 0.8
+    assert f"{is_metal.mean():.0%} of the surfels start as metal" in " ".join(said)
+
+
+def test_regions_need_the_gain(views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Metal is better everywhere, by enough in the upper half only."""
+    upper = (np.arange(SIZE) < SIZE // 2)[:, None]
+    enough, too_little = (10 ** (-factor * metal_trial.METAL_GAIN / 10) for factor in (1.8, 0.5))
+    judged(monkeypatch, 0.01, 0.01 * np.where(upper, enough, too_little))
+    trainer, _ = fitted(views, tmp_path, TRIAL, "iterations=4")
+    assert 0.2 < (metallic(trainer) > 0.5).mean() < 0.8
+
+
+def test_errors_are_attributed_by_blending_weights(views: Dataset, tmp_path: Path) -> None:
+    """Errors of one give each surfel the sum of its weights; all of them together, the sum of alpha."""
+    trainer, _ = fitted(views, tmp_path, TRIAL)
+    surfels, view = trainer.surfels.detach(), views.views[0]
+    error = np.random.default_rng(0).random((SIZE, SIZE))
+    found = metal_trial._attributed(surfels, [view, view], [error, 2 * error])
+    alpha = splat(surfels, [], view.camera()).alpha.numpy().reshape(SIZE, SIZE)
+    assert found.shape == (surfels.count,) and found.min() >= 0
+    np.testing.assert_allclose(found.sum(), 3 * (error * alpha).sum(), rtol=1e-4)
+
+
+def test_a_choice_is_that_of_the_neighbourhood() -> None:
+    """Two clusters of opposite values with noise: every point has the sign of its cluster."""
+    rng = np.random.default_rng(1)
+    positions = rng.normal(size=(8000, 3)) * 0.1 + np.repeat([[-1.0, 0, 0], [1, 0, 0]], 4000, axis=0)
+    values = np.repeat([-0.3, 0.3], 4000) + rng.normal(size=8000)
+    found = metal_trial._sum_around(positions, values)
+    np.testing.assert_array_equal(found > 0, np.repeat([False, True], 4000))
+    one = metal_trial._sum_around(positions[:1], values[:1])
+    np.testing.assert_allclose(one, values[:1])
+
+
+def test_images_of_a_fit_decide(
+    views: Dataset, tmp_path: Path, one_thread: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fit ends where one with that metallic and the same seed does, if its surfels choose together."""
+    monkeypatch.setattr(metal_trial, "NEIGHBOURHOOD", 1.0)
+    trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4")
+    sentence = next(one for one in said if "continues as" in one)
+    metal, dielectric = (float(part.split(" dB")[0].split()[-1]) for part in sentence.split(",")[:2])
     value = metal_trial.METAL if metal >= dielectric + metal_trial.METAL_GAIN else metal_trial.DIELECTRIC
     again, _ = fitted(
         views,
