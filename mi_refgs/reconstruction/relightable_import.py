@@ -62,8 +62,8 @@ def import_relightable(
     eighth is a test view. method: as in `fit`, by default the method for relighting. preset, resume,
     progress: as in `fit`; the preset also chooses the size of the views.
 
-    Raises InputError for a file that `import_splats` refuses or that shows no object that stands free, for a
-    folder with another run or foreign files, and as `fit` does.
+    Raises InputError for a file that `import_splats` refuses or that shows no free object, for a folder with
+    another run or foreign files, and as `fit` does.
     """
     path, run = Path(path), Run(output)
     if method is None and not (resume and run.exists()):
@@ -114,8 +114,8 @@ def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> 
     border = [np.concatenate([x[0], x[-1], x[:, 0], x[:, -1]]).mean() for x in seen]
     if np.mean(border) > OPAQUE_BORDER:
         raise InputError(
-            f"{path}: surfels: views are opaque up to the border, so this is a scene, not an object that "
-            "stands free; crop the object with --box"
+            f"{path}: surfels: views are opaque up to the border, so this is a scene, not a free "
+            "object; crop the object with --box"
         )
 
 
