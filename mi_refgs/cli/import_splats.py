@@ -1,23 +1,26 @@
-"""`refgs import`: a run folder from a PLY of another program."""
+"""`refgs import`: a run folder from a PLY of another program, as it is or fitted with materials."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result
-from mi_refgs.errors import counted
+from mi_refgs.cli.command import Cameras, Flag, Output, Preset, Rendering, Result, optional
+from mi_refgs.editing.options import Six
+from mi_refgs.errors import InputError, counted
 
 
 @dataclass(frozen=True, kw_only=True)
 class Import:
-    """`refgs render`, `view`, `edit` and `export` read the run folder.
+    """`refgs render`, `view`, `edit` and `export` read the run folder; with --relightable `relight`, too.
 
     example:
       refgs import point_cloud.ply -o runs/theirs
+      refgs import point_cloud.ply -o runs/vase --relightable --preset quick
     """
 
     file: Annotated[Positional[Path], arg(metavar="FILE.ply")]
@@ -25,20 +28,36 @@ class Import:
     output: Output
     """new run folder"""
     camera: Cameras = None
-    """cameras of scene.xml, in the form of transforms.json (default: around the object, z up)"""
+    """cameras of scene.xml, with --relightable of the views, in the form of transforms.json (default: around
+    the object, z up)"""
     linear: Flag = False
     """colours are linear radiance, as fitted by this program (default: display-encoded)"""
+    box: Annotated[Sequence[float] | None, optional("X0 Y0 Z0 X1 Y1 Z1", constructor=Six)] = None
+    """import only what has its centre in this axis-aligned box"""
+    relightable: Flag = False
+    """render views from all around and fit materials, an environment map and a mesh to them"""
+    purpose: Annotated[str | None, optional("{photographs,relighting}", name="for")] = None
+    """choose the method by a purpose (default with --relightable: relighting)"""
+    preset: Preset = None
+    resume: Flag = False
+    """continue a fit that was interrupted"""
     common: Rendering = Rendering()
 
     def run(self) -> Result:
         """Import the file."""
+        given = {"--for": self.purpose, "--preset": self.preset, "--resume": self.resume}
+        for option in (name for name, value in given.items() if value and not self.relightable):
+            raise InputError(f"{option}: only a relightable import is fitted; add --relightable")
+        return self._fitted() if self.relightable else self._as_it_is()
+
+    def _as_it_is(self) -> Result:
         from mi_refgs.formats.cameras import read_cameras
         from mi_refgs.reconstruction.reconstruction import import_splats
         from mi_refgs.runs.export import save
         from mi_refgs.runs.run import Run
 
         Run(self.output).require_none()
-        made = import_splats(self.file, linear=self.linear)
+        made = import_splats(self.file, linear=self.linear, box=self.box)
         cameras = made.cameras() if self.camera is None else read_cameras(self.camera)
         files = save(made.trained, self.output, made.method, cameras[0], more=cameras[1:])
         surfels = made.trained.surfels
@@ -51,3 +70,35 @@ class Import:
         }
         what = f"{counted(surfels.count, surfels.primitive.name)} of SH degree {surfels.sh_degree()}"
         return Result(data, f"{self.output}: {what}, {counted(len(cameras), 'camera')} in scene.xml")
+
+    def _fitted(self) -> Result:
+        from mi_refgs import methods
+        from mi_refgs.formats.cameras import read_cameras
+        from mi_refgs.reconstruction.relightable_import import import_relightable
+
+        found = import_relightable(
+            self.file,
+            self.output,
+            linear=self.linear,
+            box=self.box,
+            cameras=None if self.camera is None else read_cameras(self.camera),
+            method=None if self.purpose is None else methods.for_purpose(self.purpose),
+            preset=self.preset,
+            resume=self.resume,
+        )
+        trained, dataset = found.trained, str(found.provenance.data)
+        data = {
+            "run": str(self.output),
+            "dataset": dataset,
+            "method": found.method.name,
+            "preset": found.method.preset,
+            "iterations": trained.iteration,
+            "seconds": round(trained.seconds, 3),
+            "surfels": trained.surfels.count,
+        }
+        text = (
+            f"{self.output}: {trained.iteration} iterations in {trained.seconds:.0f} s, "
+            f"{trained.surfels.count} surfels, fitted to views in {dataset}; "
+            f"next: refgs relight {self.output} --envmap MAP.exr"
+        )
+        return Result(data, text)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.data.colmap_model import write_cameras, write_images, write_points, write_test_list
-from mi_refgs.data.lens import COEFFICIENTS
+from mi_refgs.data.lens import COEFFICIENTS, Lens
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.transforms import Frame
 from mi_refgs.data.view import FileCamera
@@ -19,6 +19,7 @@ from mi_refgs.io.images import ENDINGS
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 
+TRANSFORMS = "transforms.json"
 IMAGE_FOLDER = re.compile(r"images(_\d+)?")  # folders to which COLMAP's names are relative
 SIZE_MAX = 2**14  # pixels along a side of an image, at most
 
@@ -34,29 +35,11 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     """
     sparse = target / "sparse" / "0"
     make_folder(sparse)
+    write_json(target / TRANSFORMS, transforms(shots))
     files = [_file(shot) for shot in shots]
     names = [file.path.as_posix() for file in files]
     poses = [shot.camera.pose() for shot in shots]
-    cameras = [((file.width, file.height, *map(float, file.intrinsics)), file.lens) for file in files]
-
-    # transforms.json
-    frames = []
-    for name, file, pose, (numbers, lens) in zip(names, files, poses, cameras, strict=True):
-        frame: dict[str, Any] = {"file_path": name}
-        frame |= zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True)
-        if file.mask is not None and file.mask.below is None:
-            frame["mask_path"] = file.mask.path.as_posix()
-        frame["camera_model"] = "PINHOLE" if lens is None else lens.model
-        frame |= lens.coefficients if lens else {}
-        frame["transform_matrix"] = (pose @ MITSUBA_FROM_OPENGL).tolist()
-        frames.append(frame)
-    content: dict[str, Any] = {"camera_model": frames[0]["camera_model"]}
-    for split in ("train", "test"):
-        listed = [name for name, shot in zip(names, shots, strict=True) if shot.split == split]
-        content[f"{split}_filenames"] = listed
-    write_json(target / "transforms.json", {**content, "frames": frames})
-
-    # COLMAP's model
+    cameras = [_numbers(file) for file in files]
     numbered = {camera: i for i, camera in enumerate(dict.fromkeys(cameras), 1)}
     below = _below_images(names)
     write_cameras(sparse, numbered)
@@ -64,7 +47,33 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     write_points(sparse, [])
     write_test_list(sparse, [name for name, shot in zip(below, shots, strict=True) if shot.split == "test"])
     written = "cameras.txt", "images.txt", "points3D.txt", "test.txt"
-    return [target / "transforms.json", *(sparse / file for file in written)]
+    return [target / TRANSFORMS, *(sparse / file for file in written)]
+
+
+def transforms(shots: Sequence[Shot]) -> dict[str, Any]:
+    """Return the content of the transforms.json of `write`."""
+    frames: list[dict[str, Any]] = []
+    listed: dict[str, list[str]] = {"train": [], "test": []}
+    for shot in shots:
+        file = _file(shot)
+        numbers, lens = _numbers(file)
+        name = file.path.as_posix()
+        listed[shot.split].append(name)
+        frame: dict[str, Any] = {"file_path": name}
+        frame |= zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True)
+        if file.mask is not None and file.mask.below is None:
+            frame["mask_path"] = file.mask.path.as_posix()
+        frame["camera_model"] = "PINHOLE" if lens is None else lens.model
+        frame |= lens.coefficients if lens else {}
+        frame["transform_matrix"] = (shot.camera.pose() @ MITSUBA_FROM_OPENGL).tolist()
+        frames.append(frame)
+    names = {f"{split}_filenames": found for split, found in listed.items()}
+    return {"camera_model": frames[0]["camera_model"], **names, "frames": frames}
+
+
+def _numbers(file: FileCamera) -> tuple[tuple[float, ...], Lens | None]:
+    """Return width, height and intrinsics of an image file in pixels, and its lens."""
+    return (file.width, file.height, *map(float, file.intrinsics)), file.lens
 
 
 def _file(shot: Shot) -> FileCamera:

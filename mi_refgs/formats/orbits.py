@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -18,27 +18,41 @@ from mi_refgs.surfels.table import Surfels
 
 AROUND = {"test": 4, "train": 60}  # cameras around an object without a data set
 SIZE, FIELD_OF_VIEW = 512, 40.0  # pixels and degrees of their square images
+ELEVATION = (-10.0, 70.0)  # degrees
 INSIDE = 0.98
 """Fraction of the surfels, by opacity, in the sphere that fills these images: strays lie far out."""
+SIGMAS = 2.0  # standard deviations around its centre up to which a surfel is in that sphere
 
 
-def shots_around(surfels: Surfels) -> list[Shot]:
-    """Return cameras on a sphere around the surfels, from 10° below to 70° above its equator, z up."""
+def shots_around(
+    surfels: Surfels,
+    counts: Mapping[str, int] = AROUND,  # by split
+    size: int = SIZE,  # pixels per side
+    elevation: tuple[float, float] = ELEVATION,  # degrees
+) -> list[Shot]:
+    """Return cameras on a sphere around the surfels, z up, evenly spread within each split.
+
+    The images show everything but strays (INSIDE). The first camera of a split is at middle height. Raises
+    InputError if there are no surfels.
+    """
     position, weight = _weighted(surfels)
-    middle = np.array([weighted_quantile(axis, weight, 0.5) for axis in position.T])
-    reach = weighted_quantile(np.linalg.norm(position - middle, axis=1), weight, INSIDE)
+    middle = _middle_of(position, weight)
+    deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)
+    far = np.linalg.norm(position - middle, axis=1) + SIGMAS * deviation
+    reach = weighted_quantile(far, weight, INSIDE)
     radius = max(reach, 1e-6) * 1.1
     distance = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
-    focal = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
+    focal = size / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     shots = []
-    for split, count in AROUND.items():
-        low, high = (math.sin(math.radians(e)) for e in (-10, 70))
-        up = low + (high - low) * (np.arange(count) + 0.5) / count
-        turn = GOLDEN_ANGLE * np.arange(count)
+    for split, count in counts.items():
+        low, high = (math.sin(math.radians(e)) for e in elevation)
+        order = (np.arange(count) + count // 2) % count
+        up = low + (high - low) * (order + 0.5) / count
+        turn = GOLDEN_ANGLE * order
         ring = np.sqrt(1 - up**2)
         outward = np.stack([ring * np.cos(turn), ring * np.sin(turn), up], axis=1)
         for i, pose in enumerate(poses_around(outward, middle, distance)):
-            camera = Camera.from_pose(SIZE, SIZE, -focal, -focal, SIZE / 2, SIZE / 2, pose, 1e-2 * distance)
+            camera = Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose, 1e-2 * distance)
             shots.append(Shot(f"{split}/r_{i:03d}", split, camera))
     return shots
 
@@ -68,6 +82,11 @@ def _middle(scene: TrainedScene) -> np.ndarray:
         position, weight = _weighted(scene.surfels)
     else:
         position, weight = scene.mesh.vertices.astype(np.float64), np.ones(len(scene.mesh.vertices))
+    return _middle_of(position, weight)
+
+
+def _middle_of(position: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the centre (3,) of the box between the quantiles 1 - INSIDE and INSIDE along each axis."""
     ends = [[weighted_quantile(axis, weight, share) for axis in position.T] for share in (1 - INSIDE, INSIDE)]
     return np.mean(ends, axis=0)
 

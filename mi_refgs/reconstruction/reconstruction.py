@@ -292,13 +292,21 @@ def load(run: str | Path, *, write: bool = True) -> Reconstruction:
     return Reconstruction(trained, provenance, folder.path)
 
 
-def import_splats(path: str | Path, *, linear: bool = False) -> Reconstruction:
+def import_splats(
+    path: str | Path, *, linear: bool = False, box: Sequence[float] | None = None
+) -> Reconstruction:
     """Read a PLY file of 3DGS or 2DGS into memory, as `refgs import` does; `save` writes the run folder.
 
     linear: its colours are linear radiance, as this package fits them; otherwise they are display-encoded, as
-    3DGS and 2DGS write them. It has neither light nor mesh, and its cameras are around the object, z up.
-    Raises InputError for any other file, and if no Mitsuba variant is set that the renderer supports.
+    3DGS and 2DGS write them. box: two corners (6,); surfels whose centre is outside are left out. It has
+    neither light nor mesh, and its cameras are around the object, z up. Raises InputError for any other file,
+    a box without surfels, and if no Mitsuba variant is set that the renderer supports.
     """
     require_supported_variant("mi_refgs.import_splats")
     trained = read_splats(Path(path), linear)
+    if box is not None:
+        try:
+            trained = editing.edit(trained, box=box, keep=True).scene
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
     return Reconstruction(trained, Provenance(method_of(trained, Path(path).stem)))

@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
 import pytest
 
 from mi_refgs import methods
@@ -29,10 +31,12 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import BusyError
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.reconstruction import fit as reconstruct
+from mi_refgs.reconstruction.relightable_import import import_relightable
 from mi_refgs.runs.run import LOCK, Run
 from mi_refgs.synthesis import make_dataset
 from tests.helpers import command_names, command_options, refused
 from tests.scenes.sphere import SCENE
+from tests.scenes.splat_file import PRESET, render_few_views, write_ball, write_long_method
 from tests.scenes.tiny import METHOD, SETTINGS, train_command
 
 
@@ -107,6 +111,17 @@ KEPT: dict[str, dict[str, Row]] = {
         "--relight": Shows(("--relight", "{light}"), "relight/sky/transforms_test.json"),
         "--overwrite": Shows(("--overwrite", "--views", "3"), "train/r_002.png"),
     },
+    "import": {
+        "file": refuses("{splats2}", word="--resume"),
+        "--output": WHERE,
+        "--camera": Refused(("--camera", "{cameras}"), ("--resume", "--camera")),
+        "--linear": Refused(("--linear",), ("--resume", "--linear")),
+        "--box": Refused(("--box", *"-1 -1 -1 1 1 1".split()), ("--resume", "--box")),
+        "--relightable": Free("absent, --resume is refused: see test_options_of_the_fit_require_relightable"),
+        "--for": Refused(("--for", "relighting"), ("--for",)),
+        "--preset": refuses("--preset", "standard"),
+        "--resume": Free("absent, the run is refused: see test_interrupted_import_resumes"),
+    },
     "compare": {
         "data": refuses("{elsewhere}", word="DATA"),
         "--output": WHERE,
@@ -143,7 +158,6 @@ OTHERS = {
     "completion": "writes nothing",
     "view": "names saved views by number",
     "edit": "refuses an output that is there",
-    "import": "refuses an output that is there",
     "relight": "does everything again",
     "export": "does everything again",
 }
@@ -176,7 +190,12 @@ def places(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -
         "scene": folder / "scene.xml",
         "scene2": folder / "scene2.xml",
         "light": resource_dir("scenes") / "lights" / "sky.exr",
+        "splats": write_ball(folder / "splats.ply"),
+        "splats2": write_ball(folder / "splats2.ply", x=0.1),
+        "cameras": folder / "cameras.json",
     }
+    frames = [{"transform_matrix": np.eye(4).tolist()}] * 2
+    found["cameras"].write_text(json.dumps({"w": 8, "h": 8, "fl_x": 8, "frames": frames}))
     return {name: str(path) for name, path in found.items()}
 
 
@@ -186,7 +205,12 @@ Began = Callable[[str], tuple[list[str], Path]]
 
 @pytest.fixture
 def began(
-    places: dict[str, str], finished: Path, traced: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    places: dict[str, str],
+    finished: Path,
+    traced: Path,
+    fitted_splats: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Began:
     """Outputs of commands, and what takes long left out of their repetition."""
     slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)
@@ -224,8 +248,29 @@ def began(
         assert main(argv) == 3  # nothing is fitted
         return argv
 
-    made = {"train": train, "demo": demonstration, "dataset": dataset, "compare": compare}
+    def relightable() -> list[str]:
+        render_few_views(monkeypatch)
+        shutil.copytree(fitted_splats, out)
+        return ["import", places["splats"], "-o", str(out), "--relightable", "--resume", "--preset", PRESET]
+
+    made = {
+        "import": relightable,
+        "train": train,
+        "demo": demonstration,
+        "dataset": dataset,
+        "compare": compare,
+    }
     return lambda command: (made[command](), out)
+
+
+@pytest.fixture(scope="module")
+def fitted_splats(places: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out, method = tmp_path_factory.mktemp("splats") / "out", write_long_method(tmp_path_factory.mktemp("m"))
+    mi.set_variant("llvm_ad_rgb")
+    with pytest.MonkeyPatch.context() as patch:
+        render_few_views(patch)
+        import_relightable(places["splats"], out, method=method, preset=PRESET, progress=Progress())
+    return out
 
 
 TRACE = ["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--samples", "1"]
@@ -243,7 +288,7 @@ def changed(argv: list[str], row: Refused | Shows, places: dict[str, str], out: 
     values = [value.format(**places, out=out) for value in row.argv]
     if values[0].startswith("--"):
         return [*argv, *values]
-    own = {places["data"], places["scene"]}
+    own = {places["data"], places["scene"], places["splats"]}
     return [values[0] if value in own else value for value in argv]
 
 

@@ -1,0 +1,130 @@
+"""A PLY file of splats as a relightable object: views of it are rendered, and fitted like photographs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mi_refgs import methods
+from mi_refgs.constants import DEFAULT_PRESET
+from mi_refgs.data.dataset import held_out
+from mi_refgs.errors import InputError
+from mi_refgs.fitting import runner
+from mi_refgs.formats import Shot
+from mi_refgs.formats.cameras import TRANSFORMS, transforms
+from mi_refgs.formats.orbits import shots_around
+from mi_refgs.io.files import write_json
+from mi_refgs.io.images import straight_srgb, write_png
+from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.methods.read import PRESETS
+from mi_refgs.progress import with_bar
+from mi_refgs.reconstruction.fit import fit
+from mi_refgs.reconstruction.reconstruction import Reconstruction, import_splats
+from mi_refgs.runs.run import Run
+from mi_refgs.splat import Camera
+
+DATA = "data"  # folder of the rendered views, in the run folder
+FILES = (TRANSFORMS, "train/*.png", "test/*.png")
+PURPOSE = "relighting"
+"""Purpose of the method that is fitted by default: `auto` keeps colours alone, since the images of a file are
+exactly such colours, and cannot be relit."""
+VIEWS = {"train": 100, "test": 12}
+ELEVATION = (-90.0, 90.0)  # degrees: files of other programs have any side up
+SMALL = 64  # pixels of a side of the views by which an object is told from a scene around it
+OPAQUE_BORDER = 0.3
+"""Mean alpha at the border of the views above which a file is a scene: views around *chair* and `mirror_ring`
+have 0.00, around *tabletop*, a room, 0.48."""
+
+
+def import_relightable(
+    path: str | Path,
+    output: str | Path,
+    *,
+    linear: bool = False,
+    box: Sequence[float] | None = None,
+    cameras: Sequence[Camera] | None = None,
+    method: str | Path | None = None,
+    preset: str | None = None,
+    resume: bool = False,
+    progress: bool | runner.Progress = True,
+) -> Reconstruction:
+    """Fit materials, normals and an environment map to views of a PLY file of 3DGS or 2DGS.
+
+    Views from all around are rendered by the formulas of the file and written as a data set, the folder
+    `data` of the run folder `output`; training views and test views are different ones.
+
+    linear, box: as in `import_splats`. cameras: of the views, in place of those around the object; every
+    eighth is a test view. method: as in `fit`, by default the method for relighting. preset, resume,
+    progress: as in `fit`; the preset also chooses the size of the views.
+
+    Raises InputError for a file that `import_splats` refuses or that shows no free object, for a folder with
+    another run or foreign files, and as `fit` does.
+    """
+    path, run = Path(path), Run(output)
+    if method is None and not (resume and run.exists()):
+        method = methods.for_purpose(PURPOSE)
+    wanted = runner.load_method(None if method is None else str(method), preset)
+    made = import_splats(path, linear=linear, box=box)
+    given = None if cameras is None else _given(cameras)
+    views = OutputFolder(run.path / DATA, _owner(path, linear, box, given), FILES)
+    if not (resume and run.exists()):
+        run.require_none()
+        pixels = PRESETS.get(wanted.preset, PRESETS[DEFAULT_PRESET]).pixels
+        shots = given or shots_around(made.trained.surfels, VIEWS, math.isqrt(pixels), ELEVATION)
+        _require_object(made, shots, path)
+        with run.alone():
+            _write_views(made, shots, views, progress is not False)
+    elif not views.owned(TRANSFORMS):
+        raise InputError(
+            f"{path}: --resume: {views.path} has no views of this file with these --linear, --box and "
+            "--camera; choose another -o"
+        )
+    return fit(views.path, method, preset=preset, output=output, resume=resume, progress=progress)
+
+
+def _given(cameras: Sequence[Camera]) -> list[Shot]:
+    """Return views of given cameras, of which every eighth is a test view."""
+    return [
+        Shot(f"{split}/r_{i:03d}", split, camera)
+        for split in VIEWS
+        for i, camera in enumerate(held_out(cameras, split))
+    ]
+
+
+def _owner(path: Path, linear: bool, box: Sequence[float] | None, given: Sequence[Shot] | None) -> str:
+    """Return the owner of the views: the file, and what decides which views of it are written."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256")
+    corners = None if box is None else [*map(float, box)]
+    digest.update(json.dumps([linear, corners, given and transforms(given)]).encode())
+    return f"import {digest.hexdigest()[:16]}"
+
+
+def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> None:
+    """Raise InputError if the test views show nothing, or are opaque up to the border, as within a scene."""
+    cameras = [shot.camera for shot in shots if shot.split == "test"]
+    seen = [made.render(camera, size=SMALL)[..., 3] for camera in cameras]
+    if max(alpha.max() for alpha in seen) < OPAQUE_BORDER:
+        raise InputError(f"{path}: opacity: views of the surfels show nothing; export the file again")
+    border = [np.concatenate([x[0], x[-1], x[:, 0], x[:, -1]]).mean() for x in seen]
+    if np.mean(border) > OPAQUE_BORDER:
+        raise InputError(
+            f"{path}: surfels: views are opaque up to the border, so this is a scene, not a free "
+            "object; crop the object with --box"
+        )
+
+
+def _write_views(made: Reconstruction, shots: Sequence[Shot], output: OutputFolder, bar: bool) -> None:
+    """Render the views, and write them and then their cameras."""
+    output.claim(*(f"{shot.name}.png" for shot in shots), TRANSFORMS)
+    try:
+        for shot in with_bar(shots, "views", unit="view", disable=not bar):
+            write_png(output.path / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))
+    except KeyboardInterrupt as error:
+        raise type(error)("interrupted while views were rendered; give the same command again") from None
+    write_json(output.path / TRANSFORMS, transforms(shots))

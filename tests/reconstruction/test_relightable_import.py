@@ -1,0 +1,317 @@
+"""A PLY file as a relightable object: its views are images of the file, and are fitted as data sets are."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mi_refgs
+from mi_refgs import methods
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.fitting.runner import Progress
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.formats.orbits import shots_around
+from mi_refgs.io.images import read_png, straight_srgb
+from mi_refgs.methods.read import PRESETS
+from mi_refgs.reconstruction import relightable_import
+from tests.helpers import refused
+from tests.scenes.layouts import ply_bytes
+from tests.scenes.splat_file import (
+    PRESET,
+    RADIUS,
+    SIZE,
+    VIEWS,
+    ball_columns,
+    render_few_views,
+    write_ball,
+    write_long_method,
+)
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    render_few_views(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_ball(tmp_path_factory.mktemp("splats") / "ball.ply")
+
+
+@pytest.fixture(scope="module")
+def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_long_method(tmp_path_factory.mktemp("method"))
+
+
+@pytest.fixture(scope="module")
+def imported(ball: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A relightable import; do not change it."""
+    run = tmp_path_factory.mktemp("runs") / "run"
+    mi.set_variant("llvm_ad_rgb")
+    with pytest.MonkeyPatch.context() as patch:
+        render_few_views(patch)
+        mi_refgs.import_relightable(ball, run, method=method, preset=PRESET, progress=Progress())
+    return run
+
+
+def tree(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+# ---------------- the views ----------------
+
+
+def test_views_are_the_images_of_the_file(imported: Path, ball: Path) -> None:
+    """Read as a data set: rendered by the file's formula from the stated cameras, with its alpha."""
+    file = mi_refgs.import_splats(ball)
+    for split, count in VIEWS.items():
+        views = read_dataset(imported / "data", split).views
+        assert len(views) == count and all(view.has_alpha for view in views)
+        for view in views:
+            goal = np.clip(straight_srgb(file.render(view)), 0, 1)
+            found = read_png(imported / "data" / f"{view.name}.png")
+            assert found.shape == (SIZE, SIZE, 4) and goal[..., 3].max() > 0.9 > 0.1 > goal[0, :, 3].mean()
+            # Where alpha is small, the colour is that of few bits.
+            assert np.abs((found - goal)[goal[..., 3] > 0.1]).max() < 3 / 255
+            assert np.abs(found - goal)[..., 3].max() < 2 / 255
+
+
+def test_cameras_are_all_around_and_test_views_are_others(imported: Path) -> None:
+    train, test = (
+        np.array([view.to_world[:3, 3] for view in read_dataset(imported / "data", split).views])
+        for split in VIEWS
+    )
+    assert train[:, 2].min() < -RADIUS and train[:, 2].max() > RADIUS
+    assert np.linalg.norm(train.mean(0)) < 0.3 * np.linalg.norm(train, axis=1).mean()
+    assert min(np.linalg.norm(train - origin, axis=1).min() for origin in test) > 0.2
+    assert (
+        0 < test[0, 2] < 0.6 * np.linalg.norm(test[0])
+    )  # scene.xml has this camera: neither from below nor above
+
+
+@pytest.mark.parametrize(
+    "stray", [{"x": 500.0}, {"z": -500.0, "opacity": -3.0}], ids=["opaque", "translucent"]
+)
+def test_strays_do_not_decide_where_cameras_are(stray: dict[str, float], ball: Path, tmp_path: Path) -> None:
+    other = mi_refgs.import_splats(write_ball(tmp_path / "other.ply", **stray))
+    pairs = [shots_around(file.trained.surfels, VIEWS) for file in (mi_refgs.import_splats(ball), other)]
+    for first, second in zip(*pairs, strict=True):
+        np.testing.assert_allclose(second.camera.pose(), first.camera.pose(), atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("preset", "side"), [("quick", 256), ("standard", 256), ("paper", 800), ("6:9", 256)]
+)
+def test_preset_chooses_the_size_of_the_views(
+    preset: str, side: int, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def stop(made: object, shots: list[mi_refgs.formats.Shot], path: Path) -> None:
+        seen.append({(shot.camera.width, shot.camera.height) for shot in shots})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(relightable_import, "PRESETS", PRESETS)
+    monkeypatch.setattr(relightable_import, "_require_object", stop)
+    with pytest.raises(KeyboardInterrupt):
+        mi_refgs.import_relightable(ball, tmp_path / "run", preset=preset)
+    assert seen == [{(side, side)}] and not (tmp_path / "run").exists()
+
+
+def test_views_of_given_cameras(ball: Path, method: Path, tmp_path: Path) -> None:
+    """Every eighth is a test view; their sizes and lenses are theirs."""
+    poses = [
+        s.camera.pose() for s in shots_around(mi_refgs.import_splats(ball).trained.surfels, {"train": 10})
+    ]
+    frames = [{"transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist()} for pose in poses]
+    file, run = tmp_path / "cameras.json", tmp_path / "run"
+    file.write_text(json.dumps({"w": 40, "h": 30, "fl_x": 30, "cx": 18, "frames": frames}))
+    cameras = mi_refgs.formats.cameras.read_cameras(file)
+    mi_refgs.import_relightable(ball, run, cameras=cameras, method=method, preset=PRESET, progress=Progress())
+    train, test = (read_dataset(run / "data", split).views for split in ("train", "test"))
+    assert (len(train), len(test)) == (8, 2)
+    np.testing.assert_allclose([v.to_world for v in test], [poses[0], poses[8]], atol=1e-6)
+    view = train[0]
+    assert (view.width, view.height, view.fx, view.cx) == pytest.approx((40, 30, 30, 18))
+
+
+# ---------------- the fit ----------------
+
+
+def test_import_is_fitted_measured_and_relit(imported: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(imported, tmp_path / "run"))
+    made = mi_refgs.load(run)
+    assert made.trained.light is not None and made.trained.surfels.has("albedo")
+    assert made.trained.iteration == 6 and made.provenance.data == (imported / "data").resolve()
+    light = np.ones((8, 16, 3), np.float32)
+    assert made.relight(light).render(0)[..., 3].max() > 0.5
+    assert main(["eval", str(run)]) == 0
+    assert json.loads((run / "metrics.json").read_text())["psnr"] > 5
+    assert main(["export", str(run), "--to", "3dgs-ply", "-o", str(tmp_path / "again.ply")]) == 0
+
+
+def test_command_writes_the_same_views_and_fits_the_method_for_relighting(
+    imported: Path,
+    ball: Path,
+    method: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []
+    run = tmp_path / "run"
+
+    def for_purpose(purpose: str) -> str:
+        asked.append(purpose)
+        return str(method)
+
+    monkeypatch.setattr(methods, "for_purpose", for_purpose)
+    argv = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET, "--json"]
+    assert main(argv) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["run"] == str(run) and report["iterations"] == 6 and report["dataset"] == str(run / "data")
+    name = lambda files, folder: {path.relative_to(folder): data for path, data in files.items()}  # noqa: E731
+    assert name(tree(run / "data"), run) == name(tree(imported / "data"), imported)
+    assert main([*argv, "--resume"]) == 0  # finished: nothing is left to do
+    assert asked == ["relighting"]
+    assert main([*argv, "--resume", "--for", "photographs"]) == 0 and asked[1:] == ["photographs"]
+
+
+@pytest.mark.parametrize("way", ["train", "import"])
+def test_interrupted_import_resumes(
+    way: str,
+    heard_interrupts: None,
+    imported: Path,
+    ball: Path,
+    method: Path,
+    tmp_path: Path,
+    one_thread: None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By the command that its message names, and by the command of the import: as if never interrupted."""
+    step, run = Trainer.step, tmp_path / "run"
+
+    def interrupted(self: Trainer) -> None:
+        step(self)
+        if self.iteration == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    options: dict[str, Any] = {"method": method, "preset": PRESET, "progress": Progress()}
+    mi_refgs.import_relightable(ball, tmp_path / "straight", **options)
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="interrupted at iteration 4; resume with: ") as caught:
+            mi_refgs.import_relightable(ball, run, **options)
+    _, _, named = str(caught.value).partition("resume with: refgs ")
+    assert named == f"train {run / 'data'} -o {run} --resume"
+    refused(lambda: mi_refgs.import_relightable(ball, run, **options), "contains a run already; add --resume")
+    again = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET, "--resume"]
+    assert main([*(named.split() if way == "train" else again), "--threads", "1"]) == 0
+    assert (run / "surfels.ply").read_bytes() == (tmp_path / "straight" / "surfels.ply").read_bytes()
+
+
+def test_interrupted_views_are_rendered_again(
+    ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same command works, with another preset too; another file finds files that are not its own."""
+    run, write = tmp_path / "run", relightable_import.write_png
+
+    def second(path: Path, image: np.ndarray) -> None:
+        if path.name == "r_001.png":
+            raise KeyboardInterrupt
+        write(path, image)
+
+    def call(**more: Any) -> None:
+        options: dict[str, Any] = {"method": method, "preset": PRESET, "progress": Progress()}
+        mi_refgs.import_relightable(ball, run, **{**options, **more})
+
+    with monkeypatch.context() as patch:
+        patch.setattr(relightable_import, "write_png", second)
+        with pytest.raises(KeyboardInterrupt, match="give the same command again"):
+            call()
+    before = tree(run)
+    assert before
+    refused(lambda: call(linear=True), "was not written by this command for the same input")
+    assert tree(run) == before
+    call(preset="5:90", resume=True)
+    assert mi_refgs.load(run).trained.iteration == 5
+
+
+# ---------------- bad input ----------------
+
+
+def test_scene_all_around_is_refused(ball: Path, tmp_path: Path) -> None:
+    """A sky of one huge Gaussian; what is cropped to the object is imported."""
+    sky = write_ball(tmp_path / "room.ply", **{f"scale_{i}": 4.0 for i in range(3)})
+    argv = ["import", sky, "-o", tmp_path / "run", "--relightable", "--preset", PRESET]
+    refused(argv, f"{sky}: surfels: views are opaque up to the border", "--box")
+    assert not (tmp_path / "run").exists()
+
+
+def test_box_crops_an_import(ball: Path, tmp_path: Path) -> None:
+    upper = [-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]
+    found = mi_refgs.import_splats(ball, box=upper).trained.surfels.to_numpy()["position"]
+    assert (found[:, 2] >= 0).all() and len(found) == (ball_columns()["z"] >= 0).sum()
+    argv = ["import", str(ball), "-o", str(tmp_path / "run"), "--box", *map(str, upper)]
+    assert main(argv) == 0
+    np.testing.assert_array_equal(
+        mi_refgs.load(tmp_path / "run").trained.surfels.to_numpy()["position"], found
+    )
+    nowhere = ["import", ball, "-o", tmp_path / "none", "--box", 5, 5, 5, 6, 6, 6]
+    refused(nowhere, f"{ball}: selection: none of the 300 surfels is in it")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("empty", "vertex: there are none"),
+        ("colourless", "f_dc_0: the property is missing"),
+        ("invisible", "opacity: views of the surfels show nothing"),
+    ],
+)
+def test_other_files_are_refused(change: str, words: str, tmp_path: Path) -> None:
+    columns = ball_columns()
+    if change == "empty":
+        columns = {name: column[:0] for name, column in columns.items()}
+    elif change == "colourless":
+        columns = {name: column for name, column in columns.items() if not name.startswith("f_dc")}
+    else:
+        columns["opacity"][:] = -9
+    path = tmp_path / "file.ply"
+    path.write_bytes(ply_bytes(columns))
+    refused(["import", path, "-o", tmp_path / "run", "--relightable"], path, words)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", [("--for", "relighting"), ("--preset", "quick"), ("--resume",)])
+def test_options_of_the_fit_require_relightable(option: tuple[str, ...], ball: Path, tmp_path: Path) -> None:
+    refused(["import", ball, "-o", tmp_path / "run", *option], f"{option[0]}: ", "add --relightable")
+
+
+def test_bad_preset_is_refused_before_views_are_rendered(ball: Path, tmp_path: Path) -> None:
+    argv = ["import", ball, "-o", tmp_path / "run", "--relightable"]
+    refused([*argv, "--preset", "fast"], "--preset: fast: unknown")
+    refused([*argv, "--for", "fun"], "--for: fun: no method is for that")
+    assert not (tmp_path / "run").exists()
+
+
+def test_foreign_files_stay(ball: Path, method: Path, tmp_path: Path) -> None:
+    """In the folder of the views, as in the run folder."""
+    run = tmp_path / "run"
+    for name in ("data/transforms.json", "surfels.ply"):
+        file = run / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("mine")
+        refused(lambda: mi_refgs.import_relightable(ball, run, method=method, preset=PRESET), file)
+        assert tree(run) == {file: b"mine"}
+        file.unlink()
