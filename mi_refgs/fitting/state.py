@@ -5,7 +5,7 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
     params/NAME  optimiser/NAME/PART       parameters, and Adam's moments and counters of each
     error_sum  unseen                      per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
-    iteration  seconds  held_until  decisions  exposure  light_gradient
+    iteration  seconds  held_until  decisions  exposure  region  light_gradient
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.optim import Adam
@@ -125,6 +126,7 @@ class FitState:
     held_until: int = 0  # iteration before which opacities do not learn
     decisions: list[dict[str, Any]] = field(default_factory=list)  # about components of the method
     exposure: dict[str, Any] | None = None  # decision about the exposure compensation
+    region: Region | None = None  # of interest, once it has followed the object
 
     @staticmethod
     def start(setup: FitSetup, gains: Mapping[str, TensorXf]) -> FitState:
@@ -184,7 +186,8 @@ class FitState:
             state[f"{table.prefix}unseen"] = table.unseen.numpy()
         state |= {name: np.array(getattr(self, name)) for name in ("iteration", "seconds", "held_until")}
         state |= self.prefilter.state()
-        for name, value in (("exposure", self.exposure), ("decisions", self.decisions)):
+        region = None if self.region is None else self.region.content
+        for name, value in (("exposure", self.exposure), ("decisions", self.decisions), ("region", region)):
             if value:
                 state[name] = np.frombuffer(json.dumps(value).encode(), np.uint8)
         if (mesh := self.occluder.mesh()) is not None:
@@ -209,6 +212,8 @@ class FitState:
         made.decisions = decisions_of(state)
         if "exposure" in state:
             made.exposure = json.loads(state["exposure"].tobytes())
+        if "region" in state:
+            made.region = Region.of(json.loads(state["region"].tobytes()), "checkpoint")
         made.occluder = _occluder_of(state)
         _, stage = setup.method.stage_at(max(made.iteration, 1))
         made.prefilter.restore(made.light, made.shading(stage), state)

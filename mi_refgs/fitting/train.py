@@ -21,7 +21,7 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.fitting import exposure
+from mi_refgs.fitting import exposure, object_surface
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
 from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective, require_losses
@@ -134,6 +134,11 @@ class Trainer:
         return self.setup.data
 
     @property
+    def region(self) -> Region | None:
+        """The region of interest in use: that of the data until it follows the object."""
+        return self.fit.region or self.data.region
+
+    @property
     def iteration(self) -> int:
         """Steps done."""
         return self.fit.iteration
@@ -244,6 +249,7 @@ class Trainer:
             self.check()
         control.refine(iteration)
         self._decide_exposure()
+        self._follow_object(control)
         mesh = self.method.mesh
         if mesh is not None and self.fit.shading(stage).traceable and mesh.extract.due(iteration):
             last = mesh.extract.count(iteration) == mesh.extract.count(self.method.iterations)
@@ -261,7 +267,7 @@ class Trainer:
         assert options is not None
         cameras = [view.camera() for view in self.data.views] if cameras is None else cameras
         far = around.surfels.detach() if around is not None and options.unbounded else None
-        mesh = surface_of(self.surfels.detach(), cameras, options.resolution, far, self.data.region)
+        mesh = surface_of(self.surfels.detach(), cameras, options.resolution, far, self.region)
         self.fit.occluder.update(mesh)
         return mesh
 
@@ -363,6 +369,26 @@ class Trainer:
                 )
             self.check()
             self.restore(exposure.with_gains(self.state(), log))
+
+    def _follow_object(self, control: AdaptiveControl) -> None:
+        """Adapt the region of interest to the object that the surfels show, if that is due."""
+        if not object_surface.is_due(self.setup, self.fit):
+            return
+
+        def depth_of(view: View) -> tuple[Float, Float]:
+            around = self.surroundings
+            assert around is not None
+            return render_depth(self.surfels.detach(), view.camera(), around.surfels.detach())
+
+        self.check()
+        before, found = self.region, object_surface.followed(self.setup, depth_of)
+        self.fit.region = found or before
+        if found is None:
+            self.tell("region of interest: nothing stands apart from the scene, so it stays")
+            return
+        centre = ", ".join(f"{x:.3g}" for x in found.centre)
+        self.tell(f"region of interest: the object is within {found.radius:.3g} units of ({centre})")
+        control.exchange(found, self.iteration)
 
 
 def surface_of(
