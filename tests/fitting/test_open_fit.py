@@ -161,8 +161,9 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     own, other = (
         edit.surfels.to_numpy()["position"] for edit in exchanged(inner, outer, method, region, rng)
     )
-    np.testing.assert_allclose(own, [[0, 0, 0.4], [0, 0, 0.095], [0, 0.1, 0.3]], atol=1e-6)
-    np.testing.assert_allclose(other, [[0, 0, 0], [0, 0, 0.105], [0, 0, 0.05], [-0.6, 0, 0.2]], atol=1e-6)
+    np.testing.assert_allclose(own, [[0.0, 0.0, 0.4], [0.0, 0.0, 0.095], [0.0, 0.1, 0.3]], atol=1e-6)
+    outside = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.105], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]]
+    np.testing.assert_allclose(other, outside, atol=1e-6)
 
 
 def test_points_start_on_their_side_of_planes(data: Dataset, method: Method) -> None:
