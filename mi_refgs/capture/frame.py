@@ -7,11 +7,13 @@ how cameras are held and from the point at which they look.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from mi_refgs.capture.colmap import Solved
 from mi_refgs.data.hull import axis_projectors
+from mi_refgs.data.object_region import object_region
 from mi_refgs.data.region import Region, region_radius, weighted_quantile
 from mi_refgs.errors import InputError
 
@@ -87,10 +89,10 @@ def seen_share(solved: Solved, points: np.ndarray) -> np.ndarray:
 
 
 def region_of_interest(solved: Solved) -> Region:
-    """A sphere around the point at which most cameras look.
+    """A sphere around the point at which most cameras look, above what supports the object.
 
     Its radius is that of `region_radius`, or smaller if the points in the images of at least half of the
-    cameras, weighted by track length, are closer.
+    cameras, weighted by track length, are closer, or larger if the object is (`object_region`).
     """
     focus = focus_of(solved)
     distance = np.linalg.norm(solved.origin - focus, axis=1)
@@ -104,7 +106,7 @@ def region_of_interest(solved: Solved) -> Region:
         reach = weighted_quantile(offset[near], solved.length[near], REGION_QUANTILE)
         radius = max(reach, LEAST_SHARE * radius)
     x, y, z = (float(c) for c in focus)
-    return Region((x, y, z), radius)
+    return object_region(Region((x, y, z), radius), solved.origin, solved.points, partial(seen_share, solved))
 
 
 def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:

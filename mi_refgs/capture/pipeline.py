@@ -11,7 +11,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from mi_refgs.capture.colmap import Solved
 from mi_refgs.capture.frame import moved, upright_unit
 from mi_refgs.capture.photographs import Photograph, cameras_of, find_masks, find_photographs, write_copies
 from mi_refgs.data.colmap_model import MODELS
+from mi_refgs.data.object_region import support_planes
 from mi_refgs.data.region import Region, write_region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json, replace_file, write_json
@@ -37,6 +38,7 @@ FIRST_MODEL = "SIMPLE_RADIAL"
 
 SHOWN_RADII = 6.0
 """Half the width of the plot in radii of the region, unless the cameras need more; far points are cut off."""
+LEAST_TILT = 0.3  # sine of the angle to a plot from which a plane is drawn in it
 GOOD_ERROR = 1.0
 """Mean reprojection error, pixels, above which something is wrong: lens, rolling shutter, moving objects."""
 FEW_FEATURES = 60
@@ -109,7 +111,8 @@ def capture(
     solved = Solved.of(model)
     similarity = upright_unit(solved, np.array([job.copies[name].up for name in solved.names]))
     world = moved(solved, similarity)
-    found = region or Region((0.0, 0.0, 0.0), 1.0)
+    found = region or Region((0.0, 0.0, 0.0), 1.0, estimated=True)
+    found = replace(found, planes=support_planes(world.points, world.origin, found))
 
     # Undistorted images and COLMAP's files, unless the last capture wrote the same.
     lenses = [(name, repr(straight[name])) for name in solved.names]
@@ -144,7 +147,7 @@ def capture(
             "cameras": [{"width": c.width, "height": c.height, "parameters": [*c.params]} for c in cameras],
         },
         "pinholes": [{"size": s.size, "focal": s.focal, "centre": s.centre} for s in pinholes.values()],
-        "region": {"centre": found.centre, "radius": found.radius},
+        "region": found.content,
         "masks": bool(job.masks),
         "seconds": round(time.perf_counter() - began, 1),
     }
@@ -260,6 +263,11 @@ def draw(path: Path, world: Solved, region: Region) -> None:
         axes.plot(directions[..., 0], directions[..., up], color="C0", lw=0.8)
         axes.scatter(world.origin[:, 0], world.origin[:, up], s=8, color="C0")
         axes.add_patch(Circle((centre[0], centre[up]), region.radius, fill=False, color="C3", lw=1.5))
+        for *normal, offset in region.planes:  # where they cut the plane of the plot through the centre
+            across = np.array([normal[0], normal[up]])
+            if (length := np.linalg.norm(across)) > LEAST_TILT:
+                foot = centre[[0, up]] + (offset - centre @ normal) / length**2 * across
+                axes.axline(foot, foot + np.array([-across[1], across[0]]), color="C3", lw=1.5)
         axes.set(title=title, xlabel="x", ylabel="xyz"[up], aspect="equal")
         axes.set(xlim=centre[0] + half * np.array([-1, 1]), ylim=centre[up] + half * np.array([-1, 1]))
     count = len(world.names)

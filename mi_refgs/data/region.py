@@ -1,14 +1,14 @@
-"""The region of interest: a sphere, the contraction of space around it, and its estimate from cameras.
+"""The region of interest: a sphere above planes, the contraction of space around it, a guess from cameras.
 
-The contraction maps all of space into a ball of twice the sphere's radius, so that a grid or random samples
-in contracted space cover near and far. World positions in scene units. [Mip-NeRF 360, Barron et al. 2022,
-eq. 10]
+Planes are where a table or a wall supports the object. The contraction maps all of space into a ball of twice
+the sphere's radius, so that a grid or random samples in contracted space cover near and far. World positions
+in scene units. [Mip-NeRF 360, Barron et al. 2022, eq. 10]
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,45 +21,87 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json, write_json
 
 REGION_FILE = "region.json"
-"""File in the folder of a data set: {"centre": [x, y, z], "radius": r} in scene units."""
+"""File in the folder of a data set: the `content` of its region, in scene units."""
 REGION_SHARE = 0.8
 """Radius of the region estimated from cameras over that of the sphere that the median view shows entirely."""
 CAMERA_SHARE = 0.8  # its largest radius over the nearest camera's distance: cameras are outside of the region
+SAME = 1e-6
+"""Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""
 SMALLEST = 1e-6
 """Its smallest radius over the largest coordinate of a camera: float32 resolves no smaller lengths."""
 
 
+Plane = tuple[float, float, float, float]
+"""Unit normal (a, b, c) and offset d of the half-space a x + b y + c z ≥ d."""
+
+
 @dataclass(frozen=True)
 class Region:
-    """A sphere."""
+    """A sphere, or the part of it that is above planes."""
 
     centre: tuple[float, float, float]  # world
     radius: float  # scene units, positive
+    planes: tuple[Plane, ...] = ()
+    estimated: bool = field(default=False, compare=False)  # from cameras and points, not given by a user
 
     @staticmethod
     def of(content: Any, source: Path | str) -> Region:
-        """The region {"centre": [x, y, z], "radius": r} of a JSON file or an option, `source`.
+        """The region {"centre": [x, y, z], "radius": r, "planes": [[a, b, c, d], …]} of a JSON file or an
+        option, `source`; planes are optional.
 
         Raises InputError for anything else, and for numbers that no scene has.
         """
-        centre = content.get("centre") if isinstance(content, dict) else None
+        content = content if isinstance(content, dict) else {}
+        centre = content.get("centre")
         numbers = [*centre, content.get("radius")] if isinstance(centre, list) else []
-        usable = all(type(number) in (int, float) and abs(number) <= MAX_NUMBER for number in numbers)
-        if len(numbers) != 4 or not usable or not numbers[3] >= 1 / MAX_NUMBER:
+        if len(numbers) != 4 or not all(map(_usable, numbers)) or not numbers[3] >= 1 / MAX_NUMBER:
             raise InputError(
                 f"{source}: centre, radius: not three numbers and a positive one; correct or remove them"
             )
         x, y, z, radius = map(float, numbers)
-        return Region((x, y, z), radius)
+        planes, rows = list[Plane](), content.get("planes", [])
+        for row in rows if isinstance(rows, list) else [rows]:
+            usable = isinstance(row, list) and len(row) == 4 and all(map(_usable, row))
+            length = float(np.linalg.norm(row[:3])) if usable else 0.0
+            if not length >= 1 / MAX_NUMBER:
+                raise InputError(
+                    f"{source}: planes: not [a, b, c, d] of a x + b y + c z ≥ d each; correct or remove them"
+                )
+            a, b, c, d = (float(number) / length for number in row)
+            planes.append((a, b, c, d))
+        return Region((x, y, z), radius, tuple(planes), content.get("estimated") is True)
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """What `of` reads of it, for a JSON file."""
+        found: dict[str, Any] = {"centre": list(self.centre), "radius": self.radius}
+        found |= {"planes": [list(plane) for plane in self.planes]} if self.planes else {}
+        return found | ({"estimated": True} if self.estimated else {})
 
     def moved(self, offset: np.ndarray) -> Region:
-        """The region with its centre moved by an offset (3,)."""
+        """The region moved by an offset (3,)."""
         x, y, z = (float(c) for c in np.array(self.centre) + offset)
-        return Region((x, y, z), self.radius)
+        planes = tuple((a, b, c, d + float(np.dot((a, b, c), offset))) for a, b, c, d in self.planes)
+        return replace(self, centre=(x, y, z), planes=planes)
+
+    def is_close(self, other: Region) -> bool:
+        """Whether two regions are the same but for the last digits."""
+        own, others = ((*r.centre, r.radius, *np.ravel(r.planes)) for r in (self, other))
+        return len(own) == len(others) and bool(np.allclose(own, others, rtol=0, atol=SAME * self.radius))
+
+    def heights(self, points: np.ndarray) -> np.ndarray:
+        """Heights (N, P) of points (N, 3) above the planes, scene units."""
+        planes = np.array(self.planes).reshape(-1, 4)
+        return np.asarray(points @ planes[:, :3].T - planes[:, 3])
+
+    def above(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (N, 3) are above all planes: (N,) bool."""
+        return np.asarray((self.heights(points) >= 0).all(axis=-1))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Whether points (N, 3) are inside: (N,) bool."""
-        return np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius
+        near = np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius
+        return np.asarray(near & self.above(points))
 
     def contract(self, points: np.ndarray) -> np.ndarray:
         """Contract world points (N, 3): o = offset / radius inside the sphere, (2 − 1/|o|) o/|o| outside."""
@@ -77,6 +119,11 @@ class Region:
         return np.array(self.centre) + self.radius * offset
 
 
+def _usable(number: Any) -> bool:
+    """Whether a value of a JSON file is a number that a scene may have."""
+    return type(number) in (int, float) and abs(number) <= MAX_NUMBER
+
+
 def region_of(views: Sequence[View]) -> Region:
     """The sphere around the point that all cameras look at, as large as the median view shows entirely.
 
@@ -91,7 +138,7 @@ def region_of(views: Sequence[View]) -> Region:
     if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):
         raise InputError("views: cameras: they do not look at one point in front of them; give a region.json")
     x, y, z = (float(c) for c in focus)
-    return Region((x, y, z), radius)
+    return Region((x, y, z), radius, estimated=True)
 
 
 def region_radius(distance: np.ndarray, half_angle: np.ndarray) -> float:
@@ -108,16 +155,25 @@ def weighted_quantile(values: np.ndarray, weight: np.ndarray, share: float) -> f
 
 
 def region_pixels(view: View, region: Region) -> np.ndarray:
-    """Mask (H, W) of pixels whose ray through the centre hits the region's sphere in front of the camera."""
+    """Mask (H, W) of pixels whose ray through the centre hits the region in front of the camera."""
     across = (view.cx - 0.5 - np.arange(view.width)) / view.fx
     up = (view.cy - 0.5 - np.arange(view.height)) / view.fy
     local = np.stack([*np.meshgrid(across, up), np.ones((view.height, view.width))], axis=-1)
-    toward = (np.array(region.centre) - view.to_world[:3, 3]) @ view.to_world[:3, :3]
+    rotation, origin = view.to_world[:3, :3], view.to_world[:3, 3]
+    toward = (np.array(region.centre) - origin) @ rotation
     length = np.linalg.norm(local, axis=-1)
     along = (local @ toward) / length
     beside = np.sum(toward**2) - along**2
-    inside = float(np.sum(toward**2)) < region.radius**2
-    return (beside <= region.radius**2) & ((along > 0) | inside)
+    # The part of each ray in the sphere and above the planes, where its height grows or falls linearly.
+    half = np.sqrt(np.maximum(region.radius**2 - beside, 0))
+    first, last = np.maximum(along - half, 0), along + half
+    for *normal, offset in region.planes:
+        height, slope = origin @ normal - offset, (local @ (normal @ rotation)) / length
+        crossing = -height / np.where(slope == 0, np.inf, slope)
+        first = np.where(slope > 0, np.maximum(first, crossing), first)
+        last = np.where(slope < 0, np.minimum(last, crossing), last)
+        last = np.where((slope == 0) & (height < 0), -1, last)
+    return (beside <= region.radius**2) & (last > 0) & (first <= last)
 
 
 def read_region(folder: Path) -> Region | None:
@@ -131,4 +187,4 @@ def read_region(folder: Path) -> Region | None:
 
 def write_region(folder: Path, region: Region) -> None:
     """Write region.json into a data set's folder; raises InputError if it cannot be written."""
-    write_json(folder / REGION_FILE, {"centre": list(region.centre), "radius": region.radius})
+    write_json(folder / REGION_FILE, region.content)

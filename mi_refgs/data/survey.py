@@ -105,7 +105,7 @@ def survey(folder: Path) -> Survey:
         extent=train.scene_extent,
         alpha={0: "none", len(views): "all"}.get(with_alpha, "some"),
         points=len(train.points.position) if train.points else 0,
-        region=None if train.region is None else asdict(train.region),
+        region=None if train.region is None else train.region.content,
         environment=train.environment is not None,
         truth=tuple(sorted(truth)),
         missing=(),

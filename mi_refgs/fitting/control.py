@@ -32,8 +32,10 @@ MARGIN = 0.02  # distance beyond the border of the region, in radii, from which 
 
 
 def depth_outside(position: np.ndarray, region: Region) -> np.ndarray:
-    """Signed distance (N,) of points (N, 3) from the region's sphere in its radii, negative inside."""
-    return np.asarray(np.linalg.norm(position - np.array(region.centre), axis=1) / region.radius - 1)
+    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside."""
+    sphere = np.linalg.norm(position - np.array(region.centre), axis=1) / region.radius - 1
+    below = -region.heights(position) / region.radius
+    return np.asarray(np.maximum(sphere, below.max(axis=1, initial=-np.inf)))
 
 
 def exchanged(
@@ -125,6 +127,7 @@ class AdaptiveControl:
     def _densify(self, iteration: int) -> None:
         """Grow where the error is, prune, and let surfels of an open scene change tables."""
         options, data, method, state = self.options, self.setup.data, self.setup.method, self.state
+        region = state.region or data.region
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
@@ -132,9 +135,9 @@ class AdaptiveControl:
             surfels, is_background = table.surfels, bool(table.prefix)
             largest: float | np.ndarray = options.prune_extent * data.scene_extent
             if is_background:  # its surfels may grow with their distance
-                assert data.region is not None and method.surroundings is not None
-                outside = depth_outside(surfels.raw["position"].numpy(), data.region)
-                distance = data.region.radius * (1 + np.maximum(outside, 0))
+                assert region is not None and method.surroundings is not None
+                offset = surfels.raw["position"].numpy() - np.array(region.centre)
+                distance = np.maximum(np.linalg.norm(offset, axis=1), region.radius)
                 largest = method.surroundings.prune_extent * distance
             error, unseen = table.error_sum.numpy(), table.unseen.numpy() >= EPOCHS * self.setup.epoch
             table.apply(
@@ -143,14 +146,19 @@ class AdaptiveControl:
                 )
             )
         if self.setup.open_scene:
-            assert data.region is not None
-            inner, outer = (table.surfels for table in state.tables)
-            edits = exchanged(inner, outer, method, data.region, self.setup.rng(iteration, "densify"))
-            for table, edit in zip(state.tables, edits, strict=True):
-                table.apply(edit)
+            assert region is not None
+            self.exchange(region, iteration)
         state.occluder.vertex_surfels = None
         for table in state.tables:
             table.clear()
+
+    def exchange(self, region: Region, iteration: int) -> None:
+        """Let the surfels beyond the border of a region change tables."""
+        inner, outer = (table.surfels for table in self.state.tables)
+        edits = exchanged(inner, outer, self.setup.method, region, self.setup.rng(iteration, "densify"))
+        for table, edit in zip(self.state.tables, edits, strict=True):
+            table.apply(edit)
+        self.state.occluder.vertex_surfels = None
 
     def wander(self, iteration: int) -> None:
         """Apply the random step of positions that follows the optimiser's. [3DGS-MCMC]"""

@@ -47,8 +47,7 @@ def open_points(
         sparse = PointCloud(sparse.position[rows], colour) if rows.any() else None
     drawn = count if sparse is None else round(random * count)
     if inside:
-        offset = init.random_normals(drawn, rng) * np.cbrt(rng.random((drawn, 1))) * region.radius
-        points = np.array(region.centre) + offset
+        points = _within(drawn, region, rng)
     else:
         points = _around(drawn, region, data, rng)
     colours = hull.median_colours(points, data.views, data.background)
@@ -74,13 +73,28 @@ def at_points(
     return points, hull.median_colours(points, data.views, data.background)
 
 
+def _within(count: int, region: Region, rng: np.random.Generator) -> np.ndarray:
+    """Points (count, 3) uniform in the region; raises InputError if planes leave hardly any of its sphere."""
+    found = np.empty((0, 3))
+    for _ in range(DRAWS):
+        number = (4 if region.planes else 1) * (count - len(found))
+        offset = init.random_normals(number, rng) * np.cbrt(rng.random((number, 1))) * region.radius
+        points = np.array(region.centre) + offset
+        found = np.concatenate([found, points[region.above(points)]])[:count]
+        if len(found) == count:
+            return found
+    raise InputError("region: planes: they leave hardly anything of the sphere; correct or remove them")
+
+
 def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, 3) uniform in the contracted shell around the region, where enough views see them;
-    anywhere if too few are seen."""
+    """Points (count, 3) uniform in contracted space outside of the region, where enough views see them;
+    anywhere there if too few are seen."""
+    nearest = 0.0 if region.planes else 1.0  # the sphere has points below planes
 
     def draw(number: int) -> np.ndarray:
-        length = np.cbrt(rng.uniform(1, FARTHEST**3, (number, 1)))
-        return region.expand(init.random_normals(number, rng) * length)
+        length = np.cbrt(rng.uniform(nearest, FARTHEST**3, (number, 1)))
+        points = region.expand(init.random_normals(number, rng) * length)
+        return points[~region.contains(points)] if region.planes else points
 
     found = np.empty((0, 3))
     for _ in range(DRAWS):
@@ -89,7 +103,9 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
         points = draw(4 * (count - len(found)))
         seen = np.mean([view.project(points)[2] for view in data.views], axis=0) >= SEEN_SHARE
         found = np.concatenate([found, points[seen]])[:count]
-    return np.concatenate([found, draw(count - len(found))])
+    while len(found) < count:
+        found = np.concatenate([found, draw(count - len(found))])
+    return found
 
 
 ALBEDO_RANGE = (0.02, 0.9)  # range of an initial albedo from images: near 0 and 1 the sigmoid has no slope

@@ -6,11 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.data.dataset import Dataset, PointCloud
+from mi_refgs.data.object_region import camera_positions, object_region, seen_share, shown_whole
+from mi_refgs.data.region import REGION_FILE, region_pixels
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure, poses
@@ -206,6 +209,7 @@ def begin(
             method = replace(method, select=None)
         if find_points is not None:
             views = replace(views, points=find_points(views, run.path, tell))
+        views = _around_object(views, tell, warn)
     trainer = Trainer(method, views, run, state, tell=tell, warn=warn)
     if resumed:
         run.rewind(trainer.iteration)
@@ -214,6 +218,27 @@ def begin(
     install_trials(trainer, tell)
     install_metal_trial(trainer, tell)
     return trainer
+
+
+def _around_object(views: Dataset, tell: Tell, warn: Tell) -> Dataset:
+    """Adapt an estimated region of interest to the points; raises InputError for one that no view shows."""
+    region, points = views.region, views.points
+    if region is None or views.has_alpha:
+        return views
+    if region.estimated and points is not None:
+        seen = partial(seen_share, views.views)
+        found = object_region(region, camera_positions(views.views), points.position, seen)
+        if found.planes:
+            tell(f"{views.path}: region of interest: it ends above the plane that supports the object")
+        if found.radius > region.radius:
+            tell(f"{views.path}: region of interest: it has grown to {found.radius:.3g} units")
+        if not shown_whole(views.views, found, points.position):
+            warn(f"{views.path}: no image shows the whole object; add some from farther away")
+        region = found
+    if not any(region_pixels(view, region).any() for view in views.views):
+        where = f"{views.path / REGION_FILE}: centre, radius, planes"
+        raise InputError(f"{where}: no view shows the region; correct or remove them")
+    return replace(views, region=region)
 
 
 def finish(trainer: Trainer, run: Run) -> str | None:
@@ -232,6 +257,8 @@ def finish(trainer: Trainer, run: Run) -> str | None:
         run.write_json(exposure.EXPOSURE_FILE, gains)
     if (cameras := poses.record(trainer.setup, trainer.fit)) is not None:
         run.write_json(CAMERAS, cameras)
+    if trainer.fit.region is not None:
+        run.write_dataset(str(trainer.data.path.resolve()), trainer.fit.region)
     warning, camera = None, trainer.camera(0)
     try:
         camera = read_views(trainer.method, trainer.data.path, "test").views[0].camera()

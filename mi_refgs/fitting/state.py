@@ -5,7 +5,7 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
     params/NAME  optimiser/NAME/PART       parameters, and Adam's moments and counters of each
     error_sum  unseen                      per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
-    iteration  seconds  held_until  decisions  exposure  cameras  light_gradient
+    iteration  seconds  held_until  decisions  exposure  cameras  region  light_gradient
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.optim import Adam
@@ -126,6 +127,7 @@ class FitState:
     decisions: list[dict[str, Any]] = field(default_factory=list)  # about components of the method
     exposure: dict[str, Any] | None = None  # decision about the exposure compensation
     cameras: dict[str, Any] | None = None  # decision about camera corrections
+    region: Region | None = None  # of interest, once it has followed the object
 
     @staticmethod
     def start(setup: FitSetup, gains: Mapping[str, TensorXf]) -> FitState:
@@ -185,8 +187,10 @@ class FitState:
             state[f"{table.prefix}unseen"] = table.unseen.numpy()
         state |= {name: np.array(getattr(self, name)) for name in ("iteration", "seconds", "held_until")}
         state |= self.prefilter.state()
-        for name in ("exposure", "cameras", "decisions"):
-            if value := getattr(self, name):
+        region = None if self.region is None else self.region.content
+        records = {"exposure": self.exposure, "cameras": self.cameras, "decisions": self.decisions}
+        for name, value in (records | {"region": region}).items():
+            if value:
                 state[name] = np.frombuffer(json.dumps(value).encode(), np.uint8)
         if (mesh := self.occluder.mesh()) is not None:
             state |= {f"{MESH}vertices": mesh.vertices, f"{MESH}faces": mesh.faces}
@@ -208,8 +212,15 @@ class FitState:
         made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
         made.held_until = int(state["held_until"])
         made.decisions = decisions_of(state)
+<<<<<<< HEAD
         for name in {"exposure", "cameras"} & state.keys():
             setattr(made, name, json.loads(state[name].tobytes()))
+=======
+        if "exposure" in state:
+            made.exposure = json.loads(state["exposure"].tobytes())
+        if "region" in state:
+            made.region = Region.of(json.loads(state["region"].tobytes()), "checkpoint")
+>>>>>>> h-region
         made.occluder = _occluder_of(state)
         _, stage = setup.method.stage_at(max(made.iteration, 1))
         made.prefilter.restore(made.light, made.shading(stage), state)

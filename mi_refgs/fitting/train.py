@@ -21,7 +21,7 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.fitting import exposure, poses
+from mi_refgs.fitting import exposure, object_surface, poses
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
 from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective, require_losses
@@ -132,6 +132,11 @@ class Trainer:
     def data(self) -> Dataset:
         """The training views in use."""
         return self.setup.data
+
+    @property
+    def region(self) -> Region | None:
+        """The region of interest in use: that of the data until it follows the object."""
+        return self.fit.region or self.data.region
 
     @property
     def iteration(self) -> int:
@@ -245,6 +250,7 @@ class Trainer:
         control.refine(iteration)
         self._decide_exposure()
         self._decide_cameras()
+        self._follow_object()
         mesh = self.method.mesh
         if mesh is not None and self.fit.shading(stage).traceable and mesh.extract.due(iteration):
             last = mesh.extract.count(iteration) == mesh.extract.count(self.method.iterations)
@@ -266,7 +272,7 @@ class Trainer:
         if cameras is None:
             cameras = [self.camera(i) for i in range(len(self.data.views))]
         far = around.surfels.detach() if around is not None and options.unbounded else None
-        mesh = surface_of(self.surfels.detach(), cameras, options.resolution, far, self.data.region)
+        mesh = surface_of(self.surfels.detach(), cameras, options.resolution, far, self.region)
         self.fit.occluder.update(mesh)
         return mesh
 
@@ -387,6 +393,26 @@ class Trainer:
         if decision["corrected"]:
             self.check()
             self.restore(poses.with_corrections(self.setup, self.state()))
+
+    def _follow_object(self) -> None:
+        """Adapt the region of interest to the object that the surfels show, if that is due."""
+        if not object_surface.is_due(self.setup, self.fit):
+            return
+
+        def depth_of(view: View) -> tuple[Float, Float]:
+            around = self.surroundings
+            assert around is not None
+            return render_depth(self.surfels.detach(), view.camera(), around.surfels.detach())
+
+        self.check()
+        before, found = self.region, object_surface.followed(self.setup, depth_of)
+        self.fit.region = found or before
+        if found is None:
+            self.tell("region of interest: nothing stands apart from the scene, so it stays")
+            return
+        centre = ", ".join(f"{x:.3g}" for x in found.centre)
+        self.tell(f"region of interest: the object is within {found.radius:.3g} units of ({centre})")
+        AdaptiveControl(self.setup, self.fit).exchange(found, self.iteration)
 
 
 def surface_of(

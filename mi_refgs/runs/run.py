@@ -15,7 +15,6 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +90,7 @@ class Run:
 
     def write_dataset(self, dataset: str, region: Region | None) -> None:
         """Write the folder of the data set, and its region of interest if there is one."""
-        record = {"path": dataset} | ({} if region is None else {"region": asdict(region)})
+        record = {"path": dataset} | ({} if region is None else {"region": region.content})
         write_bytes(self.output.own(DATASET), json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:

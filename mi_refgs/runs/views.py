@@ -8,16 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import DATASET, Run
-
-SAME_REGION = 1e-6
-"""Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""
 
 
 def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:
@@ -70,8 +65,7 @@ def with_region(
     """
     if region is None:
         return views
-    now, old = views.region, np.array((*region.centre, region.radius))
-    change = np.inf if now is None else np.abs(np.array((*now.centre, now.radius)) - old).max()
-    if change > SAME_REGION * region.radius:
+    now = views.region
+    if now is None or not ((now.estimated and region.estimated) or now.is_close(region)):
         tell(f"{views.path}: region: it has changed since the run was started, which keeps its own")
     return replace(views, region=region)

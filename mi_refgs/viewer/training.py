@@ -39,7 +39,7 @@ class Training(ViewerScene):
 
     def __init__(self, trainer: Trainer) -> None:
         self.trainer = trainer
-        self.centre, self.radius = bounds_of(trainer.surfels, trainer.data.region)
+        self.centre, self.radius = bounds_of(trainer.surfels, trainer.region)
         names = variables_of(trainer.surfels, trainer.shading())
         self.variables = tuple(name for name in names if name != "visibility")  # in all stages
         self.backdrops = backdrops_of(trainer.surroundings is not None, light=False)

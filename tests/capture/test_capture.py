@@ -104,7 +104,9 @@ def test_capture_writes_images_masks_region_and_report(captured: Path, images: l
     report = json.loads((data / "capture.json").read_text())
     assert (report["placed"], report["photographs"], report["not_placed"]) == (COUNT, COUNT, [])
     assert 0 < report["mean_reprojection_error"] < 0.5 and report["mean_track_length"] > 2
-    assert json.loads((data / "region.json").read_text()) == {"centre": [0, 0, 0], "radius": 1}
+    region = json.loads((data / "region.json").read_text())
+    assert (region["centre"], region["radius"], region["estimated"]) == ([0, 0, 0], 1, True)
+    assert region["planes"][0][2] > 0.99  # the ground
     assert (data / "capture.png").stat().st_size > 10_000
     model = colmap.load().Reconstruction(data / "sparse" / "0")
     [camera] = model.cameras.values()
@@ -128,7 +130,8 @@ def test_captured_data_set_is_read(captured: Path, capsys: pytest.CaptureFixture
     train, test = (read_loaded(captured / "data", split) for split in ("train", "test"))
     assert [view.name for view in test.views] == [NAMES[0], NAMES[8]] and len(train.views) == COUNT - 2
     assert all(view.alpha is not None and {0.0, 1.0} == {*np.unique(view.alpha)} for view in train.views)
-    assert train.region == Region((0, 0, 0), 1) and train.points is not None
+    assert train.region is not None and replace(train.region, planes=()) == Region((0, 0, 0), 1)
+    assert train.points is not None
     shots = scene.around(COUNT)
     truth = []
     for i, view in [(int(view.name[:2]), view) for view in train.views]:
@@ -161,7 +164,8 @@ def test_second_capture_computes_nothing(captured: Path, monkeypatch: pytest.Mon
     assert {path.name: path.stat().st_mtime_ns for path in (data / "images").iterdir()} == before
     np.testing.assert_array_equal(_model(data).origin, model.origin)
     assert main([*command, "--region", "0.1", "0.2", "0.3", "0.5"]) == 0
-    assert json.loads((data / "region.json").read_text()) == {"centre": [0.1, 0.2, 0.3], "radius": 0.5}
+    region = json.loads((data / "region.json").read_text())
+    assert (region["centre"], region["radius"]) == ([0.1, 0.2, 0.3], 0.5) and "estimated" not in region
 
 
 @needs_colmap

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from mi_refgs.data.images import Pixels
-from mi_refgs.data.region import REGION_FILE, Region, read_region, region_of, region_pixels
+from mi_refgs.data.region import (
+    REGION_FILE,
+    Plane,
+    Region,
+    read_region,
+    region_of,
+    region_pixels,
+    write_region,
+)
 from mi_refgs.data.view import View
 from mi_refgs.reference.camera import look_at
 from tests.helpers import refused
@@ -37,6 +45,31 @@ def test_region_pixels_are_those_whose_rays_hit_it() -> None:
         assert found.any()
     behind = Region((6.0, 3.0, 1.5), 0.4)
     assert not region_pixels(view_from(np.array([2.0, 1.0, 0.5])), behind).any()
+
+
+def test_planes_cut_region_and_its_pixels() -> None:
+    """Against points along the rays; from above, below and inside, and for rays along a plane."""
+    region = Region((0.3, -0.2, 0.1), 0.4, ((0.0, 0.0, 1.0, 0.2), (-0.6, 0.8, 0.0, -0.4)))
+    points = np.random.default_rng(0).uniform(-0.5, 1, (2000, 3))
+    x, y, z = points.T
+    near = np.linalg.norm(points - np.array(region.centre), axis=1) <= 0.4
+    above = (z >= 0.2) & (-0.6 * x + 0.8 * y >= -0.4)
+    np.testing.assert_array_equal(region.contains(points), near & above)
+    assert 0 < np.sum(near & above) < np.sum(near)
+    for origin in ([2.0, 1.0, 0.5], [-0.5, 0.6, -1.5], [0.35, 0.05, 0.3], [2.0, 0.0, 0.25]):
+        view = replace(view_from(np.array(origin)), width=30, height=20, fx=25.0, fy=28.0, cx=12.0, cy=11.0)
+        rays = np.array(view.camera().rays()).T
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        steps = origin + np.linspace(0, 6, 3000)[:, None, None] * rays
+        sure, never = (replace(region, radius=0.4 + e, planes=shifted(region, -e)) for e in (-4e-3, 4e-3))
+        found = region_pixels(view, region).ravel()
+        assert np.all(found[sure.contains(steps).any(axis=0)])
+        assert not np.any(found[~never.contains(steps).any(axis=0)]) and found.any()
+
+
+def shifted(region: Region, distance: float) -> tuple[Plane, ...]:
+    """The planes of a region, moved along their normals."""
+    return tuple((a, b, c, d + distance) for a, b, c, d in region.planes)
 
 
 def test_contraction_is_identity_inside_and_bounded_by_two() -> None:
@@ -87,6 +120,25 @@ def test_region_file_is_read(tmp_path: Path) -> None:
     assert read_region(tmp_path) is None
     (tmp_path / REGION_FILE).write_text('{"centre": [1, 2, 3], "radius": 0.5}')
     assert read_region(tmp_path) == Region((1.0, 2.0, 3.0), 0.5)
+    (tmp_path / REGION_FILE).write_text('{"centre": [1, 2, 3], "radius": 0.5, "planes": [[0, 0, 2, 1]]}')
+    read = read_region(tmp_path)
+    assert read == Region((1.0, 2.0, 3.0), 0.5, ((0.0, 0.0, 1.0, 0.5),)) and not read.estimated
+    for region in (read, replace(read, planes=()), replace(read, estimated=True)):
+        write_region(tmp_path, region)
+        again = read_region(tmp_path)
+        assert again == region and again is not None and again.estimated == region.estimated
+
+
+def test_region_moves_with_its_planes() -> None:
+    region = Region((1.0, 2.0, 3.0), 2.0, ((0.6, 0.0, 0.8, 2.9), (0.0, 1.0, 0.0, 1.5)))
+    points, offset = np.random.default_rng(0).uniform(0, 5, (500, 3)), np.array([5.0, -7.0, 0.5])
+    inside = region.contains(points)
+    np.testing.assert_array_equal(region.moved(offset).contains(points + offset), inside)
+    assert 0 < np.sum(inside) < 500
+    assert region.is_close(region.moved(np.full(3, 1e-7))) and not region.is_close(
+        region.moved(np.full(3, 1e-5))
+    )
+    assert not region.is_close(replace(region, planes=region.planes[:1]))
 
 
 @pytest.mark.parametrize(
@@ -95,6 +147,10 @@ def test_region_file_is_read(tmp_path: Path) -> None:
      '{"centre": [1, 2, 1e10], "radius": 1}', '{"centre": [1, 2, NaN], "radius": 1}',
      '{"centre": [1, 2, true], "radius": 1}', '{"centre": [1, 2, "3"], "radius": 1}',
      '{"centre": [1, 2, 3], "radius": true}', '{"centre": [1, 2, 3], "radius": 1e10}',
+     '{"centre": [1, 2, 3], "radius": 1, "planes": 3}',
+     '{"centre": [1, 2, 3], "radius": 1, "planes": [[0, 0, 1]]}',
+     '{"centre": [1, 2, 3], "radius": 1, "planes": [[0, 0, 0, 1]]}',
+     '{"centre": [1, 2, 3], "radius": 1, "planes": [[0, 0, NaN, 1]]}',
      '{"centre": [1, 2, 3], "radius": 1e-300}', '{"centre": "123", "radius": 1}'],
 )  # fmt: skip
 def test_broken_region_file_is_refused(tmp_path: Path, text: str) -> None:

@@ -13,9 +13,10 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
 from mi_refgs.data.images import ImageFile
-from mi_refgs.data.region import REGION_FILE
+from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.control import exchanged
+from mi_refgs.fitting import object_surface
+from mi_refgs.fitting.control import depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.runner import begin, default_method
 from mi_refgs.fitting.schedule import FitSetup
@@ -143,6 +144,81 @@ def test_surfels_beyond_border_change_tables(method: Method) -> None:
     assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 3
     gone = table(method.surfels.names, [2.0, 3.0], 1)
     assert exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
+
+
+def test_surfels_below_planes_change_tables(method: Method) -> None:
+    """Those of the object that are below a plane of the region, and those of the background above all."""
+    rng = np.random.default_rng(0)
+    region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1), (1.0, 0.0, 0.0, -0.5)))
+
+    def table(names: tuple[str, ...], places: list[list[float]]) -> Surfels:
+        raw = {n: rng.normal(size=(len(places), method.surfels.columns(n))) for n in names}
+        raw["radiance_sh"] = rng.normal(size=(len(places), 3))
+        return Surfels.from_numpy(raw | {"position": np.array(places)})
+
+    inner = table(method.surfels.names, [[0, 0, 0.4], [0, 0, 0.05], [-0.6, 0, 0.2], [0, 0, 0.095]])
+    outer = table(SurroundingsOptions(degree=0).names("surfel"), [[0, 0, 0], [0, 0.1, 0.3], [0, 0, 0.105]])
+    own, other = (
+        edit.surfels.to_numpy()["position"] for edit in exchanged(inner, outer, method, region, rng)
+    )
+    np.testing.assert_allclose(own, [[0.0, 0.0, 0.4], [0.0, 0.0, 0.095], [0.0, 0.1, 0.3]], atol=1e-6)
+    outside = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.105], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]]
+    np.testing.assert_allclose(other, outside, atol=1e-6)
+
+
+def test_points_start_on_their_side_of_planes(data: Dataset, method: Method) -> None:
+    region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1),))
+    params = initial_parameters(method, replace(data, region=region), np.random.default_rng(0), True)
+    inner, outer = params["position"].numpy(), params["surroundings/position"].numpy()
+    assert np.all(region.contains(inner)) and not np.any(region.contains(outer))
+    assert np.any(REGION.contains(outer))  # below the plane, too
+    empty = replace(data, region=replace(region, planes=((0.0, 0.0, 1.0, 0.8),)))
+    refused(lambda: initial_parameters(method, empty, np.random.default_rng(0), True), "hardly anything")
+
+
+def test_region_follows_object_once(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a third of the fit, unless a user gave the region; a checkpoint has it, and edits use it."""
+    found = replace(REGION, radius=0.5, planes=((0.0, 0.0, 1.0, 0.0),), estimated=True)
+    seen, said = list[int](), list[str]()
+
+    def followed(setup: FitSetup, depth_of: object) -> Region | None:
+        seen.append(len(setup.data.views))
+        return found
+
+    monkeypatch.setattr(object_surface, "followed", followed)
+    step_to(Trainer(method, data), STEPS // 2)
+    assert not seen  # region.json
+    guessed = replace(data, region=replace(REGION, estimated=True))
+    trainer = step_to(Trainer(method, guessed, tell=said.append), STEPS // 3 + 1)
+    assert len(seen) == len(said) == 1 and trainer.region == found and "0.5 units" in said[0]
+    position = trainer.surfels.to_numpy()["position"]
+    assert depth_outside(position, found).max() < 0.05
+    resumed = Trainer(method, guessed, state=trainer.state())
+    step_to(resumed, STEPS // 2)
+    assert resumed.region == found and len(seen) == 1
+    monkeypatch.setattr(object_surface, "followed", lambda setup, depth_of: None)
+    same = step_to(Trainer(method, guessed, tell=said.append), STEPS // 3 + 1)
+    assert same.region == REGION and "stays" in said[-1]
+
+
+def test_region_that_no_view_shows_is_refused(data: Dataset, method: Method, tmp_path: Path) -> None:
+    away = replace(data, region=Region((0.0, 0.0, 50.0), 0.5))
+    refused(lambda: begin(method, away, Run(tmp_path / "run")), "no view shows the region")
+    empty = replace(data, region=replace(REGION, planes=((0.0, 0.0, 1.0, 5.0),)))
+    refused(lambda: begin(method, empty, Run(tmp_path / "run")), "no view shows the region")
+
+
+def test_region_is_adapted_to_points_when_fit_begins(data: Dataset, method: Method, tmp_path: Path) -> None:
+    """The run records it, and a resumed fit does not complain that the cameras suggest another one."""
+    rng, said = np.random.default_rng(0), list[str]()
+    floor = rng.uniform(-1.2, 1.2, (1500, 3)) * [1, 1, 0] - [0, 0, 0.6]
+    cameras = replace(data, region=replace(REGION, estimated=True), points=PointCloud(floor, None))
+    run = Run(tmp_path / "run")
+    trainer = begin(method, cameras, run, said.append)
+    assert trainer.region is not None and len(trainer.region.planes) == 1
+    assert run.region() == trainer.region
+    again = begin(method, replace(data, region=replace(REGION, estimated=True)), run, said.append)
+    assert again.region == trainer.region and not any("changed" in text for text in said)
 
 
 def test_resume_repeats_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:

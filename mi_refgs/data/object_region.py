@@ -1,0 +1,192 @@
+"""The region of interest of an object, from points on the surfaces that images show.
+
+The surfaces that support the object, such as a table or a wall, are planes with all cameras on one side; the
+region ends there. The object is the group of close points above them that most views show. Before a fit there
+are points where the object has texture: the sphere estimated from the cameras grows until it contains that
+group. During a fit there are points everywhere: sphere and more planes enclose the group. World positions in
+scene units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from mi_refgs.data.region import CAMERA_SHARE, Plane, Region
+from mi_refgs.data.view import View
+
+PLANE_REACH = 2.0  # distance from the centre, in radii, up to which points determine support planes
+PLANE_WIDTH = 0.01
+"""Half the thickness, in radii, of the points of a plane: on *tabletop* of 98 % of those on the cloth (images
+of 135 × 240 pixels)."""
+PLANE_MARGIN = 0.04
+"""Height, in radii, above a plane at which the region begins. Half as much leaves surfels of the table with
+the object, which adds 4 % to its outline in short fits."""
+PLANE_DRAWS = 2_000
+"""Planes through three points that are compared: 30 good ones if a quarter of the points is on one."""
+MOST_POINTS = 5_000  # of the points on a plane, and twice as many of a group: time and memory grow with them
+PLANE_COUNT = 3  # most support planes: a table, and a corner of two walls
+PLANE_POINTS = 50  # fewest points on a support plane
+PLANE_SHARE = 0.05  # the same, of the points within PLANE_REACH
+BELOW_SHARE = 0.5
+"""Most points below a support plane over those on it. A face of the object has the object below; below a
+table is what its polish mirrors."""
+ABOVE_SHARE = 0.9  # fraction of the cameras that are above a support plane
+REFITS = 5  # rounds of least squares that follow the best draw
+SEEN_SHARE = 0.4  # fraction of the views that show a point of the object; close views leave some parts out
+LINK = 0.15  # distance of neighbours in a group of sparse points, radii
+FITTED_LINK = 0.08  # the same of points on fitted surfaces
+LINK_COUNT = 5  # points within that distance, itself included, of a point that is no stray one
+WHOLE = 0.95  # fraction of the group in an image that shows the whole object
+GROUP_POINTS = 50  # points of the group that make it an object: fewer are texture on a part of it
+WITHIN_SHARE = 0.95  # fraction of the group inside of the region at which the region stays
+SPHERE_SAMPLES = 2_000  # points of a sphere by which it is enclosed together with a group
+ENCLOSED = 1.05  # radius of the region over that of the smallest ball around the group and the sphere's part
+LEAST_WITHIN = 0.5
+"""Fraction of a group on fitted surfaces inside of the region, below which it is no object: something
+connects it to the scene."""
+FITTED_BALL = 1.1  # radius of the region over that of the smallest ball around a group on fitted surfaces
+BOX_MARGIN = 0.2  # distance of that group, in radii, from planes beside it: thin parts may be missing
+BALL_ROUNDS = 500  # rounds of the smallest enclosing ball: the radius is right to 1/√500 … 0.2 % in practice
+
+Seen = Callable[[np.ndarray], np.ndarray]
+"""Fraction (N,) of the views that show points (N, 3)."""
+
+
+def support_planes(points: np.ndarray, origins: np.ndarray, region: Region) -> tuple[Plane, ...]:
+    """The planes that support an object in a sphere, from points (N, 3) and camera positions (V, 3).
+
+    Each is a PLANE_MARGIN above the surface. There are none without enough points on a plane that nearly all
+    cameras look down at.
+    """
+    rng = np.random.default_rng(0)
+    radius, width = region.radius, PLANE_WIDTH * region.radius
+    points = points[np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * radius]
+    points = rng.permutation(points)[:MOST_POINTS]
+    least, found = max(PLANE_POINTS, PLANE_SHARE * len(points)), list[Plane]()
+    while len(points) >= least and len(found) < PLANE_COUNT:
+        # Planes through three points, with the cameras above.
+        corner = points[rng.integers(len(points), size=(PLANE_DRAWS, 3))]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal /= np.where(length > 0, length, 1)
+        normal *= np.sign(np.median(origins @ normal.T - np.sum(normal * corner[:, 0], axis=1), axis=0))[
+            :, None
+        ]
+        offset = np.sum(normal * corner[:, 0], axis=1)
+
+        # The one that most points are on, of those that have little below.
+        height = points @ normal.T - offset
+        on, below = np.sum(abs(height) < width, axis=0), np.sum(height < -2 * width, axis=0)
+        above = np.mean(origins @ normal.T > offset, axis=0)
+        usable = (above >= ABOVE_SHARE) & (below <= BELOW_SHARE * on) & (length[:, 0] > 0)
+        best = int(np.argmax(np.where(usable, on - below, -1)))
+        if not usable[best] or on[best] < least:
+            break
+        up, level = normal[best], float(offset[best])
+        for _ in range(REFITS):
+            near = points[abs(points @ up - level) < width]
+            middle = near.mean(axis=0)
+            across = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+            up = across * np.sign(across @ up)
+            level = float(up @ middle)
+        level += PLANE_MARGIN * radius
+        x, y, z = map(float, up)
+        found.append((x, y, z, level))
+        points = points[points @ up > level]
+    return tuple(found)
+
+
+def object_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region:
+    """The region of an object, from the sphere that the cameras (V, 3) suggest and points (N, 3) on surfaces.
+
+    Without enough points it is that sphere.
+    """
+    region = replace(region, planes=support_planes(points, origins, region))
+    group = object_points(region, points, seen, LINK)
+    if len(group) < GROUP_POINTS or np.mean(region.contains(group)) >= WITHIN_SHARE:
+        return region
+
+    # The ball around the group and the part of the sphere above the planes, with the cameras outside.
+    offset = np.random.default_rng(0).normal(size=(SPHERE_SAMPLES, 3))
+    offset *= region.radius / np.linalg.norm(offset, axis=1, keepdims=True)
+    sphere = np.array(region.centre) + offset
+    centre, radius = enclosing_ball(np.concatenate([group, sphere[region.above(sphere)]]))
+    return _with_ball(region, centre, ENCLOSED * radius, origins)
+
+
+def shown_whole(views: Sequence[View], region: Region, points: np.ndarray) -> bool:
+    """Whether an image shows the whole object, as far as sparse points (N, 3) tell."""
+    group = object_points(region, points, lambda chosen: np.ones(len(chosen)), LINK)
+    return len(group) < GROUP_POINTS or any(np.mean(view.project(group)[2]) >= WHOLE for view in views)
+
+
+def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region | None:
+    """The region of an object from points (N, 3) on all surfaces of a fit; else as `object_region`.
+
+    It is a ball and a box around the object, above the planes of `region`; None if no group of points is the
+    object.
+    """
+    group = object_points(region, points, seen, FITTED_LINK)
+    if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
+        return None
+    centre, radius = enclosing_ball(group)
+    region = _with_ball(region, centre, FITTED_BALL * radius, origins)
+    axes = np.linalg.svd(group - group.mean(axis=0), full_matrices=False)[2]
+    normals = np.concatenate([axes, -axes])
+    offsets = np.min(group @ normals.T, axis=0) - BOX_MARGIN * region.radius
+    box = tuple(
+        (float(a), float(b), float(c), float(d)) for (a, b, c), d in zip(normals, offsets, strict=True)
+    )
+    return replace(region, planes=(*region.planes, *box))
+
+
+def _with_ball(region: Region, centre: np.ndarray, radius: float, origins: np.ndarray) -> Region:
+    """The region with another sphere, which is smaller if a camera is near."""
+    nearest = float(np.linalg.norm(origins - centre, axis=1).min())
+    x, y, z = map(float, centre)
+    return replace(region, centre=(x, y, z), radius=min(radius, CAMERA_SHARE * nearest))
+
+
+def object_points(region: Region, points: np.ndarray, seen: Seen, link: float) -> np.ndarray:
+    """The group (M, 3) of points (N, 3) above the region's planes that most views show, and that has the most
+    points in its sphere. `link`: distance of neighbours, radii."""
+    near = np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * region.radius
+    points = points[near & region.above(points)]
+    points = np.random.default_rng(0).permutation(points)[: 2 * MOST_POINTS]
+    points = points[seen(points) >= SEEN_SHARE]
+    if not len(points):
+        return points
+    link *= region.radius
+    number = KDTree(points).query_ball_point(points, link, return_length=True)
+    points = points[number >= LINK_COUNT]
+    if not len(points):
+        return points
+    pairs = KDTree(points).query_pairs(link, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
+    label = connected_components(graph, directed=False)[1]
+    return np.asarray(points[label == np.argmax(np.bincount(label, region.contains(points)))])
+
+
+def enclosing_ball(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of nearly the smallest ball around points (N, 3). [Bădoiu and Clarkson 2003]"""
+    centre = points.mean(axis=0)
+    for step in range(1, BALL_ROUNDS + 1):
+        farthest = points[np.argmax(np.sum((points - centre) ** 2, axis=1))]
+        centre = centre + (farthest - centre) / (step + 1)
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def seen_share(views: Sequence[View], points: np.ndarray) -> np.ndarray:
+    """Fraction (N,) of the views whose images contain points (N, 3)."""
+    return np.asarray(np.mean([view.project(points)[2] for view in views], axis=0))
+
+
+def camera_positions(views: Sequence[View]) -> np.ndarray:
+    """World positions (V, 3)."""
+    return np.array([view.to_world[:3, 3] for view in views])

@@ -1,0 +1,137 @@
+"""The region of an object: what supports it is left out, what it consists of is inside."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from mi_refgs.data.images import Pixels
+from mi_refgs.data.object_region import (
+    camera_positions,
+    enclosing_ball,
+    fitted_region,
+    object_region,
+    seen_share,
+    shown_whole,
+    support_planes,
+)
+from mi_refgs.data.region import Region, region_of
+from mi_refgs.data.view import View
+from mi_refgs.reference.camera import look_at
+
+TABLE = -0.5  # height of the table in these scenes
+
+
+def views_around(target: tuple[float, float, float], focal: float = 120.0, count: int = 24) -> list[View]:
+    """Views of 100² pixels from above the table, at a distance of about 4."""
+    angle = np.arange(count) * 2.4
+    height = 1 + np.arange(count) % 5 / 3
+    origins = np.stack([4 * np.cos(angle), 4 * np.sin(angle), height], axis=1)
+    pixels = Pixels(np.zeros((100, 100, 3), np.float32))
+    return [View("v", 100, 100, focal, focal, 50, 50, look_at(o, np.array(target)), pixels) for o in origins]
+
+
+def box(low: tuple[float, ...], high: tuple[float, ...], count: int, rng: np.random.Generator) -> np.ndarray:
+    """Points on the sides of a box."""
+    points = rng.uniform(low, high, (count, 3))
+    axis, end = rng.integers(3, size=count), rng.integers(2, size=count)
+    points[np.arange(count), axis] = np.where(end, np.array(high)[axis], np.array(low)[axis])
+    return points
+
+
+def table(rng: np.random.Generator, count: int = 2000, reach: float = 2.5) -> np.ndarray:
+    """Points on the table, as inaccurate as triangulated ones."""
+    points = rng.uniform(-reach, reach, (count, 3))
+    points[:, 2] = TABLE + rng.normal(scale=0.003, size=count)
+    return points
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_table_is_found_and_left_out(rng: np.random.Generator) -> None:
+    """With stray points above it and their mirror images below."""
+    views = views_around((0, 0, 0))
+    item = box((-0.3, -0.2, TABLE), (0.3, 0.2, 0.4), 400, rng)
+    mirrored = item * [1, 1, -1] + [0, 0, 2 * TABLE]
+    points = np.concatenate([table(rng), item, mirrored, rng.uniform(0, 3, (300, 3))])
+    region = object_region(region_of(views), camera_positions(views), points, partial(seen_share, views))
+    ((*normal, offset),) = region.planes
+    np.testing.assert_allclose(normal, [0, 0, 1], atol=0.01)
+    assert TABLE < offset < TABLE + 0.06 * region.radius
+    assert region.contains(item[item[:, 2] > TABLE + 0.1]).all()
+    assert not region.contains(table(rng)).any()
+
+
+def test_faces_of_object_support_nothing(rng: np.random.Generator) -> None:
+    """A large box without a table: its faces have the object below them."""
+    views = views_around((0, 0, 0))
+    points = box((-1, -1, TABLE), (1, 1, 0.5), 4000, rng)
+    points = points[points[:, 2] > TABLE]  # nobody sees the bottom
+    assert support_planes(points, camera_positions(views), Region((0, 0, 0), 1.0)) == ()
+    cloud = rng.normal(size=(4000, 3))
+    assert support_planes(cloud, camera_positions(views), Region((0, 0, 0), 1.0)) == ()
+    assert support_planes(points[:10], camera_positions(views), Region((0, 0, 0), 1.0)) == ()
+
+
+def test_tall_object_is_whole(rng: np.random.Generator) -> None:
+    """Taller than what the views show entirely around the point that they look at."""
+    views = views_around((0, 0, 0.3))
+    item = box((-0.2, -0.2, TABLE), (0.2, 0.2, 1.8), 1500, rng)
+    points = np.concatenate([table(rng), item])
+    sphere, origins, seen = region_of(views), camera_positions(views), partial(seen_share, views)
+    assert not sphere.contains(item).all()
+    region = object_region(sphere, origins, points, seen)
+    assert region.contains(item[item[:, 2] > TABLE + 0.12]).all() and region.estimated
+    assert shown_whole(views, region, points)
+    close = views_around((0, 0, 0.3), focal=300.0)
+    assert not shown_whole(close, region, points)
+    few = np.concatenate([table(rng), item[:20]])
+    assert object_region(sphere, origins, few, seen).radius == sphere.radius
+
+
+def test_object_beside_the_axes_is_found(rng: np.random.Generator) -> None:
+    """On a wall, seen from one side by views that aim at the wall beside it."""
+    wall = table(rng, 2000, 4.0)[:, [0, 2, 1]] * [1, -1, 1]  # y = 0.5, the room is at lower y
+    item = box((-0.4, -1.2, -0.4), (0.4, 0.5, 0.4), 1500, rng)
+    item = item[item[:, 2] > -0.4]
+    pixels = Pixels(np.zeros((100, 100, 3), np.float32))
+    origins = rng.uniform([-2.5, -4, -1.5], [2.5, -3.5, 1.5], (20, 3))
+    aim = np.array([0.5, 0.5, 0.2])
+    views = [View("v", 100, 100, 130.0, 130.0, 50, 50, look_at(o, aim), pixels) for o in origins]
+    sphere = region_of(views)
+    region = object_region(sphere, origins, np.concatenate([wall, item]), partial(seen_share, views))
+    assert not sphere.contains(item).all()
+    assert region.contains(item[item[:, 1] < 0.3]).all() and not region.contains(wall).any()
+
+
+def test_surfaces_of_fit_enclose_object_alone(rng: np.random.Generator) -> None:
+    views = views_around((0, 0, 0.3))
+    item = box((-0.2, -0.2, TABLE), (0.2, 0.2, 1.6), 8000, rng)
+    beside = box((0.9, -0.2, TABLE), (1.2, 0.2, 0.2), 4000, rng)
+    points = np.concatenate([table(rng, 20_000), item, beside])
+    region = Region((0, 0, 0.3), 1.2, ((0, 0, 1, TABLE + 0.05),), True)
+    origins, seen = camera_positions(views), partial(seen_share, views)
+    assert region.contains(beside).any() and not region.contains(item[item[:, 2] > TABLE + 0.05]).all()
+    found = fitted_region(region, origins, points, seen)
+    assert found is not None and found.estimated
+    assert found.contains(item[item[:, 2] > TABLE + 0.05]).all()
+    assert not found.contains(beside).any() and not found.contains(table(rng)).any()
+    # Without the plane, the table connects everything; and there may be nothing.
+    assert fitted_region(Region((0, 0, 0.3), 1.2), origins, points, seen) is None
+    assert fitted_region(region, origins, table(rng), seen) is None
+
+
+def test_enclosing_ball_is_smallest(rng: np.random.Generator) -> None:
+    offset = rng.normal(size=(3000, 3))
+    points = offset / np.linalg.norm(offset, axis=1, keepdims=True) * 2 + [1, 2, 3]
+    centre, radius = enclosing_ball(np.concatenate([points, points[:200] * 0.5]))
+    assert radius < 1.02 * np.linalg.norm(points - centre, axis=1).max()
+    dense = np.repeat(points[:1], 5000, axis=0)
+    centre, radius = enclosing_ball(np.concatenate([points, dense]))
+    np.testing.assert_allclose(centre, [1, 2, 3], atol=0.05)
+    assert radius == pytest.approx(2, rel=0.03)
