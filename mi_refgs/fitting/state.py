@@ -212,15 +212,10 @@ class FitState:
         made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
         made.held_until = int(state["held_until"])
         made.decisions = decisions_of(state)
-<<<<<<< HEAD
         for name in {"exposure", "cameras"} & state.keys():
             setattr(made, name, json.loads(state[name].tobytes()))
-=======
-        if "exposure" in state:
-            made.exposure = json.loads(state["exposure"].tobytes())
         if "region" in state:
             made.region = Region.of(json.loads(state["region"].tobytes()), "checkpoint")
->>>>>>> h-region
         made.occluder = _occluder_of(state)
         _, stage = setup.method.stage_at(max(made.iteration, 1))
         made.prefilter.restore(made.light, made.shading(stage), state)
