@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
