@@ -408,7 +408,7 @@ class Trainer:
         before, found = self.region, object_surface.followed(self.setup, depth_of)
         self.fit.region = found or before
         if found is None:
-            self.tell("region of interest: nothing stands apart from the scene, so it stays")
+            self.tell("region of interest: no object is separate from the scene, so it stays")
             return
         centre = ", ".join(f"{x:.3g}" for x in found.centre)
         self.tell(f"region of interest: the object is within {found.radius:.3g} units of ({centre})")
