@@ -8,7 +8,7 @@ import re
 from site_pages import ROOT
 
 ELSEWHERE = {
-    "index.md": "README.md",
+    "is_it_for_me.md": "README.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
     "scenes.md": "scenes/README.md",
