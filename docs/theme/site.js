@@ -43,3 +43,9 @@ document.querySelectorAll(".compare").forEach(slider);
 document
   .querySelectorAll(".md-content img:not(.compare img):not(.hero img):not(a img)")
   .forEach((image) => enlargeable(image, dialog));
+
+// Short cells, such as "28.8 dB", stay on one line.
+const SHORT = 16; // characters
+document.querySelectorAll(".md-typeset td").forEach((cell) => {
+  if (cell.textContent.length <= SHORT) cell.style.whiteSpace = "nowrap";
+});
