@@ -21,8 +21,10 @@ from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import straight_srgb, to_8_bits
 from mi_refgs.synthesis.settings import load_scene, under_light
 
-QUALITY = 88
+QUALITY = 90
 """WebP quality, 0 to 100."""
+MARGIN = 0.05
+"""Margin around the object, as a part of the image."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ class Pair:
         traced = self._path_traced(fitted.scene(camera).sensors()[0])
         if self.light:
             ours[..., :3] *= np.sum(ours * traced, (0, 1))[:3] / np.sum(ours**2, (0, 1))[:3]
-        for name, image in {"ours": ours, "reference": traced}.items():
+        part = around_object(np.maximum(ours[..., 3], traced[..., 3]))
+        for name, image in {"ours": ours[part], "reference": traced[part]}.items():
             buffer = io.BytesIO()
             Image.fromarray(to_8_bits(straight_srgb(image))).save(buffer, "WEBP", quality=QUALITY, method=6)
             write_bytes(Path(f"{self.output}_{name}.webp"), buffer.getvalue())
@@ -60,6 +63,14 @@ class Pair:
             scene = under_light(scene, self.light)
         integrator = mi.load_dict({"type": "path", "max_depth": 6, "hide_emitters": True})
         return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=self.spp))
+
+
+def around_object(alpha: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of an image (H, W) that the object covers, with a margin."""
+    margin = round(MARGIN * max(alpha.shape))
+    covered = [np.flatnonzero(alpha.max(axis=axis) > 0.01) for axis in (1, 0)]
+    rows, columns = (slice(max(found[0] - margin, 0), found[-1] + 1 + margin) for found in covered)
+    return rows, columns
 
 
 if __name__ == "__main__":

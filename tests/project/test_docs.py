@@ -172,6 +172,18 @@ def test_site_loads_nothing_from_other_servers(site: Path) -> None:
         assert not re.findall(r'<link[^>]*href="(?:https?:)?//[^"]*"', text), page
 
 
+def test_sliders_have_two_labelled_images(site: Path) -> None:
+    """What theme/site.js makes a slider of; its labels are the alternative texts."""
+    found = [
+        box
+        for page in site.rglob("*.html")
+        for box in re.findall(r'<div class="compare">(.*?)</div>', page.read_text("utf-8"), flags=re.DOTALL)
+    ]
+    assert found
+    for box in found:
+        assert len(re.findall(r'<img alt="[^"]+" src="[^"]+" ?/?>', box)) == 2, box
+
+
 def test_site_lists_external_links(site: Path) -> None:
     listed = (site / "external_links.txt").read_text().split()
     assert "https://www.mitsuba-renderer.org" in listed
