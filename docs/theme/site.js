@@ -44,9 +44,9 @@ document
   .querySelectorAll(".md-content img:not(.compare img):not(.hero img):not(a img)")
   .forEach((image) => enlargeable(image, dialog));
 
-// Short cells, such as "28.8 dB", stay on one line; sentences keep a width in which they can be read.
+// Short cells, such as "28.8 dB", stay on one line; site.css gives sentences a width in which they can be read.
 const [SHORT, LONG] = [16, 60]; // characters
 document.querySelectorAll(".md-typeset td").forEach((cell) => {
   if (cell.textContent.length <= SHORT) cell.style.whiteSpace = "nowrap";
-  if (cell.textContent.length > LONG) cell.style.minWidth = "12rem";
+  if (cell.textContent.length > LONG) cell.className = "long";
 });
