@@ -261,10 +261,9 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     )
     text = [
         "# Gallery",
-        f"Made by `python docs/gallery_maker.py {command}`, version {__version__}: scenes of the package, "
-        f"path-traced from {settings['views']} sides at {settings['size']}², fitted with the method for "
-        f"relighting at the preset `{settings['preset']}`, and rendered by the fit. All views displayed are "
-        "test views.",
+        f"Scenes of the package, path-traced from {settings['views']} sides at {settings['size']}², fitted "
+        f"with the method for relighting at the preset `{settings['preset']}`, and rendered by the fit, "
+        f"version {__version__}. All views displayed are test views. Click an image to enlarge it.",
         "\n".join([HEAD, *(_row(name, found[name]) for name in found)]),
         "Normal errors are means over the foreground. Albedo and relit images are compared after per-channel "
         "scaling.",
@@ -281,6 +280,8 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any]) -> str:
             f"![{name} edited]({name}/{EDITS})",
             f"Edits: {edits}.",
         ]
+    shown = command.replace(" --views", " \\\n    --views")
+    text += ["## How was it made?", f"```sh\npython docs/gallery_maker.py {shown}\n```"]
     return "\n\n".join(text) + "\n"
 
 

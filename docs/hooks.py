@@ -23,11 +23,11 @@ PAGES = {
 
 
 def on_config(config: Any) -> Any:
-    """Put the notebooks that are there below Tutorials."""
-    [tutorials] = [pages["Tutorials"] for pages in config.nav if "Tutorials" in pages]
+    """Put the notebooks below Use, as Tutorials."""
+    [use] = [pages["Use"] for pages in config.nav if "Use" in pages]
     folder = Path(config.docs_dir)
     found = sorted(path.relative_to(folder) for path in (folder / "tutorials").glob("*.ipynb"))
-    tutorials[:0] = [path.with_suffix(".md").as_posix() for path in found]
+    use.append({"Tutorials": [path.with_suffix(".md").as_posix() for path in found]})
     return config
 
 

@@ -25,6 +25,9 @@ from mi_refgs.kernels import device
 
 Row = dict[str, Any]
 
+NUMERIC = re.compile(r"$|[<>≥~±+−-]?\s?\d|[–●]")
+"""How a cell of a number, an empty one or a mark begins."""
+
 
 def where(rows: Iterable[Row], **values: Any) -> list[Row]:
     """Rows that have all these values; a tuple or list means any of them."""
@@ -57,11 +60,13 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Markdown table; numbers to the right; None and no rows at all are empty."""
+    """Markdown table; columns of numbers to the right; None and no rows at all are empty."""
     body = [["" if cell is None else str(cell) for cell in row] for row in rows]
     if not body:
         return "*Not measured in this run.*"
-    rule = ["---"] + ["---:"] * (len(head) - 1)
+    rule = [
+        "---:" if all(NUMERIC.match(cell) for cell in column) else "---" for column in zip(*body, strict=True)
+    ]
     return "\n".join("| " + " | ".join(line) + " |" for line in [list(head), rule, *body])
 
 

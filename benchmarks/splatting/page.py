@@ -134,7 +134,7 @@ def _sum(
     if fit is None:
         return "(not fitted)"
     terms = [f"{number(scale * fit['constant'])} {unit}"]
-    terms += [f"{number(small_scale * fit[name])} {small} a {WORDS[name]}" for name in names]
+    terms += [f"{number(small_scale * fit[name])} {small} per {WORDS[name]}" for name in names]
     return f"{' + '.join(terms)} (R² = {fit['r2']:.3f}, worst residual {100 * fit['worst']:.0f} %)"
 
 

@@ -1,4 +1,4 @@
-"""Comments beside the fields of dataclasses as their documentation, with shapes and units."""
+"""Docstrings as mkdocstrings displays them: comments beside fields, and arguments as lists."""
 
 from __future__ import annotations
 
@@ -20,3 +20,17 @@ class FieldComments(griffe.Extension):
         source = attr.lines_collection[file][line - 1]
         if found := re.match(rf"\s+{re.escape(attr.name)}: [^#]*#\s*(.+)$", source):
             attr.docstring = griffe.Docstring(found[1], lineno=line, parent=attr)
+
+
+class ArgumentLists(griffe.Extension):
+    """Start a list item at each sentence `name: meaning` about an argument, and a paragraph at "Raises"."""
+
+    def on_function(self, *, func: griffe.Function, **kwargs: Any) -> None:
+        """Called by griffe for each function that it has read."""
+        names = "|".join(re.escape(parameter.name.lstrip("*")) for parameter in func.parameters)
+        if func.docstring is None or not names or "Args:" in func.docstring.value:
+            return
+        first, blank, rest = func.docstring.value.partition("\n\n")
+        listed = re.sub(rf"(?:^|(?<=[.;\"])\s)({names}): ", r"\n\n- `\1`: ", rest, flags=re.MULTILINE)
+        listed = re.sub(r"(?<=\.)\s(?=Raises [A-Z])", "\n\n", listed)
+        func.docstring.value = first + blank + listed.strip()

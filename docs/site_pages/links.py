@@ -8,7 +8,7 @@ import re
 from site_pages import ROOT
 
 ELSEWHERE = {
-    "index.md": "README.md",
+    "is_it_for_me.md": "README.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
     "scenes.md": "scenes/README.md",
@@ -30,8 +30,10 @@ EXTERNAL: set[str] = set()
 
 
 def pages_from_elsewhere() -> dict[str, str | bytes]:
-    """The pages whose text is outside of docs/."""
-    return {page: (ROOT / name).read_text(encoding="utf-8") for page, name in ELSEWHERE.items()}
+    """The pages whose text is outside of docs/; the README answers the question of its page."""
+    pages = {page: (ROOT / name).read_text(encoding="utf-8") for page, name in ELSEWHERE.items()}
+    pages["is_it_for_me.md"] = pages["is_it_for_me.md"].replace("# mi_refgs\n", "# Is it for me?\n", 1)
+    return {**pages}
 
 
 def for_the_site(markdown: str, page: str) -> str:

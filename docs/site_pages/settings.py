@@ -17,8 +17,6 @@ from site_pages import table
 
 FILLED_IN = ("name", "file", "preset", "assignments", "components")
 """Fields of `Method` that no file gives: `load` fills them in."""
-SMALL = 4
-"""Fields from which on a class is a table of its own; one with fewer, as a window, is a value."""
 
 
 def page() -> str:
@@ -58,7 +56,7 @@ def tables() -> dict[str, type]:
         for name in (field.name for field in dataclasses.fields(kind) if field.metadata != FLAT):
             hint = hints[name]
             for inner, suffix in _classes(hint):
-                if len(dataclasses.fields(inner)) >= SMALL or suffix:
+                if inner is not Window:
                     found[f"{prefix}{name}{suffix}"] = inner
                     waiting.append((f"{prefix}{name}{suffix}.", inner))
     return found
@@ -73,7 +71,7 @@ def _classes(hint: Any) -> list[tuple[type, str]]:
 
 
 def fields(kind: type) -> list[tuple[str, str, str, str]]:
-    """Name, type, default and remark of each field; the remark is the comment beside it in the source."""
+    """Name, type, default and remark of each field: the comment beside or above it in the source."""
     found = []
     source, hints = inspect.getsource(kind), typing.get_type_hints(kind)
     for field in (one for one in dataclasses.fields(kind) if one.metadata != NOT_A_SETTING):
@@ -81,12 +79,14 @@ def fields(kind: type) -> list[tuple[str, str, str, str]]:
             found += fields(hints[field.name])
             continue
         line = re.search(
-            rf"^    {field.name}: (?P<type>.*?)(?: = .*?)?(?:  # (?P<remark>.*))?$", source, re.M
+            r"(?:^    # (?P<above>.*)\n)?"
+            rf"^    {field.name}: (?P<type>.*?)(?: = .*?)?(?:  # (?P<remark>.*))?$",
+            source,
+            re.M,
         )
         assert line is not None, f"{kind.__name__}.{field.name}: its declaration is not one line"
-        found.append(
-            (field.name, _plain(line["type"], hints[field.name]), _shown(field.default), line["remark"] or "")
-        )
+        remark = line["remark"] or line["above"] or ""
+        found.append((field.name, _plain(line["type"], hints[field.name]), _shown(field.default), remark))
     return found
 
 

@@ -32,9 +32,9 @@ MESH_WINDOW = Window(20_000, 50_000, 2_000)  # that of the released Ref-Gaussian
 class About:
     """What the file reproduces."""
 
-    name: str = ""
-    paper: str = ""
-    deviations: tuple[str, ...] = ()
+    name: str = ""  # in tables
+    paper: str = ""  # authors, title, venue, address
+    deviations: tuple[str, ...] = ()  # from the original, a sentence each
     purpose: str = ""  # one word, in one file only, by which `refgs train --for` finds it
     paper_row: str = ""  # its row in the paper's tables
 
@@ -44,6 +44,7 @@ class SurfelOptions:
     """The surfels at the start, and their largest number."""
 
     primitive: str = "surfel"  # what is splatted
+    # Attributes beside the geometry of the primitive.
     attributes: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
     count: int = 20_000  # initial surfels
     max_count: int = 40_000  # densification stops here, times `capacity`
@@ -113,7 +114,7 @@ class LightOptions:
 class Stage:
     """One part of the schedule with its own shading, up to and including iteration `until`."""
 
-    until: int = field(metadata=ITERATIONS)
+    until: int = field(metadata=ITERATIONS)  # last iteration of the stage
     shading: ShadingOptions = field(default_factory=ShadingOptions, metadata=FLAT)
     samples: int = 1  # per pixel, k × k, in the steps of a fit
     restart: tuple[str, ...] = ()  # attributes, and `light`, reset to initial values when the stage begins
@@ -127,7 +128,7 @@ class Propagation:
     [3DGS-DR, Ye et al. 2024, §3.3; material-aware: Ref-Gaussian §3.4]
     """
 
-    when: Window
+    when: Window  # iterations of its events
     opacity: float = 0.9  # all surfels become at least this opaque
     scale: float = 1.5  # factor of the scales of reflective surfels
     metallic: float = 0.02  # reflective: at least this metallic …
@@ -144,7 +145,7 @@ class Relocation:
     [3DGS-MCMC, Kheradmand et al. 2024]
     """
 
-    when: Window
+    when: Window  # iterations of its events
     opacity: float = 0.005  # surfels of at most this opacity are moved
     grow: float = 0.0  # fraction of the surfels that is added at each event, up to max_count
     noise: float = 1e7  # of positions: 5e5 per squared unit where the extent is 4.5 units; 0: none
@@ -154,22 +155,22 @@ class Relocation:
 class Refine:
     """Adaptive density control [3DGS §5.2; Ref-Gaussian §3.4], by error [Rota Bulò et al. 2024]."""
 
-    densify: Window | None = None
+    densify: Window | None = None  # splits surfels; absent: never
     grow: float = 0.25  # fraction of the surfels, those with the largest error, that an event splits at most
-    prune_opacity: float = 0.05
+    prune_opacity: float = 0.05  # surfels of less opacity are removed
     prune_extent: float = 0.1  # scene extents; larger surfels are removed
     reset: Window | None = None  # opacity to at most reset_opacity
-    reset_opacity: float = 0.01
+    reset_opacity: float = 0.01  # after a reset, at most
     reset_raise: tuple[str, ...] = ()  # attributes that a reset raises to at least their initial value
-    propagate: Propagation | None = None
-    relocate: Relocation | None = None
+    propagate: Propagation | None = None  # normal propagation; absent: none
+    relocate: Relocation | None = None  # of transparent surfels; absent: none
 
 
 @dataclass(frozen=True)
 class MeshOptions:
     """When and how the occluding mesh is extracted."""
 
-    extract: Window = MESH_WINDOW
+    extract: Window = MESH_WINDOW  # iterations at which the mesh is made anew
     resolution: int = 128  # voxels along the longest side; unbounded: along the region's diameter
     unbounded: bool = False  # for images without alpha: include the background, in contracted space
 
@@ -205,7 +206,7 @@ class LossWeight:
     Losses on material maps apply to deferred stages only: forward shading blends no materials.
     """
 
-    weight: float
+    weight: float  # factor in the sum of losses
     start: int = field(default=0, metadata=ITERATIONS)  # iterations without the loss
     rise: int = field(default=0, metadata=ITERATIONS)  # then its weight rises linearly from 0
     until: int | None = field(default=None, metadata=ITERATIONS)  # last iteration with the loss
@@ -262,10 +263,10 @@ class CoarseImages:
 class DataOptions:
     """How images are read, and their resolution in the course of a fit."""
 
-    images: Literal["png", "exr"] = "png"
-    background: Literal["white", "black"] = "white"
+    images: Literal["png", "exr"] = "png"  # 8-bit sRGB or linear radiance
+    background: Literal["white", "black"] = "white"  # behind images with alpha
     downscale: int | None = None  # pixels of a file per pixel, along a side; absent: as the preset allows
-    coarse: tuple[CoarseImages, ...] = ()
+    coarse: tuple[CoarseImages, ...] = ()  # downscaled images at the start of a fit
     crop: int | None = None  # pixels that a step renders at most, of a larger image; absent: all of it
 
     def block_at(self, iteration: int, pixels: int) -> int:
@@ -315,7 +316,7 @@ class Selection:
     relative, so that slow and fast machines decide alike.
     """
 
-    component: dict[str, MethodComponent]
+    component: dict[str, MethodComponent]  # by name
     surfels: int | None = None  # largest number before any trial, of a preset that allows more
     holdout: int = 8  # every so many training views validate
     gain: float = 0.02  # dB
@@ -339,25 +340,25 @@ class MetalTrial:
 class Method:
     """All settings of a fit; the resolved copy is saved with the run."""
 
-    iterations: int = field(metadata=ITERATIONS)
-    stage: dict[str, Stage]
+    iterations: int = field(metadata=ITERATIONS)  # of the fit, in which all others of the file count
+    stage: dict[str, Stage]  # by name
     about: About = About()
     surfels: SurfelOptions = SurfelOptions()
-    light: LightOptions | None = None
+    light: LightOptions | None = None  # absent: no environment map
     surroundings: SurroundingsOptions | None = None  # absent: the object is everything
     refine: Refine = Refine()
-    mesh: MeshOptions | None = None
+    mesh: MeshOptions | None = None  # absent: no occlusion
     loss: dict[str, LossWeight] = field(default_factory=LOSS_WEIGHTS.copy)  # by name
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
-    exposure: ExposureOptions | None = None
-    cameras: CameraOptions | None = None
-    seed: int = 0
+    exposure: ExposureOptions | None = None  # absent: no gains
+    cameras: CameraOptions | None = None  # absent: no corrections
+    seed: int = 0  # of initial surfels, order of views and random draws
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
     preview_every: int = 1_000  # iterations
     log_every: int = 50  # iterations
     metal_trial: MetalTrial | None = None  # absent: metallic learns from its initial value
-    select: Selection | None = None
+    select: Selection | None = None  # absent: no trials
     components: tuple[str, ...] = ()  # of `select`, in use
     name: str = ""  # filled in by `load`, as the others below: the file's stem
     file: str = ""

@@ -19,7 +19,8 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [*ROOT.glob("*.md"), ROOT / "scenes" / "README.md", *(ROOT / "docs").rglob("*.md")]
 """Every hand-written page."""
 MADE = {
-    f"{name}.md" for name in "api changelog cli contributing exports methods plugins scenes settings".split()
+    f"{name}.md"
+    for name in "api changelog cli contributing exports is_it_for_me methods plugins scenes settings".split()
 }
 """Pages of docs/ that are made while the site is built."""
 
@@ -111,7 +112,8 @@ def headings(page: Path) -> set[str]:
 
 def test_site_has_every_page(site: Path) -> None:
     expected = {page.stem for page in (ROOT / "docs").glob("*.md")} | {Path(made).stem for made in MADE}
-    assert {page.parent.name for page in site.glob("*/index.html")} >= expected
+    assert {page.parent.name for page in site.glob("*/index.html")} >= expected - {"index"}
+    assert (site / "index.html").is_file()
 
 
 def test_site_has_every_command(site: Path) -> None:
@@ -156,6 +158,8 @@ def test_site_has_every_setting(site: Path) -> None:
     text = (site / "settings" / "index.html").read_text(encoding="utf-8")
     for name in LOSS_WEIGHTS:
         assert f"<code>{name}</code>" in text
+    without = re.findall(r"<tr>\s*<td><code>([^<]*)</code></td>(?:\s*<td>.*?</td>){2}\s*<td></td>", text)
+    assert "<code>height</code>" in text and not without, f"settings without a description: {without}"
 
 
 def test_site_loads_nothing_from_other_servers(site: Path) -> None:
@@ -166,6 +170,18 @@ def test_site_loads_nothing_from_other_servers(site: Path) -> None:
             page
         )
         assert not re.findall(r'<link[^>]*href="(?:https?:)?//[^"]*"', text), page
+
+
+def test_sliders_have_two_labelled_images(site: Path) -> None:
+    """What theme/site.js makes a slider of; its labels are the alternative texts."""
+    found = [
+        box
+        for page in site.rglob("*.html")
+        for box in re.findall(r'<div class="compare">(.*?)</div>', page.read_text("utf-8"), flags=re.DOTALL)
+    ]
+    assert found
+    for box in found:
+        assert len(re.findall(r'<img alt="[^"]+" src="[^"]+" ?/?>', box)) == 2, box
 
 
 def test_site_lists_external_links(site: Path) -> None:
