@@ -242,7 +242,7 @@ class CameraOptions:
 
     corrections: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
     after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
-    worth: float = 0.3  # dB gained on pixels of the training views that the poses were not registered with
+    worth: float = 0.6  # dB gained on pixels of the training views that the poses were not registered with
     rate: float = 3e-3  # learning rate, radians per step; 3 % of it at the end
 
 
