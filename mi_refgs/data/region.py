@@ -173,7 +173,7 @@ def region_pixels(view: View, region: Region) -> np.ndarray:
         first = np.where(slope > 0, np.maximum(first, crossing), first)
         last = np.where(slope < 0, np.minimum(last, crossing), last)
         last = np.where((slope == 0) & (height < 0), -1, last)
-    return (beside <= region.radius**2) & (last > 0) & (first <= last)
+    return (beside <= region.radius**2) & (first <= last)
 
 
 def read_region(folder: Path) -> Region | None:
