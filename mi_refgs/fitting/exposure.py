@@ -170,9 +170,14 @@ def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) ->
     return displayed(frame, data.background, data.is_linear_radiance, factors)
 
 
+def squared_error(image: np.ndarray, view: View) -> np.ndarray:
+    """Squared error (H, W, 3) of a display-encoded image (H, W, 3) of a view, both clipped to [0, 1]."""
+    return np.square(np.clip(image, 0, 1) - np.clip(view.load().displayed, 0, 1))
+
+
 def psnr(image: np.ndarray, view: View, where: np.ndarray | None = None) -> float:
     """PSNR (dB) of a display-encoded image (H, W, 3) of a view, over the pixels in `where` (H, W)."""
-    square = np.square(np.clip(image, 0, 1) - np.clip(view.load().displayed, 0, 1))
+    square = squared_error(image, view)
     return psnr_of(float(square.mean() if where is None else square[where].mean() if where.any() else 0))
 
 

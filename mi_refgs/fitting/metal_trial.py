@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.fitting.exposure import displayed_of, image_of
+from mi_refgs.fitting.exposure import displayed_of, image_of, squared_error
 from mi_refgs.fitting.select import Decision
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
@@ -110,7 +110,7 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
 def _squared_error(trainer: Trainer, view: View) -> np.ndarray:
     """Squared error (H, W) of a displayed training image, mean over its channels."""
     shown = image_of(displayed_of(trainer.view(view.camera(), aovs=False), trainer.data), view)
-    return np.square(np.clip(shown, 0, 1) - np.clip(view.load().displayed, 0, 1)).mean(axis=-1)
+    return np.asarray(squared_error(shown, view).mean(axis=-1))
 
 
 def _attributed(surfels: Surfels, views: list[View], errors: list[np.ndarray]) -> np.ndarray:
