@@ -43,6 +43,7 @@ def join(first: TrainedScene, second: TrainedScene) -> tuple[TrainedScene, list[
         first,
         surfels=Surfels.from_numpy(raw),
         light=first.light or second.light,
+        near=first.near if first.light is not None else second.near,
         mesh=joined_mesh(first.mesh, object_mesh(second)),
         shading=joined_shading(first.shading, second.shading),
     )

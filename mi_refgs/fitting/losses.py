@@ -16,9 +16,11 @@ from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.fitting.ssim import ssim
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.light.light import Light
-from mi_refgs.types import Bool, Float, Vector3f
+from mi_refgs.types import Bool, Color3f, Float, Vector3f
 
 SATURATED = 254.5 / 255.0  # from here up, 8-bit values are clipped: 255 means "at least this bright"
+CLIPPED = 0.9  # linear radiance from which a photograph may be clipped: the light may be brighter, not darker
+HUE = 0.3  # weight of the colour of light that no photograph shows
 DIRECTIONS = 256  # directions in which irradiance is sampled, 13° apart
 
 
@@ -133,6 +135,22 @@ def light_colour(light: Light) -> Float:
     grey = (irradiance.x + irradiance.y + irradiance.z) / 3
     off = sum((_abs(part - grey) for part in irradiance), mi.Float(0)) / 3
     return dr.sum(off) / dr.detach(dr.sum(grey))
+
+
+def light_difference(radiance: Color3f, photographed: Color3f, seen: Float, area: Float) -> Float:
+    """Mean |d| over channels and N directions, d = log((1 + L) / (1 + P)), for radiance L and P (width 1).
+
+    The logarithm compares lamps and dark corners alike. Where P is above CLIPPED, a brighter L costs nothing.
+    A direction counts by its `area` (they sum to 1) times `seen`, 0 … 1; the rest counts HUE times by its
+    deviation from the mean d of the channels: what no photograph shows is as bright as reflections say, in
+    the colour of P.
+    """
+    off = [dr.log(1 + own) - dr.log(1 + other) for own, other in zip(radiance, photographed, strict=True)]
+    grey = (off[0] + off[1] + off[2]) / 3
+    total = mi.Float(0)
+    for d, other in zip(off, photographed, strict=True):
+        total += seen * dr.select((other > CLIPPED) & (d > 0), 0, _abs(d)) + HUE * (1 - seen) * _abs(d - grey)
+    return dr.sum(area * total) / 3
 
 
 def _abs(difference: Float) -> Float:

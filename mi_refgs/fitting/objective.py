@@ -12,6 +12,7 @@ import mitsuba as mi
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
+from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.targets import Target
 from mi_refgs.methods.method import LossWeight, Method
 from mi_refgs.methods.read import RENAMED
@@ -39,6 +40,7 @@ class LossInputs:
     target: Target
     light: Light | None  # with derivatives; without it, losses on it are left out
     log_gain: list[Float] | None = None  # log exposure of the image, three of width 1; by default 0
+    photographed: PhotographedLight | None = None  # what photographs show of the light, if there is any
 
     @staticmethod
     def of(
@@ -47,13 +49,14 @@ class LossInputs:
         data: Dataset,
         light: Light | None = None,
         log_gain: list[Float] | None = None,
+        photographed: PhotographedLight | None = None,
     ) -> LossInputs:
         """Display a frame as its target is, with highlights clipped where those of the target are."""
         gain = None if log_gain is None else [dr.exp(value) for value in log_gain]
         image = displayed(frame, data.background, data.is_linear_radiance, gain)
         if target.clipped is not None:
             image = losses.clip_highlights(image, target.image, target.clipped)
-        return LossInputs(frame, image, target, light, log_gain)
+        return LossInputs(frame, image, target, light, log_gain, photographed)
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,12 @@ def _light_colour(inputs: LossInputs) -> Float | None:
     return None if inputs.light is None else losses.light_colour(inputs.light)
 
 
+def _photographed(inputs: LossInputs) -> Float | None:
+    if inputs.light is None or inputs.photographed is None:
+        return None
+    return inputs.photographed.difference(inputs.light)
+
+
 def _alpha(inputs: LossInputs) -> Float | None:
     mask = inputs.target.alpha
     return None if mask is None else losses.alpha_loss(inputs.frame.alpha, mask)
@@ -121,6 +130,7 @@ register(Loss("smooth", _smooth, normals=True))
 register(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
 register(Loss("materials", _materials, maps=True, attributes=MATERIALS))
 register(Loss("light_colour", _light_colour, light=True))
+register(Loss("photographed", _photographed, light=True))
 register(Loss("alpha", _alpha))
 
 

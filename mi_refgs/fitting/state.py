@@ -5,6 +5,7 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
     params/NAME  optimiser/NAME/PART       parameters, and Adam's moments and counters of each
     error_sum  unseen                      per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
+    photographed/PART                      the background as the object's light, if it was rendered
     iteration  seconds  held_until  decisions  exposure  cameras  region  light_gradient
 """
 
@@ -23,6 +24,7 @@ from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import FitSetup, SharedPrefilter
 from mi_refgs.kernels.device import upload
@@ -35,6 +37,7 @@ from mi_refgs.runs.checkpoint import (
     MESH,
     OPTIMISER,
     PARAMS,
+    PHOTOGRAPHED,
     channels_of,
     light_of,
     part,
@@ -43,6 +46,7 @@ from mi_refgs.runs.checkpoint import (
 )
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Bool, Float, TensorXf, UInt32
@@ -128,6 +132,7 @@ class FitState:
     exposure: dict[str, Any] | None = None  # decision about the exposure compensation
     cameras: dict[str, Any] | None = None  # decision about camera corrections
     region: Region | None = None  # of interest, once it has followed the object
+    photographed: PhotographedLight | None = None  # the background as the object's light
 
     @staticmethod
     def start(setup: FitSetup, gains: Mapping[str, TensorXf]) -> FitState:
@@ -164,6 +169,11 @@ class FitState:
         """The environment map, also attached."""
         return light_of(self.params)
 
+    @property
+    def near(self) -> NearField | None:
+        """Distances of what the environment map shows."""
+        return None if self.photographed is None else self.photographed.near
+
     def shading(self, stage: Stage) -> Shading:
         """Shading options of a stage with the present occluder."""
         return Shading.resolve(stage.shading, not self.occluder.empty)
@@ -192,6 +202,8 @@ class FitState:
         for name, value in (records | {"region": region}).items():
             if value:
                 state[name] = np.frombuffer(json.dumps(value).encode(), np.uint8)
+        if self.photographed is not None:
+            state |= {f"{PHOTOGRAPHED}{name}": x for name, x in self.photographed.arrays().items()}
         if (mesh := self.occluder.mesh()) is not None:
             state |= {f"{MESH}vertices": mesh.vertices, f"{MESH}faces": mesh.faces}
             state[f"{MESH}voxel"] = np.array(mesh.voxel)
@@ -216,6 +228,8 @@ class FitState:
             setattr(made, name, json.loads(state[name].tobytes()))
         if "region" in state:
             made.region = Region.of(json.loads(state["region"].tobytes()), "checkpoint")
+        if f"{PHOTOGRAPHED}weight" in state:
+            made.photographed = PhotographedLight.restored(part(state, PHOTOGRAPHED))
         made.occluder = _occluder_of(state)
         _, stage = setup.method.stage_at(max(made.iteration, 1))
         made.prefilter.restore(made.light, made.shading(stage), state)

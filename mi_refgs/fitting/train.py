@@ -25,6 +25,7 @@ from mi_refgs.fitting import exposure, object_surface, poses
 from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.health import Health
 from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective, require_losses
+from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.fitting.targets import Targets, require_memory
@@ -169,7 +170,7 @@ class Trainer:
             shading = self.shading().antialiased()
             self.fit.update_missing_caches(shading)
             light, around = shading.light_of(self.light), None if object_only else self.surroundings
-            scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around)
+            scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around, self.fit.near)
             degree = self.setup.sh_degree(self.iteration)
             return render(scene, camera, Request(scene.all_aovs if aovs else (), not aovs, sh_degree=degree))
 
@@ -251,6 +252,7 @@ class Trainer:
         self._decide_exposure()
         self._decide_cameras()
         self._follow_object()
+        self._photograph_light()
         mesh = self.method.mesh
         if mesh is not None and self.fit.shading(stage).traceable and mesh.extract.due(iteration):
             last = mesh.extract.count(iteration) == mesh.extract.count(self.method.iterations)
@@ -333,14 +335,15 @@ class Trainer:
         shading = self.fit.shading(stage)
         fit.update_missing_caches(shading)
         light = fit.prefilter.light(fit.light, shading)
-        scene = SurfelScene(surfels, shading, light, fit.occluder, around)
+        scene = SurfelScene(surfels, shading, light, fit.occluder, around, fit.near)
         asked = losses_in_use(weights)
         aovs = ("normal",) if any(loss.normals for loss in asked) else ()
         request = Request(aovs, sh_degree=setup.sh_degree(iteration), attribution=attribution)
         view = partial(render, scene, request=request)
         frame = supersampled(view, camera, stage.samples, details=any(loss.maps for loss in asked))
         gain = exposure.log_gain(fit.params, index)
-        loss, error = objective(LossInputs.of(frame, target, self.data, light, gain), weights, iteration)
+        inputs = LossInputs.of(frame, target, self.data, light, gain, fit.photographed)
+        loss, error = objective(inputs, weights, iteration)
         self.loss, self.error = dr.detach(loss), dr.mean(error)
         if frame.attribution is not None:
             loss += dr.sum(error * frame.attribution)
@@ -413,6 +416,18 @@ class Trainer:
         centre = ", ".join(f"{x:.3g}" for x in found.centre)
         self.tell(f"region of interest: the object is within {found.radius:.3g} units of ({centre})")
         AdaptiveControl(self.setup, self.fit).exchange(found, self.iteration)
+
+    def _photograph_light(self) -> None:
+        """Render the background as the object's light, if that is due."""
+        options, around, region = self.method.light, self.surroundings, self.region
+        if options is None or options.photographed is None or around is None or region is None:
+            return
+        if not options.photographed.due(self.iteration):
+            return
+        self.check()
+        self.fit.photographed = PhotographedLight.of(
+            self.surfels.detach(), around, region, self._few_cameras(), options.height
+        )
 
 
 def surface_of(

@@ -108,6 +108,8 @@ class LightOptions:
     height: int = 64  # texels; width is twice that
     radiance: float = 0.5  # initial, everywhere
     every: int = 1  # iterations that share one prefiltered light, which then receives all their gradients
+    # Iterations at which the background is rendered for the loss `photographed`; absent: never.
+    photographed: Window | None = None
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,8 @@ class LossWeight:
     """Weight of the loss NAME over the iterations; a number in `[loss]`, `NAME = 0.1`, is its `weight` alone.
     L = (1 - `ssim`) L1 + `ssim` (1 - SSIM) + `normal` L_n + `smooth` L_s + `alpha` L_α, and priors:
     `half_metal` prefers metallic near 0 or 1, `materials` equal roughness and metallic of neighbouring pixels
-    of similar colour, `light_colour` a grey light over a grey albedo. Any other NAME is one of
+    of similar colour, `light_colour` a grey light over a grey albedo, `photographed` a light that is the
+    background of the photographs. Any other NAME is one of
     `register_loss`.
 
     Losses on material maps apply to deferred stages only: forward shading blends no materials.
@@ -218,7 +221,9 @@ class LossWeight:
         return self.weight * (min((iteration - self.start) / self.rise, 1) if self.rise else 1)
 
 
-LOSS_WEIGHTS = dict.fromkeys(("alpha", "half_metal", "materials", "light_colour"), LossWeight(0.0)) | {
+LOSS_WEIGHTS = dict.fromkeys(
+    ("alpha", "half_metal", "materials", "light_colour", "photographed"), LossWeight(0.0)
+) | {
     "ssim": LossWeight(0.2),
     "normal": LossWeight(0.05),
     "smooth": LossWeight(0.0, until=18_000),

@@ -25,6 +25,7 @@ from mi_refgs.plugins.properties import (
     BackgroundProperties,
     read_aovs,
     read_light,
+    read_near_field,
     read_shading,
     read_surfels,
     read_terms,
@@ -64,6 +65,12 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light. Without one, the
          scene's own environment emitter of these types lights the surfels. In Python also the raw tensor of
          a ``mi_refgs.shade.light.envmap.EnvironmentLight``.
+
+     * - near_field
+       - |string|
+       - File (.npz) with ``nearness`` (h, 2h), 1 / distance of what the light shows in the orientation of an
+         ``envmap`` without rotation, seen from the point ``centre`` (3,): reflections are looked up where
+         they meet it. (Default: infinitely far)
 
      * - mesh
        - |string|
@@ -190,6 +197,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self.set_id("refgs")  # an address otherwise, and with it every parameter's key
         self.surfels = read_surfels(props)
         self.light, self.light_rotation = read_light(props)
+        self.near = read_near_field(props)
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
         self.shading, self.occluder = read_shading(props, self.surfels)
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
@@ -313,7 +321,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             # Mitsuba does not announce changes of the scene's light, on which ambient ratios depend.
             self.caches_valid = self.light is not None or not self.shading.ambient_rays
         surfels, surroundings = Surfels(self.surfels.raw, screened=True), background.splatted(self.surfels)
-        rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings)
+        rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings, self.near)
         chosen = () if len(self.terms) == len(TERMS) else self.terms
         frame = render(rendered, camera, replace(request, aovs={*request.aovs, *chosen}))
         if chosen:  # of the object only

@@ -19,6 +19,7 @@ from mi_refgs.plugins.light import own_light
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.options import DIFFUSE, QUALITY, ShadingOptions
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.reflectance import MODELS
@@ -165,6 +166,15 @@ def read_light(props: Any) -> tuple[Any, Any]:
         return own_light(emitters[0])
     raw = _tensor(props, "light")
     return (None, None) if raw is None else (EnvironmentLight(raw), None)
+
+
+def read_near_field(props: Any) -> NearField | None:
+    """Read the distances of what the light shows; None: infinitely far."""
+    path = _path(props, "near_field")
+    try:
+        return None if path is None else NearField.read(path)
+    except InputError as error:
+        raise InputError(f"refgs: near_field: {error}") from error
 
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:

@@ -164,7 +164,7 @@ class Features:
                 values["incident"] = raw["indirect_sh"]
             if scene.reflectance == "gaussian_shader":
                 normal = unit(normal + np.where(away, -1, 1) * raw["normal_offset"])
-            points = Points(normal, -direction, values)
+            points = Points(normal, -direction, values, raw["position"])
             terms = MODELS[scene.reflectance](points, scene.light, self.options, taps)
             values |= dict(zip(TERMS, terms, strict=True)) | {"radiance": sum(terms[1:], terms[0])}
         values["normal"] = normal
@@ -177,6 +177,8 @@ class Resolve:
     def __init__(self, scene: Scene, features: Features, x: Array, y: Array, sums: Array) -> None:
         self.scene, self.features = scene, features
         self.ray = rays(scene.camera, x, y)
+        self.depth: Array | None = None  # (P,) of a scene with a background; else that of the sums
+        self.along = self.ray @ scene.camera.to_world[:3, 2]  # camera-z depth per length
         self.found = {}
         if scene.visibility is not None:
             self.found["visibility"] = scene.visibility(unit(sums[:, :3]), self.ray)[:, None]
@@ -187,7 +189,10 @@ class Resolve:
         inverse = np.where(seen, 1 / np.where(seen, alpha, 1), 0)
         blended = self.features.blended(sums[:, :-2])
         values = {name: x * inverse for name, x in blended.items() if name != "normal"}
-        maps = {"alpha": alpha, "depth": sums[:, -2:-1] * inverse, "normal": blended["normal"], **values}
+        depth = sums[:, -2:-1] * inverse
+        maps = {"alpha": alpha, "depth": depth, "normal": blended["normal"], **values}
+        z = depth if self.depth is None else self.depth[:, None]
+        position = scene.camera.to_world[:3, 3] + z / self.along[:, None] * self.ray
         if scene.at == "surfel":
             maps |= {name: blended[name] for name in ("radiance", *TERMS) if name in blended}
         else:
@@ -197,7 +202,7 @@ class Resolve:
             ]  # fmt: skip
             for normal, ray, visible in nodes:
                 found: list[tuple[Array, Array, Array]] = []
-                points = Points(normal, -ray, values | visible)
+                points = Points(normal, -ray, values | visible, position)
                 here = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
                 taps += [(texel, share, factor * alpha / len(nodes)) for texel, share, factor in found]
                 shares = [term / len(nodes) for term in here]
@@ -286,11 +291,12 @@ def render_open(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
     share = blend.weight[:count].sum(0)
     sums = np.concatenate([blend.weight[:count].T @ values, depth[:, None], share[:, None]], axis=1)
     resolve = Resolve(scene, features, x, y, sums)
+    seen = alpha > c.COVERAGE_FLOOR
+    resolve.depth = np.where(seen, depth / np.where(seen, alpha, 1), 0)
     maps = resolve.named(resolve(sums, []).real)
     maps["object_alpha"], maps["object_normal"] = share[:, None], maps["normal"]
     maps["alpha"] = alpha[:, None]
-    seen = alpha > c.COVERAGE_FLOOR
-    maps["depth"] = np.where(seen, depth / np.where(seen, alpha, 1), 0)[:, None]
+    maps["depth"] = resolve.depth[:, None]
     maps["radiance"] = maps["radiance"] + blend.weight[count:].T @ colour
     if scene.at == "surfel":  # one slot for the normals of both
         maps["normal"] = maps["normal"] + blend.weight[count:].T @ _facing(other, direction)

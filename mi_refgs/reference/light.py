@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,8 @@ class Light:
     roughness: tuple[float, ...]
     table: Array  # (n, n, 2): [roughness, n·v]
     turn: Array | None = None  # (3, 3): from world directions to the map's
+    nearness: float = 0.0  # 1 / distance of what the map shows, the same everywhere, from the `centre`
+    centre: Array = field(default_factory=lambda: np.zeros(3))
 
     def flat(self) -> Array:
         """All texels (T, 3), level after level."""
@@ -37,6 +39,16 @@ class Light:
     def look_up(self, texel: Array, weight: Array) -> Array:
         """Weighted sums (n, 3) of texels."""
         return np.einsum("nk,nkc->nc", weight, self.flat()[texel])
+
+
+def seen_from(light: Light, position: Array | None, direction: Array) -> Array:
+    """Unit directions (n, 3) from the light's centre to where rays from positions (n, 3) meet its sphere."""
+    if not light.nearness or position is None:
+        return direction
+    offset = position - light.centre
+    along = np.sum(offset * direction, axis=1)
+    t = np.sqrt(along**2 + light.nearness**-2 - np.sum(offset**2, axis=1)) - along
+    return (offset + t[:, None] * direction) * light.nearness
 
 
 def filtered(radiance: Array, filters: Sequence[Array]) -> list[Array]:

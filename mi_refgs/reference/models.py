@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.light import Light, bilinear, irradiance, specular, table_lookup
+from mi_refgs.reference.light import Light, bilinear, irradiance, seen_from, specular, table_lookup
 from mi_refgs.reference.lobe import normal_reflectance
 
 Array = np.ndarray
@@ -43,6 +43,7 @@ class Points:
     normal: Array
     view: Array
     values: dict[str, Array]  # by name, such as albedo (n, 3), metallic and visibility (n, 1)
+    position: Array | None = None  # in the world
 
     @staticmethod
     def of(values: dict[str, Any]) -> Points:
@@ -69,6 +70,7 @@ def split_sum(points: Points, light: Light | None, options: Options, taps: Taps)
     if options.dominant:  # [Lagarde and de Rousiers 2014, §4.9.3]
         smooth = 1 - roughness[:, None] ** 2
         direction = unit(n + smooth * (np.sqrt(smooth) + 1 - smooth) * (direction - n))
+    direction = seen_from(light, points.position, direction)
     reflected = _looked_up(light, specular(light, direction, roughness), free * reflectance, taps)
     if options.multiscatter:  # [Fdez-Agüera 2019]
         lost = (f0 + (1 - f0) / 21) * (1 - a - b)[:, None]
@@ -104,7 +106,8 @@ def mirror(points: Points, light: Light | None, options: Options, taps: Taps) ->
     assert light is not None
     n, v = unit(points.normal), unit(points.view)
     share = points.values["metallic"]
-    lookup = bilinear(light, 2 * np.sum(n * v, 1, keepdims=True) * n - v, np.zeros(len(n), int))
+    direction = seen_from(light, points.position, 2 * np.sum(n * v, 1, keepdims=True) * n - v)
+    lookup = bilinear(light, direction, np.zeros(len(n), int))
     reflected = _looked_up(light, lookup, share, taps)
     return _terms((1 - share) * points.values["radiance"], reflected)
 
@@ -117,7 +120,7 @@ def gaussian_shader(points: Points, light: Light | None, options: Options, taps:
     cosine = np.sum(n * v, 1)
     scale, bias = table_lookup(light.table, cosine, roughness).T
     around = _looked_up(light, irradiance(light, n), 1 - tint, taps)
-    lookup = specular(light, 2 * cosine[:, None] * n - v, roughness)
+    lookup = specular(light, seen_from(light, points.position, 2 * cosine[:, None] * n - v), roughness)
     factor = tint * scale[:, None] + bias[:, None]
     return _terms(values["radiance"] + around, _looked_up(light, lookup, factor, taps))
 
@@ -146,7 +149,8 @@ def monte_carlo(points: Points, light: Light | None, options: Options, taps: Tap
         f_s = np.where(n_v.real > 0, d * f * smith / 4, 0)
         weight = 2 * math.pi / options.directions * positive(n_l)
         free = 1.0 if options.free is None else options.free[:, j : j + 1]
-        lookup = bilinear(light, w, np.zeros(len(w), int))
+        position = None if points.position is None else points.position.real
+        lookup = bilinear(light, seen_from(light, position, w), np.zeros(len(w), int))
         for term, share in enumerate((base / math.pi, f_s)):
             found[term] = found[term] + _looked_up(light, lookup, free * weight * share, taps)
         if incident is not None:

@@ -26,6 +26,7 @@ from mi_refgs.render.antialias import averaged
 from mi_refgs.render.gbuffer import AROUND, OBJECT, GBuffer, features, inverse_alpha, joined_slots
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.light.near_field import LocalLight, NearField
 from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
@@ -33,7 +34,7 @@ from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives import require_known_primitive
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Color3f, Float, Vector3f
+from mi_refgs.types import Color3f, Float, Point3f, Vector3f
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,19 @@ class SurfelScene:
     light: Light | None = None  # as `Shading.light_of` returns it; required unless the model uses none
     occluder: Occluder | None = None  # `traced_bounces` requires that it has the surfels' materials
     surroundings: Surroundings | None = None
+    near: NearField | None = None  # distances of what the light shows; None: infinitely far
 
     @property
     def all_aovs(self) -> frozenset[str]:
         """Names of all AOVs that a frame of this scene may have."""
         materials = {name for name in self.surfels.raw if attribute(name).aov}
         return frozenset({*materials, *TERMS, "visibility", "normal", "depth"})
+
+    def light_at(self, position: Point3f) -> Light | None:
+        """The light as it is seen from points."""
+        if self.light is None or self.near is None:
+            return self.light
+        return LocalLight(self.light, self.near, position)
 
 
 @dataclass(frozen=True)
@@ -190,7 +198,7 @@ class _View:
             slots = joined_slots(slots, others, (own, self.geometry.count - own))
         values = features(slots)
         if self.request.forward_only:
-            depth, draft = "depth" in self.asked, self.request.draft
+            depth, draft = "depth" in self.asked or self.scene.near is not None, self.request.draft
             blended = splat_compact(self.geometry, values, self.camera, depth=depth, draft=draft)
         else:
             if self.request.attribution is not None:
@@ -223,7 +231,7 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
         origin, ray = view.camera.origin, -points.view
         context = TraceContext(scene.occluder, scene.surfels, scene.light, origin, ray)
         points = scene.shading.model.trace(points, context, scene.shading)
-    terms = shade(points, scene.light, scene.shading)
+    terms = shade(points, scene.light_at(scene.surfels.position()), scene.shading)
 
     # Slots: the radiance and the requested AOVs only, since each costs time in every surfel-tile pair.
     asked_terms = {name: term for name, term in terms.known().items() if name in asked}
@@ -279,7 +287,10 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
         maps["visibility"] = points.visibility
 
     # Radiance, premultiplied.
-    shaded_at = partial(shade, light=scene.light, shading=shading)
+    light = scene.light
+    if scene.near is not None:
+        light = scene.light_at(camera.origin + buffer.depth * ray)
+    shaded_at = partial(shade, light=light, shading=shading)
     if shading.antialias:
         # Traced radiance exists only where the pixel's own ray is blocked: the rest would have none.
         interpolated = shading.occlusion and not shading.traced_bounces

@@ -32,6 +32,7 @@ class SceneFiles:
     mesh: str | None = None
     surroundings: str | None = None
     background: Sequence[float] | str | None = None  # a lat-long map, linear radiance, or transparent
+    near_field: str | None = None  # distances of what the envmap shows
 
 
 def write_scene_xml(
@@ -76,6 +77,8 @@ def write_scene_xml(
     if files.envmap is not None:
         light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
         put(light, "string", "filename", files.envmap)
+    if files.near_field is not None:
+        put(integrator, "string", "near_field", files.near_field)
     for index, camera in enumerate(cameras):
         add_sensor(scene, camera, f"sensor_{index}" if index else "sensor")
     write_xml(path, scene)

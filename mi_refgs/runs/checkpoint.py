@@ -20,6 +20,7 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 
@@ -44,8 +45,14 @@ def surroundings_of(params: Mapping[str, Any]) -> Surroundings | None:
     return Surroundings(Surfels(channels), behind)
 
 
-PARAMS, OPTIMISER, MESH = "params/", "optimiser/", "mesh/"
-"""What the names of parameters, of Adam's moments and of the occluder begin with."""
+def near_field_of(state: Mapping[str, np.ndarray]) -> NearField | None:
+    """Distances of what the environment map of a checkpoint shows, if it was compared with photographs."""
+    arrays = part(state, PHOTOGRAPHED)
+    return NearField(arrays["centre"], arrays["nearness"]) if arrays else None
+
+
+PARAMS, OPTIMISER, MESH, PHOTOGRAPHED = "params/", "optimiser/", "mesh/", "photographed/"
+"""Prefixes of the names of parameters, of Adam's moments, of the occluder and of the photographed light."""
 _MARK = b"sha256 "
 _DIGITS = 64
 
@@ -134,6 +141,13 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     for prefix, rows in tables.items():
         _check(state, [f"{prefix}error_sum", f"{prefix}unseen"], (rows.count,))
     _check(state, signed, signed=True)
+    if part(state, PHOTOGRAPHED):
+        if LIGHT not in params:
+            raise DamagedError(f"{PHOTOGRAPHED}weight: there is no light")
+        height = len(params[LIGHT])
+        _check(state, [f"{PHOTOGRAPHED}centre"], (3,), signed=True)
+        _check(state, [f"{PHOTOGRAPHED}radiance"], (height, 2 * height, 3))
+        _check(state, [f"{PHOTOGRAPHED}{name}" for name in ("nearness", "weight")], (height, 2 * height))
     if part(state, MESH):
         _check(state, [f"{MESH}voxel"], ())
         _check(state, [f"{MESH}vertices", f"{MESH}faces"], (None, 3), signed=True)

@@ -2,6 +2,7 @@
 
     surfels.ply       the object: raw attributes, with 2DGS's property names
     envmap.exr        the environment map: lat-long radiance, Mitsuba's orientation
+    near_field.npz    distances of what the environment map shows, and its centre
     mesh.ply          the occluder
     surroundings.ply  the background Gaussians, like surfels.ply, with radiance_sh only
     background.exr    the background map, lat-long radiance
@@ -34,6 +35,7 @@ from mi_refgs.runs.trained_scene import (
     LIGHT_MAP,
     MESH,
     MODEL,
+    NEAR_FIELD,
     SCENE,
     SURFELS,
     TrainedScene,
@@ -57,10 +59,13 @@ def export(
     written or a value is not finite.
     """
     light = LIGHT_MAP if fitted.light is not None else None
+    near = NEAR_FIELD if fitted.near is not None else None
     mesh = MESH if fitted.mesh is not None else None
     around = AROUND_FILE if fitted.surroundings is not None else None
     behind = BACKGROUND_MAP if fitted.surroundings and fitted.surroundings.background else None
-    written = [name for name in (SURFELS, light, mesh, around, behind, SCENE, MODEL) if name is not None]
+    written = [
+        name for name in (SURFELS, light, near, mesh, around, behind, SCENE, MODEL) if name is not None
+    ]
     with Run(folder).alone():
         output = output or Run(folder).output
         output.require_free(ARTEFACTS)
@@ -69,6 +74,8 @@ def export(
         write_ply(folder / SURFELS, fitted.surfels)
         if fitted.light is not None:
             fitted.light.write(folder / LIGHT_MAP)
+        if fitted.near is not None:
+            fitted.near.write(folder / NEAR_FIELD)
         if fitted.mesh is not None:
             write_mesh(folder / MESH, fitted.mesh)
         if fitted.surroundings is not None:
@@ -78,7 +85,7 @@ def export(
         # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
         # scene file cannot express. Without a background map it is black, as in `render`.
         black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
-        files = SceneFiles(SURFELS, light, mesh, around, behind or black)
+        files = SceneFiles(SURFELS, light, mesh, around, behind or black, near)
         remark = "" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels"
         write_scene_xml(folder / SCENE, files, fitted.shading, [camera, *more], remark)
         # Written last: if it is there, the other files are complete.

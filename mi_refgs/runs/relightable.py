@@ -53,8 +53,8 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 
     A diffuse part that was fitted as an SH colour becomes an albedo (`albedo_from_radiance`). Attributes that
     are fitted to the light (radiance, indirect) are removed; interreflection is traced instead, if the scene
-    has a mesh. The light stays, and so do other shading options. The background is removed: its brightness is
-    that of the photographs. A scene that has only materials keeps them as they are.
+    has a mesh. The light stays, infinitely far, and so do other shading options. The background is removed:
+    its brightness is that of the photographs. A scene that has only materials keeps them as they are.
 
     Raises InputError for a scene without light or one of the materials.
     """
@@ -79,7 +79,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
         traced_bounces=bounces,
         ambient_rays=ambient_rays,
     )
-    return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None)
+    return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None, near=None)
 
 
 def _near(mesh: Mesh, surfels: Surfels) -> Mesh:

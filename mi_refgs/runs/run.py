@@ -36,7 +36,7 @@ LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl 
 CONFIG = "config.toml"
 RUN_FILES = (
     *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png", "points.npz"),
-    *("surfels.ply", "envmap.exr", "mesh.ply", "surroundings.ply", "background.exr"),
+    *("surfels.ply", "envmap.exr", "near_field.npz", "mesh.ply", "surroundings.ply", "background.exr"),
     *("scene.xml", "model.json"),
     *("exposure.json", CAMERAS, "decisions.json", "edit.json", "preview.png"),
     *("metrics.json", "contact_sheet.png", "decomposition.png", "eval/*.png"),

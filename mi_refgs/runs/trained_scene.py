@@ -21,9 +21,10 @@ from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.checkpoint import PARAMS, channels_of, light_of, surroundings_of, tensors
+from mi_refgs.runs.checkpoint import PARAMS, channels_of, light_of, near_field_of, surroundings_of, tensors
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import attribute
@@ -31,8 +32,8 @@ from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 
 SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
-AROUND_FILE, BACKGROUND_MAP = "surroundings.ply", "background.exr"
-ARTEFACTS = (SURFELS, LIGHT_MAP, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL)
+AROUND_FILE, BACKGROUND_MAP, NEAR_FIELD = "surroundings.ply", "background.exr", "near_field.npz"
+ARTEFACTS = (SURFELS, LIGHT_MAP, NEAR_FIELD, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL)
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class TrainedScene:
     seconds: float  # spent training
     pruned: Pruned | None = None  # absent: the whole fit
     surroundings: Surroundings | None = None  # background Gaussians and map, of images without alpha
+    near: NearField | None = None  # distances of what the light shows; None: infinitely far
 
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
@@ -76,6 +78,7 @@ class TrainedScene:
             iteration,
             float(state["seconds"]),
             surroundings=surroundings_of(params),
+            near=near_field_of(state),
         )
 
     @property
@@ -104,7 +107,7 @@ class TrainedScene:
             raise InputError(
                 f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"
             ) from error
-        light, mesh = folder / LIGHT_MAP, folder / MESH
+        light, mesh, near = folder / LIGHT_MAP, folder / MESH, folder / NEAR_FIELD
         around, behind = folder / AROUND_FILE, folder / BACKGROUND_MAP
         if shading.model.light != "none" and not light.is_file():
             raise InputError(
@@ -119,6 +122,7 @@ class TrainedScene:
             seconds,
             pruned,
             Surroundings.read(around, behind if behind.is_file() else None) if around.is_file() else None,
+            NearField.read(near) if near.is_file() else None,
         )
         try:
             shading.require_inputs(fitted.surfels.raw, fitted.light is not None)
@@ -143,7 +147,7 @@ class TrainedScene:
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
         update_occluder_caches(occluder, self.surfels, light, self.shading)
-        scene = SurfelScene(self.surfels, self.shading, light, occluder, self.surroundings)
+        scene = SurfelScene(self.surfels, self.shading, light, occluder, self.surroundings, self.near)
 
         def draw(camera: Camera, aovs: bool | Collection[str], samples: int = 1) -> Frame:
             asked = aovs if not isinstance(aovs, bool) else scene.all_aovs if aovs else ()

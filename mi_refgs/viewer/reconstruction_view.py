@@ -18,6 +18,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
@@ -124,6 +125,11 @@ class ReconstructionView(ViewerScene):
         cos, sin = dr.opaque(mi.Float, math.cos(angle)), dr.opaque(mi.Float, math.sin(angle))
         return RotatedLight(self._filtered, mi.Matrix3f([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
 
+    @property
+    def _near(self) -> NearField | None:
+        """Distances of what the scene's own light shows, unless it is rotated."""
+        return self.scene.near if self.environment is self.original.light and not self.turn else None
+
     # ---------------- images ----------------
 
     def frame(self, sample: SampleRequest) -> Frame:
@@ -134,7 +140,9 @@ class ReconstructionView(ViewerScene):
                 update_occluder_caches(self._occluder, scene.surfels, light, scene.shading)
                 self._stale = False
             background = None if sample.look.object_only else scene.surroundings
-            rendered = SurfelScene(scene.surfels, scene.shading, light, self._occluder, background)
+            rendered = SurfelScene(
+                scene.surfels, scene.shading, light, self._occluder, background, self._near
+            )
             request = Request(sample.aovs, forward_only=True, draft=not sample.settled)
             return render(rendered, sample.camera(), request)
 

@@ -212,6 +212,32 @@ def test_colour_of_light(rng: np.random.Generator) -> None:
     assert float(loss(grey)[0]) < 1e-6
 
 
+def test_difference_of_lights(rng: np.random.Generator) -> None:
+    """Against the definition, by the radiance; a light brighter than what is clipped costs nothing."""
+    photographed = rng.uniform(0, 1.5, (40, 3)).astype(np.float32)
+    radiance = (photographed + rng.choice([-0.2, 0.3], (40, 3)) * rng.random((40, 3))).clip(0.01)
+    seen, area = rng.choice([0, 0.4, 1], 40).astype(np.float32), rng.random(40).astype(np.float32)
+
+    def define(values: np.ndarray) -> float:
+        return reference.light_difference(values, photographed, seen, area, losses.HUE)
+
+    light = mi.Color3f(radiance.T.astype(np.float32))
+    dr.enable_grad(light)
+    value = losses.light_difference(light, mi.Color3f(photographed.T), mi.Float(seen), mi.Float(area))
+    assert float(value[0]) == pytest.approx(define(radiance), rel=1e-5)
+    dr.backward(value)
+    slope, step = dr.grad(light).numpy().T, 1e-4 * rng.normal(size=radiance.shape)
+    difference = define(radiance + step) - define(radiance - step)
+    assert np.sum(slope * step) == pytest.approx(difference / 2, rel=1e-2)
+    free = (photographed > losses.CLIPPED) & (radiance > photographed) & (seen == 1)[:, None]
+    assert free.any() and not slope[free].any()
+    brighter = photographed * np.float32(1.5) + np.float32(0.5)  # same log ratio in all channels
+    unseen = losses.light_difference(
+        mi.Color3f(brighter.T), mi.Color3f(photographed.T), mi.Float(np.zeros(40)), mi.Float(area)
+    )
+    assert float(unseen[0]) < 1e-6
+
+
 def test_second_call_compiles_nothing(images: tuple[np.ndarray, np.ndarray]) -> None:
     image, target = images
 

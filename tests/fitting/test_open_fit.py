@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,15 +19,19 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import object_surface
 from mi_refgs.fitting.control import depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
+from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.runner import begin, default_method
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
-from mi_refgs.methods.method import Method, Refine, SurroundingsOptions
+from mi_refgs.methods.method import LossWeight, Method, Refine, SurroundingsOptions
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
+from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes.highlight import require_same_state, step_to
@@ -51,6 +56,7 @@ def method(tmp_path_factory: pytest.TempPathFactory) -> Method:
         "surroundings.count=60", "surroundings.max_count=90", "log_every=4",
         "refine.densify={ start = 0, until = 10, every = 4 }",
         "refine.reset={ start = 0, until = 6, every = 6 }", "loss.normal=0.1",
+        "light.photographed={ start = 0, until = 10, every = 4 }", "loss.photographed=1",
     ]  # fmt: skip
     return methods.load(str(path), "quick", settings)
 
@@ -278,6 +284,55 @@ def test_fit_of_open_scene_improves(data: Dataset, method: Method) -> None:
     for name in ("params/background", "params/light"):
         assert np.abs(end[name] - start[name]).max() > 1e-3, name
     assert trainer.health.skipped == 0 and all(np.isfinite(x).all() for n, x in end.items() if n in start)
+
+
+def test_light_follows_photographs(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where views show the background, but not behind them; rendered in the iterations of the window."""
+    rendered: list[int] = []
+    first = PhotographedLight.of
+
+    def counted(*arguments: Any) -> PhotographedLight:
+        rendered.append(trainer.iteration)
+        return first(*arguments)
+
+    monkeypatch.setattr(PhotographedLight, "of", staticmethod(counted))
+    loss, rates = method.loss | {"photographed": LossWeight(100.0)}, replace(method.rates, light=0.3)
+    heavy = replace(method, loss=loss, rates=rates)
+    trainer = Trainer(heavy, data)
+    step_to(trainer, 4)
+    known = trainer.fit.photographed
+    assert known is not None and rendered == [4]
+    before = float(known.difference(trainer.light.prefilter())[0])
+    step_to(trainer, 8)
+    after = float(known.difference(trainer.light.prefilter())[0])
+    assert rendered == [4, 8] and after < 0.8 * before
+    assert known.weight.max() == 1 and known.weight.min() == 0
+    off = replace(method, light=replace(method.light, photographed=None))  # type: ignore[type-var]
+    assert step_to(Trainer(off, data), 5).fit.photographed is None
+
+
+def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None:
+    """A wall behind a nearer wall has no weight; without the nearer one it has."""
+    assert data.region is not None
+    centre = np.array(data.region.centre)
+    cameras = [view.camera() for view in data.views]
+    towards = centre - data.views[0].to_world[:3, 3]
+    towards /= np.linalg.norm(towards)
+
+    def wall(distance: float) -> Surfels:
+        made = from_points(
+            (centre + distance * towards)[None], -towards[None], rng=np.random.default_rng(0),
+            attributes=["radiance_sh"], opacity=0.99,
+        )  # fmt: skip
+        raw = made.to_numpy()
+        raw["scale"][:] = np.log(3.0)
+        return Surfels.from_numpy(raw)
+
+    far = Surroundings(wall(3.0), EnvironmentLight.constant(0.5, 8))
+    behind = map_directions(8) @ towards > 0.95
+    for nearer, share in ((wall(30.0), 1.0), (wall(0.5), 0.0)):
+        found = PhotographedLight.of(nearer, far, data.region, cameras, 8)
+        assert np.all(found.weight[behind] == share)
 
 
 def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> None:

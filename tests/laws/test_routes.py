@@ -33,6 +33,7 @@ from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import save
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.options import TRACED
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
@@ -118,14 +119,17 @@ def trained(shading: Shading, primitive: str, around: str, meshed: bool, bare: b
     if bare:
         raw = {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
     map_behind = background_light() if around == "surroundings and a map" else None
+    lit = EnvironmentLight.from_radiance(sky()) if "albedo" in raw else None
+    near = NearField(np.array([0.1, -0.2, 0.3]), rng.uniform(0, 0.5, (8, 16)).astype(np.float32))
     return TrainedScene(
         Surfels.from_numpy(raw),
-        EnvironmentLight.from_radiance(sky()) if "albedo" in raw else None,
+        lit,
         two_balls() if meshed or shading.occlusion else None,
         shading,
         7,
         1.5,
         surroundings=None if around == "nothing" else Surroundings(Surfels.from_numpy(others), map_behind),
+        near=near if map_behind is not None and lit is not None else None,
     )
 
 

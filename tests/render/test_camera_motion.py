@@ -65,8 +65,10 @@ def test_displaced_camera_is_at_its_pose(far: float, motion: np.ndarray) -> None
     assert found.motion is None
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: " ".join(case))
-def test_derivatives_of_open_scene_are_those_of_float64(case: tuple[str, str], motion: np.ndarray) -> None:
+@pytest.mark.parametrize("case", CASES, ids=lambda case: " ".join(map(str, case)))
+def test_derivatives_of_open_scene_are_those_of_float64(
+    case: tuple[str, str, float], motion: np.ndarray
+) -> None:
     """Both modes, for every map of object, surroundings and background, shaded in either order."""
     pair = Pair(*case)
     start = np.linalg.inv(moved_pose(np.eye(4), motion.astype(np.float64))) @ pair.case.camera.to_world

@@ -22,7 +22,7 @@ from tests.scenes.integrator import scattered_discs
 from tests.scenes.open_pair import CASES, MAPS, Pair, weighted
 
 
-@pytest.fixture(scope="module", params=CASES, ids=lambda case: " ".join(case))
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: " ".join(map(str, case)))
 def pair(request: pytest.FixtureRequest) -> Pair:
     return Pair(*request.param)
 

@@ -24,12 +24,17 @@ State = dict[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def state(finished: Path) -> State:
-    """What a fit of the full method has saved, with a mesh whose vertices have a surfel each."""
+    """What a fit of the full method has saved, with a mesh whose vertices have a surfel each, and a light that
+    photographs show."""
     newest = checkpoint.read(Run(finished).checkpoints()[-1])
     assert "mesh/faces" in newest and "params/light" in newest
     ones = np.ones_like(newest["mesh/vertices"].T)
     around = {"surfels": ones[:1].astype(np.uint32), "weights": ones[:1], "normals": ones}
-    return newest | {f"mesh/{name}": values for name, values in around.items()}
+    height = len(newest["params/light"])
+    maps = {"nearness": np.ones((height, 2 * height)), "weight": np.ones((height, 2 * height))}
+    seen = maps | {"centre": np.zeros(3), "radiance": np.ones((height, 2 * height, 3))}
+    made = {f"mesh/{name}": values for name, values in around.items()}
+    return newest | made | {f"photographed/{name}": values for name, values in seen.items()}
 
 
 def test_what_is_written_is_read(state: State) -> None:
@@ -99,6 +104,9 @@ WRONG = {
     "a face without its vertex": replaced("mesh/faces", spoilt(10**6)),
     "a vertex of a surfel that is not there": replaced("mesh/surfels", spoilt(10**6)),
     "negative weights of surfels": replaced("mesh/weights", spoilt(-1)),
+    "a light behind the centre": replaced("photographed/nearness", spoilt(-1)),
+    "a photographed light of another size": replaced("photographed/weight", lambda x: x[:-1]),
+    "no photographed radiance": without("photographed/radiance"),
     "text": replaced("params/metallic", lambda x: x.astype(str)),
     "objects": replaced("params/metallic", lambda x: x.astype(object)),
     "complex": replaced("params/metallic", lambda x: x.astype(complex)),

@@ -17,12 +17,20 @@ from mi_refgs.reference import image as oracle
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import scattered_discs
 
-CASES = [("pixel", "sh"), ("surfel", "irradiance")]
+FAR, NEAR = 0.0, 0.25  # 1 / distance of what the light shows
+CASES = [
+    ("pixel", "sh", FAR),
+    ("surfel", "irradiance", FAR),
+    ("pixel", "irradiance", NEAR),
+    ("surfel", "sh", NEAR),
+]
+CENTRE = np.array([0.2, -0.1, 0.3])  # the point from which the light shows it
 MAPS = ["radiance", "alpha", "depth", "normal", "object_alpha", "albedo", "metallic", "roughness"]
 MAPS += ["background"]
 
@@ -33,6 +41,7 @@ class Pair:
 
     at: str
     diffuse: str
+    nearness: float = FAR
 
     @cached_property
     def case(self) -> Any:
@@ -64,7 +73,8 @@ class Pair:
         if pose is not None:
             case = replace(case, camera=replace(case.camera, to_world=pose))
         pixels = np.arange(case.camera.width * case.camera.height)
-        scene = exact.scene_of(case, pixels, self.order, exact.light_of(values["light"]))
+        light = replace(exact.light_of(values["light"]), centre=CENTRE, nearness=self.nearness)
+        scene = exact.scene_of(case, pixels, self.order, light)
         others = {name: values[f"surroundings/{name}"] for name in scattered_discs()}
         return oracle.render_open(oracle.OpenScene(scene, others, values["background"]))
 
@@ -75,7 +85,8 @@ class Pair:
         light = EnvironmentLight(params["light"]).prefilter()
         shading = Shading(self.at, "split_sum", self.diffuse)  # type: ignore[arg-type]
         eye = eye or exact.fast_camera(self.case)
-        scene = SurfelScene(surfels, shading, light, surroundings=behind)
+        near = NearField(CENTRE, np.full((4, 8), self.nearness)) if self.nearness else None
+        scene = SurfelScene(surfels, shading, light, surroundings=behind, near=near)
         return render(scene, eye, Request(scene.all_aovs))
 
     def planes(self, params: dict[str, Any], eye: Camera | None = None) -> dict[str, list[Any]]:

@@ -89,14 +89,14 @@ class PrefilteredLight:
 
     def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
         """Radiance (bilinear) that arrives from unit world directions; derivative in light and direction."""
-        return self._bilinear(*_azimuth_polar(direction), mi.UInt32(0))
+        return self._bilinear(*azimuth_polar(direction), mi.UInt32(0))
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
         """∫ L cosθ dω / π over the hemisphere of unit world normals: constant light 1 gives 1.
 
         At roughness 1 the lobe D is constant and only the cosine is left, so this is the last level.
         """
-        return self._bilinear(*_azimuth_polar(normal), mi.UInt32(len(self.operator.roughness)))
+        return self._bilinear(*azimuth_polar(normal), mi.UInt32(len(self.operator.roughness)))
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Radiance averaged over the GGX lobe around unit world directions.
@@ -107,13 +107,13 @@ class PrefilteredLight:
         """
         place = _level(roughness, self.operator.roughness)
         lower = dr.minimum(mi.UInt32(dr.detach(place)), len(self.operator.roughness) - 1)
-        at = _azimuth_polar(direction)
+        at = azimuth_polar(direction)
         return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
 
     def _bilinear(self, u: Any, v: Any, level: Any) -> Any:
         """Colour at the fractions u of a turn and v of a meridian."""
         first, h, w = (dr.gather(mi.UInt32, self.operator.info, 4 * level + k) for k in range(3))
-        colour = _interpolated(lambda i: dr.gather(mi.Vector4f, self.levels, first + i), u, v, h, w)
+        colour = interpolated(lambda i: dr.gather(mi.Vector4f, self.levels, first + i), u, v, h, w)
         return mi.Color3f(colour.x, colour.y, colour.z)
 
 
@@ -127,8 +127,8 @@ class UnfilteredLight:
     def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
         """Radiance in unit directions, as `PrefilteredLight.radiance` gives it."""
         h = dr.opaque(mi.UInt32, self.height)
-        u, v = _azimuth_polar(direction)
-        return _interpolated(lambda i: dr.gather(mi.Color3f, self.texels, i), u, v, h, 2 * h)
+        u, v = azimuth_polar(direction)
+        return interpolated(lambda i: dr.gather(mi.Color3f, self.texels, i), u, v, h, 2 * h)
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
         raise InputError("light: irradiance: the light is not filtered; use EnvironmentLight.prefilter()")
@@ -137,7 +137,7 @@ class UnfilteredLight:
         raise InputError("light: specular: the light is not filtered; use EnvironmentLight.prefilter()")
 
 
-def _interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -> Any:
+def interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -> Any:
     """Bilinear value of a map of h rows and w columns at the fractions u of a turn and v of a meridian."""
     x, y = dr.fma(u, mi.Float(w), -0.5), v * mi.Float(h - 1)
     left = mi.Int32(dr.floor(dr.detach(x)))
@@ -152,7 +152,7 @@ def _interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -
     return dr.lerp(upper, below, t)
 
 
-def _azimuth_polar(direction: Any) -> tuple[Any, Any]:
+def azimuth_polar(direction: Any) -> tuple[Any, Any]:
     """Fractions u of a turn and v of a meridian of unit directions, with finite derivatives at the poles."""
     x, y, z = direction.x, direction.y, direction.z
     sin2 = x * x + z * z

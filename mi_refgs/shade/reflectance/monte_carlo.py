@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.light.near_field import LocalLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
@@ -28,7 +29,7 @@ class MonteCarlo(Reflectance):
 
     f_s is GGX with α = roughness², Smith-Schlick shadowing of k = (roughness + 1)² / 8, and F0 = 0.04.
     b = 0.03 + 0.77 albedo, roughness = 0.09 + 0.9 of the attribute. The directions are those of a Fibonacci
-    hemisphere about the normal, J = `options.directions`; the normal is detached in all of it. V is 0 where
+    hemisphere about the normal, J = `options.directions`; normal and position are detached. V is 0 where
     the mesh blocks the ray, if `options.occlusion`. The light of other surfaces, `indirect_sh`,
     counts where the surfels have it.
     """
@@ -67,6 +68,8 @@ class MonteCarlo(Reflectance):
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         count = dr.opaque(mi.UInt32, options.directions)
         normal = dr.detach(safe_normalize(points.normal))
+        if isinstance(light, LocalLight):
+            light = light.detached()  # as the normal: the loop's adjoint keeps derivatives of its state only
         free, incident = points.get("free"), points.get("incident")
         base = dr.fma(points.albedo, BASE_RANGE[1], BASE_RANGE[0])
         roughness = dr.fma(points.roughness, ROUGHNESS_RANGE[1], ROUGHNESS_RANGE[0])

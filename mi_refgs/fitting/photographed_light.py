@@ -1,0 +1,120 @@
+"""The light that photographs show: a panorama of the fitted background, near which the environment map stays.
+
+Images of an object alone determine only products of light and material. In photographs without alpha the
+background is what lights the object, so the environment map is compared with it, texel by texel. What no
+photograph shows, such as a ceiling, is left to the reflections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.data.region import Region
+from mi_refgs.fitting.losses import light_difference
+from mi_refgs.kernels.device import upload
+from mi_refgs.render.panorama import Panorama, panorama
+from mi_refgs.render.pipeline import render_depth
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.light.lobe_matrices import map_directions, row_areas
+from mi_refgs.shade.light.near_field import NearField
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float
+
+NEAR = 0.05  # radii of the region: what is nearer to its centre is not background
+FARTHEST = 1e4  # radii of the region: distance of the background map
+SEEN_SHARE = 0.05  # fraction of the views from which a texel counts fully: fewer views may show a floater
+BEHIND = 1.1  # factor of the rendered depth up to which a point is on the surface that a view shows
+
+
+@dataclass(frozen=True, eq=False)
+class PhotographedLight:
+    """Radiance that the photographs show in all directions, and how much each direction counts."""
+
+    panorama: Panorama
+    weight: np.ndarray  # (h, 2h) 0 … 1
+
+    @staticmethod
+    def of(
+        surfels: Surfels,
+        surroundings: Surroundings,
+        region: Region,
+        cameras: Sequence[Camera],
+        height: int,
+    ) -> PhotographedLight:
+        """Render the background from the region's centre, with `height` rows.
+
+        A texel counts if cameras show the surface there: it is in their image, and nothing is in front.
+        """
+        centre, radius = np.array(region.centre), region.radius
+        seen = panorama(surroundings, centre, height, NEAR * radius)
+        points = seen.points(FARTHEST * radius).reshape(-1, 3)
+        shown = np.zeros(len(points))
+        for camera in cameras:
+            with dr.suspend_grad():
+                depth, alpha = render_depth(surfels, camera, surroundings.surfels)
+            shown += _shown(points, camera, depth.numpy(), alpha.numpy())
+        weight = np.minimum(shown / (SEEN_SHARE * len(cameras)), 1)
+        return PhotographedLight(seen, weight.reshape(height, 2 * height))
+
+    @cached_property
+    def near(self) -> NearField:
+        """The distances of the panorama."""
+        return NearField(self.panorama.centre, self.panorama.nearness)
+
+    @cached_property
+    def _texels(self) -> tuple[Any, ...]:
+        """Unit directions and radiance of the texels, how far they are seen, and their areas.
+
+        What is not seen has the mean radiance of the rest.
+        """
+        height, seen = len(self.weight), self.weight[..., None]
+        area = np.broadcast_to(row_areas(height)[:, None] / (4 * height), self.weight.shape)
+        shown = seen * area[..., None]
+        mean = np.sum(shown * self.panorama.radiance, axis=(0, 1)) / max(shown.sum(), 1e-9)
+        radiance = seen * self.panorama.radiance + (1 - seen) * mean
+        vectors = (x.reshape(-1, 3).T.astype(np.float32) for x in (map_directions(height), radiance))
+        scalars = (upload(x.astype(np.float32)) for x in (self.weight, area))
+        return mi.Vector3f(next(vectors)), mi.Color3f(next(vectors)), *scalars
+
+    def difference(self, light: Light) -> Float:
+        """How far a light is from the panorama, as `losses.light_difference` weighs it (width 1)."""
+        direction, *photographed = self._texels
+        return light_difference(light.radiance(direction), *photographed)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Its part of a checkpoint."""
+        seen = self.panorama
+        return {
+            "centre": seen.centre,
+            "radiance": seen.radiance,
+            "nearness": seen.nearness,
+            "weight": self.weight,
+        }
+
+    @staticmethod
+    def restored(arrays: Mapping[str, np.ndarray]) -> PhotographedLight:
+        """Restore `arrays`, bit for bit."""
+        seen = Panorama(*(arrays[name] for name in ("centre", "radiance", "nearness")))
+        return PhotographedLight(seen, arrays["weight"])
+
+
+def _shown(points: np.ndarray, camera: Camera, depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Whether a camera shows points (N, 3) rather than something in front of them: (N,) bool."""
+    pose = camera.pose()
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    z = np.where(local[:, 2] > 0, local[:, 2], np.inf)
+    fx, fy, cx, cy = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    column, row = np.floor(fx * local[:, 0] / z + cx), np.floor(fy * local[:, 1] / z + cy)
+    inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    pixel = (np.where(inside, row * camera.width + column, 0)).astype(int)
+    surface = np.where(alpha > 0.5, depth, np.inf)
+    return inside & (local[:, 2] <= BEHIND * surface[pixel])

@@ -1,0 +1,53 @@
+"""The background in all directions from one point: orientation, distances, what is nearer than `near`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mi_refgs.render.panorama import panorama
+from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.lobe_matrices import map_directions
+from mi_refgs.surfels import init
+from mi_refgs.surfels.table import Surfels
+
+CENTRE = np.array([0.3, -0.2, 0.5])
+HEIGHT = 32
+
+
+def discs(points: np.ndarray, normals: np.ndarray, colours: np.ndarray, sizes: list[float]) -> Surfels:
+    """Opaque discs with one colour each."""
+    made = init.from_points(
+        points, normals, colours, rng=np.random.default_rng(0), attributes=["radiance_sh"], opacity=0.99
+    )
+    raw = made.to_numpy()
+    raw["scale"][:] = np.log(sizes)[:, None]
+    return Surfels.from_numpy(raw)
+
+
+def test_background_map_is_seen_as_it_is() -> None:
+    """In the orientation of `EnvironmentLight`, wherever the centre is; nothing is near."""
+    wave = 0.5 + 0.3 * map_directions(HEIGHT)
+    far = discs(np.array([[0.0, 0.0, -900.0]]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)), [1e-3])
+    seen = panorama(Surroundings(far, EnvironmentLight.from_radiance(wave)), CENTRE, HEIGHT, 0.01)
+    np.testing.assert_allclose(seen.radiance, wave, atol=0.02)  # the far disc is a part of a pixel
+    assert not seen.nearness.any()
+    np.testing.assert_allclose(seen.points(7.0), CENTRE + 7 * map_directions(HEIGHT))
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_surfels_have_their_radiance_and_distance(axis: int, sign: int) -> None:
+    """A large disc across one axis: the texels that see it have its plane's distance, and its colour."""
+    towards = sign * np.eye(3)[axis]
+    colour = np.array([[0.2, 0.5, 0.8]])
+    points, normals = CENTRE + np.outer([0.5, 2], towards), -np.stack([towards, towards])
+    both = discs(points, normals, np.concatenate([0 * colour, colour]), [0.05, 9.0])  # one nearer
+    seen = panorama(Surroundings(both), CENTRE, HEIGHT, 1.0)
+    directions = map_directions(HEIGHT)
+    central = directions @ towards > 0.9
+    expected = directions[central] @ towards / 2
+    np.testing.assert_allclose(seen.nearness[central], expected, rtol=0.03)
+    np.testing.assert_allclose(seen.radiance[central], np.broadcast_to(colour, (central.sum(), 3)), atol=0.02)
+    assert not seen.nearness[directions @ towards < -0.1].any()
