@@ -302,9 +302,13 @@ def test_light_follows_photographs(data: Dataset, method: Method, monkeypatch: p
     step_to(trainer, 4)
     known = trainer.fit.photographed
     assert known is not None and rendered == [4]
-    before = float(known.difference(trainer.light.prefilter())[0])
+    light = trainer.light
+    assert light is not None
+    before = float(known.difference(light.prefilter())[0])
     step_to(trainer, 8)
-    after = float(known.difference(trainer.light.prefilter())[0])
+    light = trainer.light
+    assert light is not None
+    after = float(known.difference(light.prefilter())[0])
     assert rendered == [4, 8] and after < 0.8 * before
     assert known.weight.max() == 1 and known.weight.min() == 0
     off = replace(method, light=replace(method.light, photographed=None))  # type: ignore[type-var]
