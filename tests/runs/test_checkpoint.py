@@ -24,7 +24,7 @@ State = dict[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def state(finished: Path) -> State:
-    """What a fit of the full method has saved, with surfels of the mesh's vertices and a photographed light."""
+    """What a fit of the full method has saved, with surfels of the vertices and a photographed light."""
     newest = checkpoint.read(Run(finished).checkpoints()[-1])
     assert "mesh/faces" in newest and "params/light" in newest
     ones = np.ones_like(newest["mesh/vertices"].T)
