@@ -116,7 +116,8 @@ class FilmImage:
 
     def _values(self, band: Band) -> Any:
         """Channels of the pixels of a band (mi.Float), pixel by pixel; under AD."""
-        camera = band.camera
+        # Attached anew in each pass: a traversal removes the graph from the sensor to its camera.
+        camera = band.camera.attached(self.sensor)
         frame = supersampled(self.view, camera, self._samples)
         made = self.channels(frame, camera, self._alpha)
         pixels = dr.zeros(mi.Float, camera.width * camera.height)

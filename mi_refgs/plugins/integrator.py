@@ -162,9 +162,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     shapes, and shows the environment only in reflections. It has no noise, and ignores the seed. A sample
     count n (of ``mi.render``, else of the sensor's sampler, whose default is 4) gives k × k regular samples
     per pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. `mi.render` differentiates it in both
-    modes with respect to the parameters above and to ``data``, ``scale`` or ``radiance.value`` of the scene's
-    environment, but not to sensors, background or mesh; `mi_refgs.splat.composite` lists the derivatives that
-    are absent.
+    modes with respect to the parameters above, to ``data``, ``scale`` or ``radiance.value`` of the scene's
+    environment, and to ``to_world`` (rigid changes) and ``x_fov`` of sensors, but not to a background colour
+    or the mesh; `mi_refgs.splat.composite` lists the derivatives that are absent.
 
     A surfel with a value that is NaN or infinite in any attribute, or beyond 1e18 in position or SH
     coefficients, covers no pixel and gets zero gradient; such a value of the light is black. One warning
@@ -272,7 +272,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
         self.unusable.check(self._models, self._maps)
-        image = self._image(scene, sensor, spp, forward_only=True).image()
+        with dr.suspend_grad():
+            image = self._image(scene, sensor, spp, forward_only=True).image()
         if evaluate:
             dr.eval(image)
         return image if develop else mi.TensorXf()

@@ -21,8 +21,8 @@ class Camera:
     """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
 
     In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. All numbers but the image size
-    are opaque Dr.Jit values, so that every view of a data set uses one compiled kernel. Numbers have no
-    derivatives; a camera that was `displaced` under AD has those of its `motion`.
+    are opaque Dr.Jit values, so that every view of a data set uses one compiled kernel. Poses have no
+    derivatives; a camera that was `displaced` or `attached` under AD has those of its `motion`.
     """
 
     width: int  # pixels
@@ -143,7 +143,7 @@ class Camera:
     def from_sensor(sensor: Any) -> Camera:
         """Camera of a Mitsuba `perspective` sensor, with its crop window and principal-point offset.
 
-        Raises InputError for every other sensor.
+        It has no derivatives unless it is `attached`. Raises InputError for every other sensor.
         """
         params = mi.traverse(sensor)
         if "x_fov" not in params or "aperture_radius" in params:
@@ -166,6 +166,27 @@ class Camera:
         x, y = (int(offset) for offset in sensor.film().crop_offset())
         size = int(sensor.film().size()[0]), int(sensor.film().size()[1])
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
+
+    def attached(self, sensor: Any) -> Camera:
+        """The camera with derivatives of its sensor's `to_world` and `x_fov`, where gradients are enabled.
+
+        A change of `to_world` counts as that of the rigid matrix nearest to it: scale and shear have no
+        derivative.
+        """
+        camera, matrix, angle = self, sensor.world_transform().matrix, mi.traverse(sensor)["x_fov"]
+        if dr.grad_enabled(matrix):
+            turned = mi.Matrix3f(*(matrix[i, j] for i in range(3) for j in range(3)))
+            turned @= dr.rcp(dr.detach(turned))
+            moved = mi.Vector3f(*(matrix[i, 3] for i in range(3)))
+            camera = replace(camera, motion=_motion_of(turned, moved))
+        if dr.grad_enabled(angle):
+            slope = dr.tan(dr.deg2rad(0.5 * angle))
+            camera = camera.zoomed(dr.detach(slope) / slope)
+        return camera
+
+    def zoomed(self, factor: Float) -> Camera:
+        """The camera with both focal lengths times a factor of width 1, under AD; the tiles stay."""
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
     def towards(self, point: Point3f) -> Vector3f:
         """Vector in the world from the camera to a point, with the precision of float32 of the vector."""
@@ -227,13 +248,8 @@ class Camera:
         change = rotation @ lever - lever + translation  # of the origin; small, so it keeps its digits
         origin = dr.detach(mi.Point3f(self.origin + self.origin_rest + change))
         rest = (mi.Vector3f(self.origin) - mi.Vector3f(origin)) + self.origin_rest + dr.detach(change)
-        motion = None
-        if dr.grad_enabled(rotation, translation):
-            turned = rotation @ dr.detach(rotation).T  # the identity; its antisymmetric part is the motion
-            pairs = ((2, 1), (0, 2), (1, 0))
-            angles = [0.5 * (turned[i, j] - turned[j, i]) for i, j in pairs]
-            motion = dr.concat([*angles, *(change - dr.detach(change))])
-            motion -= dr.detach(motion)  # rounding
+        enabled = dr.grad_enabled(rotation, translation)
+        motion = _motion_of(rotation @ dr.detach(rotation).T, change) if enabled else None
         matrix = self.rotation @ dr.detach(rotation).T
         dr.eval(matrix, origin, rest, motion)
         return replace(self, rotation=matrix, origin=origin, origin_rest=rest, motion=motion)
@@ -285,3 +301,13 @@ class Camera:
         offset = self.offset[0] * factor, self.offset[1] * factor
         film = None if self.film is None else (self.film[0] * factor, self.film[1] * factor)
         return replace(self, offset=offset, film=film, **scaled)
+
+
+def _motion_of(turned: mi.Matrix3f, moved: Vector3f) -> Float:
+    """`Camera.motion` of a matrix that is the identity, and of a vector, under AD.
+
+    The antisymmetric part of the matrix's tangent is that of the rotation nearest to it.
+    """
+    angles = [0.5 * (turned[i, j] - turned[j, i]) for i, j in ((2, 1), (0, 2), (1, 0))]
+    motion = dr.concat([*angles, *moved])
+    return motion - dr.detach(motion)

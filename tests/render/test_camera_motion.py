@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,25 +19,14 @@ from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
+from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotation_of
 from tests.scenes.open_pair import CASES, MAPS, Pair, weighted
-
-CENTRE = np.array([0.3, -0.2, 0.1])
-STEP = 1e-6
-
-
-def moved_pose(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """A pose rotated (3, axis times 2 tan(θ/2)) about CENTRE, then moved (3)."""
-    change = np.eye(4)
-    change[:3, :3] = Rotation.from_quat([*(0.5 * motion[:3]), 1]).as_matrix()
-    change[:3, 3] = CENTRE - change[:3, :3] @ CENTRE + motion[3:]
-    return np.asarray(change @ pose)
 
 
 def displaced(eye: Camera, motion: mi.Float) -> Camera:
     """A camera that is moved in this way, by (6,) numbers under AD."""
-    x = [dr.gather(mi.Float, motion, dr.opaque(mi.UInt32, i)) for i in range(6)]
-    q = dr.normalize(mi.Quaternion4f(0.5 * x[0], 0.5 * x[1], 0.5 * x[2], 1))
-    return eye.displaced(dr.quat_to_matrix(mi.Matrix3f, q), mi.Point3f(CENTRE), mi.Vector3f(*x[3:]))
+    rotation, translation = rotation_of(motion)
+    return eye.displaced(rotation, mi.Point3f(CENTRE), translation)
 
 
 @pytest.fixture(params=[0.0, 0.2], ids=["at zero", "away from zero"])
@@ -140,20 +128,3 @@ def test_normals_of_depth_turn_with_camera(motion: np.ndarray) -> None:
         return float(np.sum(weight * (turn @ np.array(still, np.float64))))
 
     require_slopes(total, define, motion)
-
-
-def require_slopes(total: Any, define: Any, motion: np.ndarray) -> None:
-    """The gradient of `total`, and its forward derivative, are the differences of `define`."""
-    at = motion.astype(np.float64)
-    sides = [[define(at + sign * STEP * axis) for sign in (1, -1)] for axis in np.eye(6)]
-    expected = np.array([(above - below) / (2 * STEP) for above, below in sides])
-    leaf = mi.Float(motion)
-    dr.enable_grad(leaf)
-    dr.backward(total(leaf))
-    np.testing.assert_allclose(np.array(dr.grad(leaf)), expected, atol=2e-3 * np.abs(expected).max())
-    tangent = np.array([0.5, -1, 0.7, 0.3, 1, -0.4], np.float32)
-    leaf = mi.Float(motion)
-    dr.enable_grad(leaf)
-    dr.set_grad(leaf, mi.Float(tangent))
-    found = dr.forward_to(total(leaf))
-    assert float(found[0]) == pytest.approx(expected @ tangent, abs=4e-3 * np.abs(expected).max())

@@ -120,6 +120,7 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
     params = mi.traverse(of)
     keys = ["integrator.position", "integrator.opacity", "integrator.albedo", "integrator.light"]
     start = {key: mi.TensorXf(params[key]) for key in keys}
+    pose, angle = mi.Transform4f(params["sensor.to_world"]), mi.Float(params["sensor.x_fov"])
     rng = np.random.default_rng(5)
     moved = {key: mi.TensorXf(rng.normal(size=x.shape).astype(np.float32)) for key, x in start.items()}
 
@@ -128,8 +129,13 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
         dr.enable_grad(amount)
         for key in keys:
             params[key] = start[key] + moved[key] * amount
-        params.update()
+        move_sensor(amount)
         return amount, mi.render(of, params, spp=16)
+
+    def move_sensor(amount: mi.Float) -> None:
+        turned = mi.Transform4f().translate([amount, 0, 2 * amount]).rotate([0.6, 0.8, 0], 50 * amount)
+        params["sensor.to_world"], params["sensor.x_fov"] = turned @ pose, angle + 10 * amount
+        params.update()
 
     def derivatives() -> tuple[np.ndarray, ...]:
         amount, image = rendered()
@@ -141,9 +147,11 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
         for key, value in leaf.items():
             dr.enable_grad(value)
             params[key] = value
-        params.update()
+        leaf["sensor"] = mi.Float(0)
+        dr.enable_grad(leaf["sensor"])
+        move_sensor(leaf["sensor"])
         dr.backward(dr.sum(mi.render(of, params, spp=16) * mi.TensorXf(weight), axis=None))
-        gradients = [dr.grad(value).numpy() for value in leaf.values()]
+        gradients = [np.array(dr.grad(value)) for value in leaf.values()]
         amount, again = rendered()
         dr.forward(amount)
         tangent = dr.grad(again).numpy()

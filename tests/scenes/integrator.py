@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -106,42 +107,52 @@ TANGENT_TOLERANCE = 5e-3  # relative L2; observed 8e-5 … 3e-3
 
 
 def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
-    """Forward mode against central differences of mi.render, and reverse mode against forward mode."""
-    rng = np.random.default_rng(3)
+    """Derivatives of mi.render with respect to a parameter; see `check_image_derivatives`."""
     params = mi.traverse(of)
     base = params[key].numpy().copy()  # a view: the parameter is about to be overwritten in place
-    v = (rng.uniform(0.5, 1, base.shape) * rng.choice([-1, 1], base.shape)).astype(np.float32)
 
-    def at(t: object) -> mi.TensorXf:
-        params[key] = mi.TensorXf(base) + t * mi.TensorXf(v)
+    def rendered(values: mi.TensorXf) -> mi.TensorXf:
+        params[key] = values
         params.update()
         return mi.render(of, params, spp=spp)
 
+    check_image_derivatives(rendered, base, key)
+
+
+def check_image_derivatives(rendered: Callable[[Any], mi.TensorXf], base: np.ndarray, name: str) -> None:
+    """Forward mode against central differences of images, and reverse mode against forward mode.
+
+    `rendered` returns the image for a tensor of values like `base`.
+    """
+    rng = np.random.default_rng(3)
+    v = (rng.uniform(0.5, 1, base.shape) * rng.choice([-1, 1], base.shape)).astype(np.float32)
+
+    def at(t: object) -> mi.TensorXf:
+        return rendered(mi.TensorXf(base) + t * mi.TensorXf(v))
+
     t = mi.Float(0)
     dr.enable_grad(t)
-    rendered = at(t)
+    image = at(t)
     dr.set_grad(t, 1)
-    tangent = dr.forward_to(rendered).numpy()
+    tangent = dr.forward_to(image).numpy()
     errors = []
     for step in STEPS:
         before, middle, after = (at(mi.Float(t)).numpy().astype(np.float64) for t in (-step, 0, step))
         left, right = (middle - before) / step, (after - middle) / step
         difference, seen = (left + right) / 2, np.any(middle != 0, axis=2)
         typical = np.sqrt(np.mean(difference[seen] ** 2))
-        assert typical > 1e-3, f"{key}: no influence on the image"
+        assert typical > 1e-3, f"{name}: no influence on the image"
         smooth = np.all(np.abs(right - left) < JUMP * (typical + np.abs(difference)), axis=2)
         if np.mean(~smooth[seen]) <= MAX_LEFT_OUT:
             error = np.linalg.norm((tangent - difference)[smooth])
             errors.append(error / np.linalg.norm(difference[smooth]))
-    assert errors, f"{key}: too many jumps at every step"
-    assert min(errors) < TANGENT_TOLERANCE, f"{key}: {min(errors):.1e} from central differences"
+    assert errors, f"{name}: too many jumps at every step"
+    assert min(errors) < TANGENT_TOLERANCE, f"{name}: {min(errors):.1e} from central differences"
 
     leaf = mi.TensorXf(base)
     dr.enable_grad(leaf)
-    params[key] = leaf
-    params.update()
     weight = rng.normal(size=tangent.shape).astype(np.float32)
-    dr.backward(dr.sum(mi.render(of, params, spp=spp) * mi.TensorXf(weight), axis=None))
+    dr.backward(dr.sum(rendered(leaf) * mi.TensorXf(weight), axis=None))
     reverse, forward = np.sum(dr.grad(leaf).numpy() * v), np.sum(weight * tangent)
     assert abs(reverse - forward) < 1e-5 * np.linalg.norm(weight) * np.linalg.norm(tangent)
 

@@ -1,0 +1,264 @@
+"""Derivatives of mi.render with respect to a sensor's `to_world` and `x_fov`; poses found by descent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.stability import exact
+from benchmarks.stability.cases import HEIGHT, WIDTH, Case, camera, catalogue, plain
+from mi_refgs.kernels.device import upload, upload_tensor
+from mi_refgs.occlusion.mesh import write_mesh
+from mi_refgs.reference import image as oracle
+from mi_refgs.reference.camera import PinholeCamera, ray_slopes
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.init import from_points
+from tests.helpers import unit
+from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotation_of
+from tests.scenes.integrator import (
+    check_image_derivatives,
+    image,
+    integrator,
+    open_scene,
+    plane_mesh,
+    scene,
+    sensor,
+)
+
+POSE, ANGLE = "sensor.to_world", "sensor.x_fov"
+FOV = 45.0  # degrees
+START = np.array([0.06, -0.1, 0.08, 0.04, 0.06, -0.02, 0.03], np.float32)
+"""Where derivatives are taken: a motion, and the relative change of the field of view."""
+
+
+def transform(motion: mi.Float) -> mi.Transform4f:
+    """The rigid motion of `moved_pose`, under AD."""
+    rotation, translation = rotation_of(motion)
+    rows = [x for i in range(3) for x in (*(rotation[i, j] for j in range(3)), mi.Float(0))]
+    turned = mi.Transform4f(mi.Matrix4f(*rows, 0, 0, 0, 1))
+    centre = mi.Vector3f(CENTRE)
+    return mi.Transform4f().translate(centre + translation) @ turned @ mi.Transform4f().translate(-centre)
+
+
+@dataclass
+class Moved:
+    """A scene whose sensor has another pose and field of view, by (7,) numbers under AD."""
+
+    of: mi.Scene
+
+    def __post_init__(self) -> None:
+        self.params = mi.traverse(self.of)
+        self.start = mi.Transform4f(self.params[POSE])
+        self.angle = float(self.params[ANGLE][0])
+
+    def image(self, values: mi.Float, **arguments: Any) -> mi.TensorXf:
+        self.params[POSE] = transform(values) @ self.start
+        self.params[ANGLE] = self.angle * (1 + dr.gather(mi.Float, values, dr.opaque(mi.UInt32, 6)))
+        self.params.update()
+        return mi.render(self.of, self.params, **arguments)
+
+
+# ---------------- against float64 ----------------
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A case in the plugin and in the float64 reference."""
+
+    case: Case
+    folder: Path
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The pose that START moves to that of the case."""
+        away = np.linalg.inv(moved_pose(np.eye(4), START[:6].astype(np.float64)))
+        return np.asarray((away @ self.case.camera.to_world).astype(np.float32), np.float64)
+
+    @cached_property
+    def materials(self) -> tuple[str, ...]:
+        return () if self.case.reflectance == "radiance" else ("albedo", "roughness")
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        return exact.product_order(self.case, np.arange(WIDTH * HEIGHT))
+
+    @cached_property
+    def scene(self) -> Moved:
+        case, options = self.case, {}
+        if case.mesh is not None:
+            options["mesh"] = str(self.folder / "mesh.ply")
+            write_mesh(self.folder / "mesh.ply", case.mesh())
+        aovs = ",".join(f"{name}:{name}" for name in ("normal", "depth", *self.materials))
+        chosen = {"shade_at": case.at, "reflectance": case.reflectance, "diffuse": case.diffuse}
+        inner = integrator(case.raw, light=upload_tensor(case.light), aovs=aovs, **chosen, **options)
+        film = {"width": WIDTH, "height": HEIGHT, "pixel_format": "rgba"}
+        eye = sensor(film=film, to_world=mi.ScalarTransform4f(self.start), fov=FOV / (1 + START[6]))
+        return Moved(mi.load_dict({"type": "scene", "integrator": inner, "sensor": eye}))
+
+    def camera(self, values: np.ndarray) -> PinholeCamera:
+        focal = -0.5 * WIDTH / np.tan(np.radians(FOV / (1 + float(START[6])) * (1 + values[6])) / 2)
+        pose = moved_pose(self.start, values[:6])
+        return replace(self.case.camera, fx=focal, fy=focal, to_world=pose)
+
+    def planes(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Channels (H, W, C) as the plugin has them, and where a declared discontinuity is near."""
+        eye, pixels = self.camera(values), np.arange(WIDTH * HEIGHT)
+        found = oracle.render(exact.scene_of(replace(self.case, camera=eye), pixels, self.order))
+        maps = found.maps
+        ray = np.linalg.norm(ray_slopes(eye, pixels % WIDTH + 0.5, pixels // WIDTH + 0.5), axis=0)
+        seen = maps["alpha"].ravel() > 1e-3
+        normal = maps["normal"] / np.where(seen, np.linalg.norm(maps["normal"], axis=1), 1)[:, None]
+        depth = (maps["depth"].ravel() - 0.01) * ray
+        parts = [maps["radiance"], maps["alpha"], normal, depth, *(maps[name] for name in self.materials)]
+        table = np.concatenate([part.reshape(len(pixels), -1) for part in parts], axis=1)
+        return np.where(seen[:, None], table, 0), found.band | ~seen
+
+
+def gaussians() -> Case:
+    case = plain("sh", at="surfel", reflectance="radiance", camera=camera())
+    raw = {name: case.raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
+    return replace(case, raw=raw | {"scale": np.concatenate([raw["scale"], raw["scale"][:, :1] - 1], 1)})
+
+
+CASES = {
+    "deferred": plain("deferred"),
+    "deferred, irradiance": plain("irradiance", diffuse="irradiance"),
+    "forward": plain("forward", at="surfel", diffuse="irradiance"),
+    "SH colour": plain("sh", at="surfel", reflectance="radiance"),
+    "3D Gaussians": gaussians(),
+    "occlusion": next(case for case in catalogue() if case.name == "two plates"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives_are_those_of_float64(name: str, tmp_path: Path) -> None:
+    """Both modes, of radiance, alpha and AOVs, with respect to motions and the field of view."""
+    pair = Pair(CASES[name].rounded(), tmp_path)
+    exact_image, band = pair.planes(START.astype(np.float64))
+    found = pair.scene.image(mi.Float(START), spp=1).numpy().reshape(exact_image.shape)
+    np.testing.assert_allclose(found[~band], exact_image[~band], atol=2e-4 * np.abs(exact_image).max())
+    rng = np.random.default_rng(7)
+    weight = rng.normal(size=exact_image.shape) / np.abs(exact_image).max(axis=0)
+    weight[band] = 0
+
+    def total(leaf: mi.Float) -> mi.Float:
+        return dr.sum(pair.scene.image(leaf, spp=1).array * upload(weight.astype(np.float32).ravel()))
+
+    def define(values: np.ndarray) -> float:
+        return float(np.sum(weight * pair.planes(values)[0]))
+
+    require_slopes(total, define, START)
+
+
+# ---------------- against differences of images ----------------
+
+CROP = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
+AOVS = "nn:normal,d:depth,a:albedo"
+
+
+@pytest.mark.parametrize("kind", ["deferred", "occlusion", "antialias", "open", "crop", "forward"])
+def test_derivatives_are_those_of_differences(kind: str, tmp_path: Path) -> None:
+    """Of supersampled images and their AOVs."""
+    options: dict[str, Any] = {
+        "occlusion": {"mesh": plane_mesh(tmp_path), "visibility_rays": 2},
+        "antialias": {"antialias": True},
+        "forward": {"shade_at": "surfel", "diffuse": "irradiance"},
+    }
+    make = open_scene if kind == "open" else scene
+    eye = sensor(film=CROP if kind == "crop" else {})
+    moved = Moved(make(eye, aovs=AOVS, **options.get(kind, {})))
+
+    def rendered(values: mi.TensorXf) -> mi.TensorXf:
+        return moved.image(values.array, spp=4 if kind != "antialias" else 1)
+
+    check_image_derivatives(rendered, np.zeros(7, np.float32), kind)
+
+
+def test_gradients_together_are_those_alone(tmp_path: Path) -> None:
+    """Of the sensor, surfels and light in one backward pass; of a sensor that the image is not of: none."""
+    inner = integrator(aovs=AOVS)
+    other = sensor(to_world=mi.ScalarTransform4f().look_at([-1, 3, 1], [0, 0, 0], [0, 0, 1]))
+    of = mi.load_dict({"type": "scene", "integrator": inner, "sensor": sensor(), "other": other})
+    params = mi.traverse(of)
+    keys = ["integrator.position", "integrator.light", "integrator.roughness"]
+    base = {key: params[key].numpy().copy() for key in keys}
+    start = {name: mi.Transform4f(params[f"{name}.to_world"]) for name in ("sensor", "other")}
+    weight = mi.TensorXf(np.random.default_rng(1).normal(size=image(of).shape).astype(np.float32))
+
+    def gradients(*chosen: str) -> dict[str, np.ndarray]:
+        leaves: dict[str, Any] = {key: mi.TensorXf(values) for key, values in base.items()}
+        leaves |= {name: mi.Float(np.zeros(6, np.float32)) for name in start}
+        for name in chosen:
+            dr.enable_grad(leaves[name])
+        for key in keys:
+            params[key] = leaves[key]
+        for name, pose in start.items():
+            params[f"{name}.to_world"] = transform(leaves[name]) @ pose
+        params.update()
+        dr.backward(dr.sum(mi.render(of, params, sensor=1, spp=1) * weight, axis=None))
+        return {name: np.array(dr.ravel(dr.grad(leaves[name]))) for name in chosen}
+
+    together = gradients(*keys, "sensor", "other")
+    assert not together.pop("sensor").any()
+    for name, found in together.items():
+        [alone] = gradients(name).values()
+        np.testing.assert_allclose(found, alone, atol=1e-5 * np.abs(alone).max(), err_msg=name)
+        assert np.abs(alone).max() > 0
+
+
+def test_only_rigid_changes_have_derivatives() -> None:
+    """The gradient of a matrix is a rotation's and a translation's: that of scale and shear is zero."""
+    moved = Moved(scene())
+    leaf = mi.Matrix4f(moved.start.matrix)
+    dr.enable_grad(leaf)
+    moved.params[POSE] = mi.Transform4f(leaf)
+    moved.params.update()
+    dr.backward(dr.sum(mi.render(moved.of, moved.params, spp=1), axis=None))
+    gradient, pose = (np.array(x, np.float64).reshape(4, 4) for x in (dr.grad(leaf), leaf))
+    symmetric = gradient[:3, :3] @ pose[:3, :3].T
+    np.testing.assert_allclose(symmetric + symmetric.T, 0, atol=1e-5 * np.abs(gradient).max())
+    assert np.abs(gradient[:3, 3]).max() > 0.1 and not gradient[3].any()
+
+
+def test_sensor_without_gradients_changes_nothing() -> None:
+    """The camera is the same object; images that are not rendered by mi.render never have derivatives."""
+    moved = Moved(scene())
+    eye, leaf = moved.of.sensors()[0], mi.Float(START)
+    camera = Camera.from_sensor(eye)
+    assert camera.attached(eye) is camera
+    dr.enable_grad(leaf)
+    assert dr.grad_enabled(moved.image(leaf, spp=1)) and camera.attached(eye).motion is not None
+    assert not dr.grad_enabled(moved.of.integrator().render(moved.of, 0, spp=1))
+
+
+# ---------------- poses that are found ----------------
+
+
+def test_wrong_pose_is_recovered() -> None:
+    """By descent through mi.render, from 3° and 4.6 % of the distance away."""
+    rng = np.random.default_rng(0)
+    points = unit(rng.normal(size=(400, 3)))
+    spots = 0.5 + 0.5 * np.sin(6 * points)
+    ball = from_points(points, points, spots, rng=rng, opacity=0.99, metallic=0.1, roughness=0.3)
+    eye = sensor(film={"width": 24, "height": 24})
+    moved = Moved(scene(eye, ball.to_numpy()))
+    target = mi.render(moved.of, spp=1)
+    opt = mi.ad.Adam(lr=1e-2)
+    opt["motion"] = mi.Float([0.03, -0.03, 0.03, 0.1, -0.1, 0.1])
+    for step in range(120):
+        opt.set_learning_rate(1e-2 * 0.97**step)
+        image = moved.image(dr.concat([opt["motion"], mi.Float(0)]), spp=1)
+        dr.backward(dr.mean(dr.square(image - target), axis=None))
+        opt.step()
+    found, true = (np.array(x.matrix, np.float64).reshape(4, 4) for x in (moved.params[POSE], moved.start))
+    turn = Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).magnitude()
+    assert np.degrees(turn) < 0.1
+    assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 2e-3 * np.linalg.norm(true[:3, 3])
