@@ -289,7 +289,7 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
     # Radiance, premultiplied.
     light = scene.light
     if scene.near is not None:
-        light = scene.light_at(camera.origin + buffer.depth * ray)
+        light = scene.light_at(camera.along(ray, buffer.depth))
     shaded_at = partial(shade, light=light, shading=shading)
     if shading.antialias:
         # Traced radiance exists only where the pixel's own ray is blocked: the rest would have none.

@@ -193,6 +193,11 @@ class Camera:
         vector = (mi.Vector3f(point) - mi.Vector3f(self.origin)) - self.origin_rest
         return vector if self.motion is None else vector - self._motion(3, vector)
 
+    def along(self, ray: Vector3f, distance: Float) -> Point3f:
+        """Point in the world at a distance along each of the camera's rays, in lengths of the ray."""
+        vector = distance * ray
+        return self.origin + (vector if self.motion is None else vector + self._motion(3, vector))
+
     def to_camera(self, point: Point3f) -> Vector3f:
         """World point to camera frame."""
         return self.rotate_to_camera(self.towards(point))
