@@ -112,7 +112,7 @@ def is_done(path: Path, build: str) -> bool:
 
 def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
     """Measure a part, and print how long it took; returns whether that succeeded."""
-    begin, work = time.monotonic(), folder / "work" if options.small else ROOT / "runs" / "all"
+    begin, work = time.monotonic(), folder / "work" if options.small else Path("runs", "all")
     words = part.module.format(data=options.data, work=work, run=work / commit() / RING.name / "run").split()
     words += (part.small or "").split() if options.small else []
     has_page = part.name in pages.TEMPLATES
@@ -121,7 +121,7 @@ def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
 
     def measure() -> dict[str, Any]:
         if part.name in GROUPS:
-            return group(part.name, Workplace(work, options.data, options.small))
+            return group(part.name, Workplace(ROOT / work, options.data, options.small))
         done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
         if done.returncode:
             raise InputError(f"python -m {' '.join(words)}: exit code {done.returncode}; see above")

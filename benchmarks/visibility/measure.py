@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
             "surfels": setup.surfels.count,
         }
     return {
-        "settings": vars(settings),
+        "settings": vars(settings) | {"meshes": [Path(name).name for name in settings.meshes]},
         "scenes": facts,
         "rows": rows,
         "curve": curve,
