@@ -67,7 +67,7 @@ PARTS = (
     Part("soak", 25, "benchmarks.survival soak", "--steps 1000"),
     Part(
         "frontier",
-        55,
+        75,
         "benchmarks.frontier {data}/chair_400 {work}/data/mirror_ring --methods ref_gaussian auto "
         "--presets quick --surfels 20000 --iterations 500 1000 --threads 1",
     ),

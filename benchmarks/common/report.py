@@ -137,7 +137,12 @@ def write_reports(
 
 
 def values_of(result: dict[str, Any], page: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:
-    """Return tables and numbers of a result by name: those of `page`, its settings, its build and time."""
+    """Return tables and numbers of a result by name: those of `page`, its settings, its build and time.
+
+    Raises InputError for a result without a build.
+    """
+    if "build" not in result:
+        raise InputError("--json: build: missing; the result is of an earlier version, measure it again")
     build = result["build"] | {"build": text_of(result["build"])}
     build["load"] = "{:.1f} before and {:.1f} after".format(*result["build"]["load"])
     minutes = {"minutes": f"{result['seconds'] / 60:.1f}"}
