@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def is_done(path: Path, build: str) -> bool:
     """Whether a data file is of this build."""
-    return is_file(path) and read_json(path)["build"]["commit"] == build != "unknown"
+    return is_file(path) and read_json(path)["build"]["commit"] == build
 
 
 def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:

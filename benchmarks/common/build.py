@@ -76,7 +76,8 @@ def merged(builds: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def text_of(build: dict[str, Any]) -> str:
     """Return commit, machine, load and date in words."""
-    name = build["commit"].partition("+")[0] + ("" if build["clean"] else " with changes")
+    last, changed, _ = build["commit"].partition("+")
+    name = f"{last} with changes" if changed else last
     load = "load {:.1f} before and {:.1f} after".format(*build["load"])
     return f"commit {name}, {build['cpu']}, {build['cores']} cores, {load}, {build['date']}"
 
