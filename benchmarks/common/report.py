@@ -1,13 +1,9 @@
-"""Options of the command line, results on disk (CSV, JSON), Markdown tables and pages."""
+"""Options of the command line, Markdown tables and pages."""
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
-import json
 import math
-import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,10 +14,10 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
 import mitsuba as mi  # isort: skip
 
+from benchmarks.common.build import RESULTS, recorded, text_of, write_result
 from benchmarks.common.view import ROOT
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import write_bytes
-from mi_refgs.kernels import device
+from mi_refgs.io.files import read_json, write_bytes
 
 Row = dict[str, Any]
 
@@ -38,25 +34,10 @@ def where(rows: Iterable[Row], **values: Any) -> list[Row]:
     return [row for row in rows if fits(row)]
 
 
-def machine() -> dict[str, Any]:
-    """What the times were taken on, and how busy it is: the load average of the last minute."""
-    return device.machine() | {"variant": mi.variant(), "load": f"{os.getloadavg()[0]:.1f}"}
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a file atomically, and make its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, text.encode())
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """One line a row, columns in the order of the first row; None is empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-    write_text(path, text.getvalue())
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -121,7 +102,7 @@ def make_parser(
     mi.set_log_level(mi.LogLevel.Error)
     parser = plain_parser(name, description)
     parser.set_defaults(settings=page)
-    parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and runs/")
+    parser.add_argument("-o", "--output", type=Path, help="folder; without it docs/ and benchmarks/results/")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write page and images of this earlier run")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     if small is not None:
@@ -137,25 +118,38 @@ def write_reports(
     plot: Callable[[dict[str, Any], Path], Any],
     page: Callable[[dict[str, Any]], dict[str, Any]],
 ) -> int:
-    """Measure, or read `options.json`; write JSON, CSV (of "rows") and page. The exit code: 2 for bad input.
+    """Measure, or read `options.json`; write JSON and page. The exit code: 2 for bad input.
 
     `plot` writes its images of the result to a folder; `page` returns what the template page.md of the
-    benchmark leaves open: tables and numbers by name. The machine, the
-    settings and the run's minutes are added.
+    benchmark leaves open: tables and numbers by name.
     """
-    folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", ROOT / "runs")
+    folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", RESULTS)
     try:
-        result = json.loads(options.json.read_text(encoding="utf-8")) if options.json else measure()
-        write_text(data / f"{name}.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
-        write_csv(data / f"{name}.csv", result["rows"])
+        result = read_json(options.json) if options.json else recorded(measure)
+        result = write_result(data / f"{name}.json", result)
         plot(result, folder / "images")
-        values = result["machine"] | result.get("settings", {}) | page(result)
-        values["minutes"] = f"{result['seconds'] / 60:.1f}"
-        template = (ROOT / "benchmarks" / name / "page.md").read_text(encoding="utf-8")
-        text = re.sub(r"\{\{(\w+)\}\}", lambda found: str(values[found[1]]), template)
-        write_text(folder / f"{name}.md", text)
+        write_text(folder / f"{name}.md", page_text(name, values_of(result, page)))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
     print(folder / f"{name}.md")
     return 0
+
+
+def values_of(result: dict[str, Any], page: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:
+    """Return tables and numbers of a result by name: those of `page`, its settings, its build and time.
+
+    Raises InputError for a result without a build.
+    """
+    if "build" not in result:
+        raise InputError("--json: build: missing; the result is of an earlier version, measure it again")
+    build = result["build"] | {"build": text_of(result["build"])}
+    build["load"] = "{:.1f} before and {:.1f} after".format(*result["build"]["load"])
+    minutes = {"minutes": f"{result['seconds'] / 60:.1f}"}
+    return build | minutes | result.get("settings", {}) | page(result)
+
+
+def page_text(name: str, values: Mapping[str, Any]) -> str:
+    """Return the page of a benchmark: its template with values."""
+    template = (ROOT / "benchmarks" / name / "page.md").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: str(values[found[1]]), template)

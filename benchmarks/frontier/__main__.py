@@ -2,14 +2,14 @@
 
     python -m benchmarks.frontier chair scenes/mirror_ring.xml     data sets, or scenes that are path-traced
     python -m benchmarks.frontier chair --seeds 0 1 --threads 1 -o out
-    python -m benchmarks.frontier --json runs/frontier.json        the page and the plot again
+    python -m benchmarks.frontier --json FILE                  the page and the plot of an earlier result
 
 Every combination of the options is a cell, and so is every shipped preset: one fit in a process of its own.
 Every eighth training view is a validation view, which is not fitted but scored at full size. The file of a
 cell in --cells is written atomically, and an interrupted run continues; results of other data, code or
 machines are not used.
-Writes frontier.md, images/frontier.png, frontier.csv and frontier.json; without -o, the page and its plot go
-to docs/ and the two others to runs/.
+Writes frontier.md, images/frontier.png and frontier.json; without -o, the page and its plot go
+to docs/ and the JSON to benchmarks/results/.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
 import drjit as dr  # isort: skip
 
-from benchmarks.common.report import Row, machine, make_parser, write_reports
+from benchmarks.common.report import Row, make_parser, write_reports
 from benchmarks.common.view import ROOT
 from benchmarks.frontier.cells import Axes, Cell, Store
 from benchmarks.frontier.fit import measure
@@ -88,7 +88,6 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
         raise InputError(f"DATA: no cell has a result; the first: {failed[0]['failed']}" if failed else
                          "DATA: no cells; give --presets, or --surfels and --iterations")  # fmt: skip
     return {
-        "machine": machine(),
         "version": __version__,
         "code": store.code,
         "rows": rows,

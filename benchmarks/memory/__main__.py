@@ -4,7 +4,8 @@
     python -m benchmarks.memory --all   from all of them
 
 Each cell is a process of its own. Those that are predicted to need more than LIMIT are left out, and said so.
-Writes memory.md, memory.csv and memory.json; without -o, the page goes to docs/ and the two others to runs/.
+Writes memory.md and memory.json; without -o, the page to docs/ and the JSON to
+benchmarks/results/.
 """
 
 from __future__ import annotations
@@ -13,10 +14,9 @@ import contextlib
 import itertools
 import subprocess
 import sys
-import time
 from typing import Any
 
-from benchmarks.common.report import machine, make_parser, table, write_reports
+from benchmarks.common.report import make_parser, table, write_reports
 from benchmarks.common.timing import in_fresh_process
 from benchmarks.memory import cell
 from mi_refgs.kernels import memory
@@ -93,13 +93,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def run() -> dict[str, Any]:
-        start = time.perf_counter()
         rows = []
         for one in cells(options.all):
             rows.append(measured(*one))
             if not options.quiet:
                 print(rows[-1], file=sys.stderr, flush=True)
-        return {"machine": machine(), "rows": rows, "seconds": time.perf_counter() - start}
+        return {"rows": rows}
 
     return write_reports("memory", options, run, lambda *_: None, page)
 

@@ -4,8 +4,8 @@
     python -m benchmarks.splatting --scene runs/glossy the same, with the surfels of a fitted scene
     python -m benchmarks.splatting --small -o out      a small instance, below a minute
 
-Writes splatting.md, images/splatting_*.png, splatting.csv and splatting.json to the output folder; without
--o, the page and its images go to docs/ and the two others to runs/.
+Writes splatting.md, images/splatting_*.png and splatting.json to the output folder; without
+-o, the page and its images go to docs/ and the JSON to benchmarks/results/.
 """
 
 from __future__ import annotations

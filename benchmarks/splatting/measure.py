@@ -8,7 +8,6 @@ lower bound of the time of any renderer of these surfels.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 from scipy.optimize import nnls
 from tqdm import tqdm
 
-from benchmarks.common import report, timing
+from benchmarks.common import timing
 from benchmarks.common.fits import make_trainer, sphere_data
 from benchmarks.common.timing import once
 from benchmarks.splatting import process
@@ -136,7 +135,6 @@ Row = dict[str, Any]
 
 def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
     """Everything that the page shows."""
-    begin = time.perf_counter()
 
     def shown(items: Iterable[Any], name: str) -> Iterable[Any]:
         return tqdm(list(items), desc=name, disable=quiet)
@@ -158,9 +156,8 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
     ]
     dr.flush_malloc_cache()
     memory = [process.measure("memory", one) for one in shown(settings.memory, "memory")]
-    result = {
+    return {
         "settings": asdict(settings),
-        "machine": report.machine(),
         "peaks": peaks,
         "rows": rows,
         "cost": plane(spheres, "both_ms", COST) if len(spheres) > len(COST) + 1 else None,
@@ -171,7 +168,6 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         "compile": process.measure_compile(settings.compiled),
         "step": step_times(*settings.step, settings.steps),
     }
-    return result | {"seconds": time.perf_counter() - begin}
 
 
 STEP_SECONDS = 1.0

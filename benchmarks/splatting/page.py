@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import figures
-from benchmarks.common.report import number, percent, table
+from benchmarks.common.report import number, percent, table, where
 from benchmarks.splatting.measure import CLASSES, COST, FLOPS, MEMORY, PHASES
 
 CASE = "surfels, image"
@@ -33,6 +33,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     """By name in page.md."""
     rows, peaks = result["rows"], result["peaks"]
     ratios = [row["volprim_both_ms"] / row["both_ms"] for row in rows if row["volprim_both_ms"]]
+    typical = [*where(rows, surfels=50_000, size=512, spread=1.5), *rows][0]
     return {
         "times": table([CASE, *TIMES], [[label(row), *map(number, _times(row))] for row in rows]),
         "phases": table([CASE, *PHASES], [[label(row), *map(number, _phases(row))] for row in rows]),
@@ -44,6 +45,10 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
         ),
         "compile": table(["kernel cache", "forward, ms", "f. + backward, ms"], _compile(result["compile"])),
         "steps": _steps(result["step"]),
+        **{f"step_{name}": number(stage["step_ms"]) for name, stage in result["step"].items()},
+        "brief": _brief(rows, result["errors"]),
+        "typical_ms": number(typical["both_ms"]),
+        "typical_volprim_s": number((typical["volprim_both_ms"] or 0) / 1e3),
         "cost": _sum(result["cost"], "ms", 1, "ns", 1e6, COST),
         "peak": _sum(result["memory_fit"], "MiB", 1 / MIB, "B", 1, MEMORY),
         "least_ratio": number(min(ratios), 2),
@@ -78,6 +83,25 @@ def _times(row: Row) -> list[float | None]:
 
 def _phases(row: Row) -> list[float]:
     return [row[f"{phase.replace(' ', '_')}_ms"] for phase in PHASES]
+
+
+def _brief(rows: list[Row], errors: list[Row]) -> str:
+    """Cases of which volprim and errors were measured, too."""
+    names = ("surfels", "size", "spread")
+    wrong = {tuple(row[name] for name in names): row for row in errors}
+    both = [(row, wrong.get(tuple(row[name] for name in names))) for row in rows if row["volprim_both_ms"]]
+    lines = [
+        [
+            label(row),
+            *(f"{number(row[key])} ms" for key in ("both_ms", "volprim_both_ms")),
+            *_errors(found)[1:2],
+        ]
+        for row, found in both
+        if found is not None
+    ]
+    return table(
+        [CASE, "ours, 16 channels", "`volprim_rf_basic`, colour only", "largest error of the image"], lines
+    )
 
 
 WORK = (

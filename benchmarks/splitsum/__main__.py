@@ -4,8 +4,8 @@
     python -m benchmarks.splitsum --small -o out       a small instance, below a minute
     python -m benchmarks.splitsum --envmap sky.exr --shape sphere -o out   your light beside the built-in ones
 
-Writes splitsum.md, images/splitsum_*.png, splitsum.csv and splitsum.json to the output folder; without -o,
-the page and its images go to docs/ and the two others to runs/.
+Writes splitsum.md, images/splitsum_*.png and splitsum.json to the output folder; without -o,
+the page and its images go to docs/ and the JSON to benchmarks/results/.
 """
 
 from __future__ import annotations

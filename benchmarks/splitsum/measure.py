@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.common import errors, report, timing
+from benchmarks.common import errors, timing
 from benchmarks.common.errors import CLEAR
 from benchmarks.common.report import Row, where
 from benchmarks.common.setup import path_tracer
@@ -134,7 +133,6 @@ class Run:
 
 def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     """Run it all; what comes back is the JSON report."""
-    begin = time.perf_counter()
     lights = [make_light(name, settings.truth_height) for name in settings.lights]
     run, budgets, surfel_budgets = Run(settings), [], []
     materials = [(r, m) for r in settings.roughness for m in settings.metallic]
@@ -157,9 +155,7 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
             if name == budget.SHAPE:
                 surfel_budgets.append(budget.surfel_budget(setup))
     return {
-        "machine": report.machine(),
         "settings": vars(settings),
-        "seconds": time.perf_counter() - begin,
         "frequencies": {light.name: light.frequency() for light in lights},
         "pixels": {setup.name: setup.points.count for setup in stages},
         "rows": [row | {"ms_per_mpx": time_of(run.times, row)} for row in run.rows],

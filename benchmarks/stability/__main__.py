@@ -4,15 +4,14 @@
     python -m benchmarks.stability --quick -o out      without large cases, fits, the method's own error
     python -m benchmarks.stability --only light -o out cases whose name contains a word; repeatable
 
-Writes stability.md, stability.csv and stability.json to the output folder; without -o, the page goes to docs/
-and the two others to runs/. The exit code is 1 if a case fails.
+Writes stability.md and stability.json to the output folder; without -o, the page to docs/ and
+the JSON to benchmarks/results/. The exit code is 1 if a case fails.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +19,6 @@ import drjit as dr
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.common import report
 from benchmarks.common.fits import make_trainer, sphere_data
 from benchmarks.common.report import make_parser, table, write_reports
 from benchmarks.stability import bias, response
@@ -100,7 +98,6 @@ def fit(name: str) -> dict[str, Any]:
 
 def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = False) -> dict[str, Any]:
     """Measure everything on the page; `only`: cases whose name contains one of these words."""
-    begin = time.perf_counter()
     words = only or [""]
     cases = [case for case in catalogue() if case.quick or not quick]
     chosen = [case for case in cases if any(word in case.name for word in words)]
@@ -108,13 +105,13 @@ def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = Fa
     for case in tqdm(chosen, desc="cases", disable=quiet):
         rows.append(_finite(measure_case(case, floors=case.quick).record()))
         dr.flush_malloc_cache()  # an image of 4096² leaves gigabytes
-    result: dict[str, Any] = {"machine": report.machine(), "rows": rows}
+    result: dict[str, Any] = {"rows": rows}
     result |= {name: [] for name in ("curve", "losses", "fits", "rules", "gradient")}
     if not only:
         result |= {name: [_finite(row) for row in found] for name, found in response.measure().items()}
     if not (only or quick):
         result |= bias.measure() | {"fits": [fit(name) for name in FITS]}
-    return result | {"seconds": time.perf_counter() - begin}
+    return result
 
 
 def _finite(row: dict[str, Any]) -> dict[str, Any]:

@@ -86,7 +86,7 @@ class Row:
         return "ill-conditioned: " + ", ".join(ill) if ill else "within limits"
 
     def record(self) -> dict[str, Any]:
-        """For CSV and JSON: one level."""
+        """For JSON: one level."""
         gradient = max(self.gradient_floor.values(), default=0.0)
         flat = {"case": self.name, "image": self.image, "maps": self.maps, "ulp_image": self.image_floor}
         flat |= {"ulp_gradient": gradient, "non_finite": self.non_finite, "kept": self.kept}

@@ -4,8 +4,8 @@
     python -m benchmarks.visibility --small -o out        a small instance, below a minute
     python -m benchmarks.visibility --mesh bob.obj -o out your closed mesh beside the built-in scenes
 
-Writes visibility.md, images/visibility_*.png, visibility.csv and visibility.json to the output folder;
-without -o, the page and its image go to docs/ and the two others to runs/.
+Writes visibility.md, images/visibility_*.png and visibility.json to the output folder;
+without -o, the page and its image go to docs/ and the JSON to benchmarks/results/.
 """
 
 from __future__ import annotations

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.common import errors, report, timing
+from benchmarks.common import errors, timing
 from benchmarks.common import montecarlo as mc
 from benchmarks.visibility.budget import budgets
 from benchmarks.visibility.cases import Rule, Settings, make_scene, rules
@@ -21,7 +21,6 @@ DEPTHS = {"direct": 2, "bounce": 3, "full": 12}
 
 def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     """Run it all; what comes back is the JSON report."""
-    begin = time.perf_counter()
     scenes = [make_scene(name, settings.detail) for name in (*settings.scenes, *settings.meshes)]
     rows: list[dict[str, Any]] = []
     curve: list[dict[str, Any]] = []
@@ -44,9 +43,7 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
             "surfels": setup.surfels.count,
         }
     return {
-        "machine": report.machine(),
-        "settings": vars(settings),
-        "seconds": time.perf_counter() - begin,
+        "settings": vars(settings) | {"meshes": [Path(name).name for name in settings.meshes]},
         "scenes": facts,
         "rows": rows,
         "curve": curve,

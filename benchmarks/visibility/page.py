@@ -71,6 +71,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
     s, budgets = result["settings"], above_noise(result["budgets"])
     mirror = where(result["rows"], depth="full", method=MIRROR)
     none = where(result["rows"], depth="full", rays=0)
+    frame = _summary(where(result["tradeoffs"], time="frame_ms"))
     return {
         "scenes": table(
             ["scene", "pixels", "triangles", "surfels"],
@@ -80,6 +81,7 @@ def page(result: dict[str, Any]) -> dict[str, Any]:
             ["by the time of", "smaller in", "median ratio", "least", "most"],
             [[WHAT[key], *_summary(where(result["tradeoffs"], time=key))] for key in TIMES],
         ),
+        **dict(zip(("smaller", "median", "least", "most"), frame, strict=True)),
         "gains": _gains(result["tradeoffs"]),
         "limits": _limits(result),
         "rules": "\n\n".join(_rules(result, scene) for scene in result["scenes"]),

@@ -89,5 +89,5 @@ def summary() -> list[str]:
     for path in sorted(folder().glob("speed-*.json")):
         with contextlib.suppress(InputError, KeyError, TypeError):
             threads[read_json(path)["subject"]["threads"]] += 1
-    found = [f"{count} measured with {number} threads" for number, count in threads.items()]
+    found = [f"{count} measured with {n} thread{'s' * (n != 1)}" for n, count in threads.items()]
     return [*found, f"in {folder()}, which may be removed to measure them anew"] if found else []

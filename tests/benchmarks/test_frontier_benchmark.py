@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.common.build import recorded
 from benchmarks.common.report import Row
 from benchmarks.frontier import __main__ as frontier
 from benchmarks.frontier import cells, fit, page
@@ -334,8 +335,8 @@ def test_page_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     """From stored data; every table gives the sizes of images."""
     rows = [row(None, *point) for point in POINTS] + [row("quick", 35, 24.5), row("standard", 70, 27.0)]
     rows += [found | {"data": "cubes", "normal_mae_deg": 12.34} for found in rows]
-    machine = {name: "x" for name in ("threads", "cpu", "mitsuba", "drjit", "variant")}
-    result = {"machine": machine, "rows": rows, "failed": [], "seconds": 90.0}
+    build = recorded(dict)["build"]
+    result = {"build": build, "rows": rows, "failed": [], "seconds": 90.0}
     stored = tmp_path / "frontier.json"
     stored.write_text(json.dumps(result | {"version": "0.1.0", "code": "0123456789abcdef"}))
     assert frontier.main(["--json", str(stored), "-o", str(tmp_path / "out")]) == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -48,8 +47,7 @@ def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
     assert not re.search(r"\bnan\b|\binf\b|\bNone\b", text)
     links = re.findall(r"\]\((images/splatting_\w+\.png)\)", text)
     assert len(links) == 2 and all((folder / link).stat().st_size > 10_000 for link in links)
-    with (folder / "splatting.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(result["rows"]) == 4
+    assert len(result["rows"]) == 4
     for row in result["rows"]:
         assert page.label(row) in text
 

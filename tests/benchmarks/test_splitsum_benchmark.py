@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from pathlib import Path
@@ -48,11 +47,7 @@ def test_reports_are_written(folder: Path, result: dict[str, Any]) -> None:
     for name in ("pareto", "lights", "trust", "speedup", "budget"):
         assert f"](images/splitsum_{name}.png)" in page
         assert (folder / "images" / f"splitsum_{name}.png").stat().st_size > 10_000
-    with (folder / "splitsum.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(result["rows"])
-    for row in rows:
-        assert float(row["relmse"]) >= 0 and float(row["mape"]) >= 0
+    assert all(row["relmse"] >= 0 and row["mape"] >= 0 for row in result["rows"])
     split = cases(result, "split_sum")
     settings = result["settings"]
     assert len(split) == math.prod(len(settings[k]) for k in ("shapes", "lights", "roughness", "metallic"))

@@ -75,5 +75,5 @@ def test_doctor_lists_measured_speeds(
     for threads in (1, 2):
         cost_model.kept({"threads": threads}, lambda: cost_model.Speed({"all": [1.0, 2.0]}, 0.0, 0.0))
     text = doctor.text(report | {"speeds": cost_model.summary()})
-    assert "1 measured with 1 threads" in text and "1 measured with 2 threads" in text
+    assert "1 measured with 1 thread;" in text and "1 measured with 2 threads" in text
     assert f"in {tmp_path}, which may be removed to measure them anew" in text

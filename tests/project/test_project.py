@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,31 @@ def test_changelog_has_this_version_first() -> None:
     headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert all(re.fullmatch(r"\d+\.\d+\.\d+ \((unreleased|\d{4}-\d\d-\d\d)\)", text) for text in headings)
     assert headings[0].split()[0] == mi_refgs.__version__
+
+
+def test_release_date_is_cited_once_there_is_one() -> None:
+    dates = re.findall(r"^## \S+ \((.*)\)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    released = read(ROOT / "CITATION.cff").get("date-released")
+    assert str(released) == dates[0] or (released is None and dates[0] == "unreleased")
+
+
+def test_authors_are_the_same_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert read(ROOT / "CITATION.cff")["authors"] == project["authors"] == [{"name": "mi_refgs contributors"}]
+
+
+def test_licences_of_assets_are_listed() -> None:
+    """Every file that is not text is in the table of docs/releasing.md."""
+    text = (ROOT / "docs" / "releasing.md").read_text(encoding="utf-8").partition("## Licences")[2]
+    listed = {
+        path
+        for glob in re.findall(r"`([\w/]+/\*+[.\w]*)`", text)
+        for path in ROOT.glob(glob + "/*" * glob.endswith("**"))
+    }
+    kinds = {".exr", ".ply", ".png", ".webp", ".jpg", ".svg", ".npz", ".npy", ".hdr", ".obj", ".glb"}
+    folders = ("mi_refgs", "benchmarks", "scenes", "variants", "docs", "tests")
+    assets = {path for name in folders for path in (ROOT / name).rglob("*") if path.suffix in kinds}
+    assert len(assets) > 40 and not assets - listed
 
 
 def test_hosted_checks_are_those_of_ci() -> None:

@@ -1,0 +1,145 @@
+"""Measure everything that the pages show, one part after the other; leave the machine alone meanwhile.
+
+    python -m benchmarks.all --data FOLDER --list       the parts, their times, and what is measured already
+    python -m benchmarks.all --data FOLDER              measure what is missing, and write the pages
+    python -m benchmarks.all --only splatting images
+    python -m benchmarks.all --small -o out             small instances; no page is written
+
+FOLDER contains chair_400/ (NeRF-Synthetic), meshes/bob_tri.obj and lat-long maps in envmaps/. A part whose
+result, benchmarks/results/NAME.json, is of the present commit is not repeated, nor is a finished fit: the
+same command continues an interrupted run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from benchmarks import pages
+from benchmarks.common.build import RESULTS, commit, recorded, write_result
+from benchmarks.common.report import plain_parser
+from benchmarks.common.view import ROOT
+from benchmarks.fits.measure import Workplace, group
+from benchmarks.fits.plan import GROUPS, RING
+from mi_refgs.errors import InputError
+from mi_refgs.io.files import is_file, read_json
+
+
+@dataclass(frozen=True)
+class Part:
+    """A data file, and the module with arguments that measures it.
+
+    {data} is --data, {work} the folder of the fits, {run} that of RING. A module with a page of its own
+    writes its file itself; others print JSON, which becomes `result`. Groups of fits have no module.
+    """
+
+    name: str
+    minutes: float  # on an idle machine with two cores
+    module: str = ""
+    small: str | None = None  # arguments of a small instance
+
+
+TRACING = {"images": 28, "relighting": 10, "methods": 4, "photographs": 14}
+"""Minutes of path tracing in a group."""
+FITS = [
+    Part(name, round(sum(fit.minutes for fit in fits)) + TRACING.get(name, 0), small="")
+    for name, fits in GROUPS.items()
+]
+PARTS = (
+    Part("splatting", 5, "benchmarks.splatting", "--small"),
+    Part("splitsum", 9, "benchmarks.splitsum", "--small"),
+    Part("visibility", 4, "benchmarks.visibility --mesh {data}/meshes/bob_tri.obj", "--small"),
+    Part("stability", 15, "benchmarks.stability", "--quick --only light"),
+    Part("memory", 6, "benchmarks.memory"),
+    *FITS,
+    Part("frames", 2, "mi_refgs profile {run} --json"),
+    Part("viewer", 9, "benchmarks.viewer {run} --minutes 7"),
+    Part("capture", 1, "benchmarks.capture {work}/data/tabletop_captured {work}/data/tabletop_colmap --json"),
+    Part("kill", 10, "benchmarks.survival kill", "--times 2"),
+    Part("soak", 25, "benchmarks.survival soak", "--steps 1000"),
+    Part(
+        "frontier",
+        75,
+        "benchmarks.frontier {data}/chair_400 {work}/data/mirror_ring --methods ref_gaussian auto "
+        "--presets quick --surfels 20000 --iterations 500 1000 --threads 1",
+    ),
+)
+"""In this order: those with {run} or {work} need groups of fits."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure; exit code 1 if a part fails, 2 for bad input."""
+    parser = plain_parser("all", __doc__)
+    names = [part.name for part in PARTS]
+    parser.add_argument("--list", action="store_true", help="print the plan only")
+    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help="these parts")
+    parser.add_argument("--small", action="store_true", help="small instances; requires -o")
+    parser.add_argument("-o", "--output", type=Path, help="folder of the results of --small")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="data that is not made here")
+    options = parser.parse_args(arguments)
+    if options.small != bool(options.output):
+        parser.error("--small: -o: give both, or none of the two")
+    mi.set_variant("llvm_ad_rgb")
+    folder, build = (options.output or RESULTS).resolve(), commit()
+    chosen = [part for part in PARTS if part.name in options.only]
+    if options.small:
+        chosen = [part for part in chosen if part.small is not None]
+    left = [part for part in chosen if not is_done(folder / f"{part.name}.json", build)]
+    for part in chosen:
+        print(f"{part.name:<15}{part.minutes:>4} min  {'to do' if part in left else 'done'}")
+    print(f"{'in all':<15}{sum(part.minutes for part in left):>4} min, commit {build}", flush=True)
+    if options.list:
+        return 0
+    failed = [part.name for part in left if not run(part, options, folder)]
+    if failed:
+        print(f"failed: {' '.join(failed)}; the same command repeats only them", file=sys.stderr)
+    code = 0 if options.small else pages.main([])
+    return code or int(bool(failed))
+
+
+def is_done(path: Path, build: str) -> bool:
+    """Whether a data file is of this build."""
+    return is_file(path) and read_json(path)["build"]["commit"] == build
+
+
+def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
+    """Measure a part, and print how long it took; returns whether that succeeded."""
+    begin, work = time.monotonic(), folder / "work" if options.small else Path("runs", "all")
+    words = part.module.format(data=options.data, work=work, run=work / commit() / RING.name / "run").split()
+    words += (part.small or "").split() if options.small else []
+    has_page = part.name in pages.TEMPLATES
+    if has_page:
+        words += ["--quiet", *(["-o", str(folder)] if options.small else [])]
+
+    def measure() -> dict[str, Any]:
+        if part.name in GROUPS:
+            return group(part.name, Workplace(ROOT / work, options.data, options.small))
+        done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        if done.returncode:
+            raise InputError(f"python -m {' '.join(words)}: exit code {done.returncode}; see above")
+        return {} if has_page else {"result": json.loads(done.stdout)}
+
+    print(f"{part.name} …", flush=True)
+    try:
+        if options.data is None and "{data}" in part.module and not options.small:
+            raise InputError(f"{part.name}: --data: missing; give the folder")
+        found = recorded(measure)
+        if not has_page:
+            write_result(folder / f"{part.name}.json", found)
+    except InputError as error:
+        print(error, file=sys.stderr, flush=True)
+        return False
+    print(f"{part.name}: {(time.monotonic() - begin) / 60:.1f} min", flush=True)
+    return True
+
+
+if __name__ == "__main__":
+    sys.exit(main())
