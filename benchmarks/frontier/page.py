@@ -158,8 +158,8 @@ def _seeds(fewest: int) -> str:
     """Sentence about what differences mean."""
     if fewest < 2:
         return (
-            f"Some settings were run with one seed only: a difference below {CLEAR} dB is then not clear, and which "
-            "of the two settings is on the front may be chance."
+            f"Some settings were run with one seed only: a difference below {CLEAR} dB is then not clear, "
+            "and which of the two settings is on the front may be chance."
         )
     return (
         f"Every setting was run with at least {fewest} seeds. A difference below {CLEAR} dB is clear if "
