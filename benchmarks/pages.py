@@ -27,7 +27,7 @@ from benchmarks.fits.plan import GROUPS
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 
-PAGES = ("README.md", "docs/accuracy.md", "docs/speed.md", "docs/photographs.md")
+PAGES = ("README.md", "docs/accuracy.md", "docs/speed.md", "docs/photographs_in_detail.md")
 TEMPLATES = tuple(sorted(path.parent.name for path in (ROOT / "benchmarks").glob("*/page.md")))
 """Benchmarks that write docs/NAME.md as a whole."""
 STALE = build.RESULTS / "stale.toml"

@@ -158,11 +158,11 @@ def _seeds(fewest: int) -> str:
     """Sentence about what differences mean."""
     if fewest < 2:
         return (
-            f"One seed only was run of some settings: their differences below {CLEAR} dB are not clear, "
-            "and which of two such settings is on the front may be chance."
+            f"Some settings were run with one seed only: a difference below {CLEAR} dB is then not clear, "
+            "and which of the two settings is on the front may be chance."
         )
     return (
-        f"Every setting was run with at least {fewest} seeds. A difference below {CLEAR} dB is clear where "
+        f"Every setting was run with at least {fewest} seeds. A difference below {CLEAR} dB is clear if "
         "it is larger than the standard deviation over seeds of both settings."
     )
 

@@ -25,7 +25,7 @@ LIGHT_KEY = 0.36
 CELL_MIN = 128
 """Pixels: smaller images are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
 MARGIN = 4  # pixels between images
-TITLE_HEIGHT = 16  # pixels above each image, enough for Pillow's built-in font
+TITLE_SIZES = range(22, 9, -1)  # pixels: the first size at which all titles of a line fit is used
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
 
@@ -162,13 +162,17 @@ def contact_sheet(
 
 def _line(cells: dict[str, np.ndarray]) -> np.ndarray:
     """Place titled images side by side."""
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageDraw, ImageFont
 
+    fonts = [ImageFont.load_default(size) for size in TITLE_SIZES]
+    fits = (f for f in fonts if all(f.getlength(text) < cells[text].shape[1] - 2 for text in cells))
+    font = next(fits, fonts[-1])
+    title_height = sum(font.getmetrics()) + 2
     height = max(image.shape[0] for image in cells.values())
     columns = []
     for text, image in cells.items():
-        label = Image.new("RGB", (image.shape[1], TITLE_HEIGHT), "white")
-        ImageDraw.Draw(label).text((2, 2), text, fill="black")
+        label = Image.new("RGB", (image.shape[1], title_height), "white")
+        ImageDraw.Draw(label).text((2, 0), text, fill="black", font=font)
         title = np.asarray(label, dtype=np.float32) / 255
         columns.append(_padded(np.concatenate([title, image]), height - image.shape[0], MARGIN))
     return np.concatenate(columns, axis=1)[:, :-MARGIN]

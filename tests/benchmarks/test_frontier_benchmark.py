@@ -342,7 +342,7 @@ def test_page_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert frontier.main(["--json", str(stored), "-o", str(tmp_path / "out")]) == 0
     text = (tmp_path / "out" / "frontier.md").read_text()
     assert not re.search(r"\{\{|\}\}|\bnan\b|\binf\b|\bNone\b", text)
-    assert "2 of 4 fits with a preset are on the Pareto front" in text and "One seed only" in text
+    assert "2 of 4 fits with a preset are on the Pareto front" in text and "one seed only" in text
     assert text.count("validation views of 20 × 30 pixels, 7 fitted views") == 2
     tables = [part for part in text.split("\n\n") if part.startswith("| ")]
     assert len(tables) == 3 and all("| 10 × 15 |" in line for t in tables for line in t.splitlines()[2:])
@@ -357,4 +357,4 @@ def test_page_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 def test_page_with_seeds_does_not_claim_one() -> None:
     rows = [row(None, *point, seed=seed) for point in POINTS for seed in (0, 1)]
     assert "at least 2 seeds" in text_of(rows)["seeds"]
-    assert "One seed only" in text_of(rows[:-1])["seeds"]
+    assert "one seed only" in text_of(rows[:-1])["seeds"]

@@ -32,8 +32,8 @@ def outputs(path: Path) -> list[Any]:
     return [output for cell in cells(path) for output in cell.outputs]
 
 
-def test_there_are_four_tutorials() -> None:
-    assert len(NOTEBOOKS) == 4
+def test_there_are_six_tutorials() -> None:
+    assert len(NOTEBOOKS) == 6
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
