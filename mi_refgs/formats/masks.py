@@ -33,8 +33,8 @@ def write(
 
     Readers take them from the folder `masks` beside the images: that of `images/a.jpg` is `masks/a.jpg.png`,
     that of `train/r_0.png` is `masks/train/r_0.png.png`. A mask has the size and the lens of its image file.
-    Of the surfels that `where` selects (an expression, or in Python surfels (N,) bool), the opacity is at
-    least 0.5 there; all others occlude them. Without `where` these are all that are not background.
+    There, the opacity of the surfels that `where` selects is at least 0.5; all others occlude them. `where`
+    is an expression, or in Python surfels (N,) bool; without it, all but the background are selected.
     """
     if isinstance(where, str):
         if not where and trained.surroundings is None:

@@ -46,7 +46,9 @@ class PaintingPanel:
             )
             gui.add_markdown(f"{text}the camera and correct other sides.")
             low, high, first = BRUSHES
-            self.brush = gui.add_slider("Brush", low, high, low, first, hint="Of a click, window heights.")
+            self.brush = gui.add_slider(
+                "Brush", low, high, low, first, hint="Radius of a click, in heights of the window."
+            )
             undo = gui.add_button("Undo")
             hint = f"Its folder {MASKS} gets them; empty: the data set."
             self.folder = gui.add_text("Masks into", "", hint=hint)

@@ -31,7 +31,7 @@ POINTS = 49
 """Points of each."""
 COLOUR = (120, 230, 120)
 THICKNESS = 1.5
-"""Of its lines, pixels."""
+"""Width of its lines, pixels."""
 
 
 class RegionPanel:
@@ -149,7 +149,7 @@ def wireframe(region: Region) -> np.ndarray:
         curves.append(circle[:, :1] * across + circle[:, 1:2] * (0, 0, 1))
     found = [_segments(centre + region.radius * np.array(curves), region)]
 
-    # Of each plane the circle in which the sphere ends, and a grid of lines inside.
+    # For each plane, the circle in which the sphere ends, and a grid of lines inside.
     for plane in region.planes:
         normal = np.array(plane[:3])
         below = float(normal @ centre) - plane[3]
