@@ -26,6 +26,7 @@ MAX_ZOOM = 2.0  # factor of the focal length beyond which less than a quarter of
 ZOOM_STEPS = 30  # bisections: 1e-9 of the focal length, 1e-6 pixels
 GRID = 65
 """Points along each side at which a zoom is checked; between them edges bend by less than 0.01 pixels."""
+NEWTON_STEPS = 10  # of the inverse: a fisheye's, 60° off its axis, is right to 1e-6 after 6
 ROWS = 64  # rows of an image whose source pixels are computed together
 _lock = Lock()
 
@@ -70,6 +71,18 @@ class Lens:
             x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x),
             y * factor + 2 * p2 * x * y + p1 * (square + 2 * y * y),
         )
+
+    def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Image points (x, y) at unit distance that the lens distorts to these; any where there are none."""
+        wanted_x, wanted_y, step = x, y, 1e-4
+        with np.errstate(all="ignore"):
+            for _ in range(NEWTON_STEPS):
+                u, v = self.distort(x, y)
+                (ux, vx), (uy, vy) = self.distort(x + step, y), self.distort(x, y + step)
+                a, b, c, d = (z / step for z in (ux - u, uy - u, vx - v, vy - v))
+                off_x, off_y, det = wanted_x - u, wanted_y - v, a * d - b * c
+                x, y = x + (d * off_x - b * off_y) / det, y + (a * off_y - c * off_x) / det
+        return x, y
 
     def _series(self, square: np.ndarray) -> np.ndarray:
         total = np.zeros_like(square)

@@ -15,9 +15,11 @@ from mi_refgs.editing.options import Selection
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, read_mask
 from mi_refgs.kernels.device import upload
+from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera, splat
+from mi_refgs.types import Float
 
 PAINTED_SHARE = 0.5
 """Part of a surfel's blended weight that must lie in the painted pixels."""
@@ -64,9 +66,19 @@ def select(
 def painted(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> np.ndarray:
     """Return the surfels (N,) bool that painted pixels, `mask` (H, W) bool, show in a view.
 
-    More than PAINTED_SHARE of a surfel's blended weight lies in the mask, and its centre is at most
-    BEHIND_SIZES behind the mean depth of those pixels, so that a far side that shines through is left out.
-    The background occludes the object. Raises InputError for a mask of another size.
+    More than PAINTED_SHARE of a surfel's `shown_weights` lies in the mask. Raises InputError for a mask of
+    another size.
+    """
+    every, inside = shown_weights(scene, camera, mask)
+    return inside > PAINTED_SHARE * every
+
+
+def shown_weights(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the blended weight of each surfel in a view, and that in painted pixels: (N,), pixels.
+
+    It is 0 if the centre is more than BEHIND_SIZES behind the mean depth of the surfel's pixels, so that a
+    far side that shines through is left out. The background occludes the object. Raises InputError for a
+    mask of another size.
     """
     _require_size("--mask", mask, camera)
     own, background = scene.surfels.detach(), scene.surroundings
@@ -87,7 +99,20 @@ def painted(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> np.ndarray
     centre = np.array(camera.to_camera(own.position()).z, np.float64)
     pixel_depth = far / np.maximum(every, np.finfo(np.float64).tiny)
     behind = centre - pixel_depth > BEHIND_SIZES * SurfelValues(scene)["size"]
-    return (every > 0) & (inside > PAINTED_SHARE * every) & ~behind
+    return np.where(behind, 0, every), np.where(behind, 0, inside)
+
+
+def selected_alpha(scene: TrainedScene, chosen: np.ndarray, camera: Camera) -> Float:
+    """Opacity (H·W,) of the chosen surfels (N,) bool in a view; all other surfels occlude them."""
+    own, background = scene.surfels.detach(), scene.surroundings
+    table = own if background is None else own.followed_by(background.surfels.detach())
+    feature = upload(np.pad(chosen.astype(np.float32), (0, table.count - own.count)))
+
+    def blended(part: Camera) -> Float:
+        return splat(table, [feature], part).features[0]
+
+    with dr.suspend_grad():
+        return in_passes(blended, camera, surfels=table.count)
 
 
 def read_painted(path: Path, camera: Camera) -> np.ndarray:

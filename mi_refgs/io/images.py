@@ -205,7 +205,8 @@ def to_8_bits(image: np.ndarray) -> np.ndarray:
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write an (H, W, 3 or 4) image, sRGB-encoded values in [0, 1] (clipped), as 8-bit PNG, atomically.
+    """Write an (H, W), grey, or (H, W, 3 or 4) image, sRGB-encoded values in [0, 1] (clipped), as 8-bit PNG,
+    atomically.
 
     Raises InputError if the path cannot be written.
     """

@@ -17,7 +17,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 import msgspec
@@ -50,6 +50,7 @@ TEXT = 1000
 Coordinate = Annotated[float, msgspec.Meta(ge=-COORDINATE, le=COORDINATE)]
 Distance = Annotated[float, msgspec.Meta(ge=0, le=COORDINATE)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
+Quaternion = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Side = Annotated[int, msgspec.Meta(ge=1, le=SIDE)]
 Text = Annotated[str, msgspec.Meta(max_length=TEXT)]
 Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -58,7 +59,7 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 class Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage"):
     """The camera of a page."""
 
-    wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+    wxyz: Quaternion
     position: Point
     look_at: Point
     up_direction: Point
@@ -102,7 +103,26 @@ class Part(msgspec.Struct, tag_field="type", tag="FileTransferPart"):
     content: bytes
 
 
-DECODER = msgspec.msgpack.Decoder(Camera | Update | Start | Part)
+class Gizmo(msgspec.Struct, tag_field="type", tag="TransformControlsUpdateMessage"):
+    """A pose to which a gizmo of the page was moved."""
+
+    name: Text
+    wxyz: Quaternion
+    position: Point
+    owner: Text = ""
+
+
+class Pointer(msgspec.Struct, tag_field="type", tag="ScenePointerMessage"):
+    """A click or a dragged rectangle, with a key for which viser's server has a function."""
+
+    event_type: Literal["click", "rect-select"]
+    screen_pos: list[tuple[Coordinate, Coordinate]]  # a point, or two corners; 0 … 1 on the canvas
+    modifier: Literal["shift", "cmd/ctrl"]
+    ray_origin: Point | None = None  # of a click
+    ray_direction: Point | None = None
+
+
+DECODER = msgspec.msgpack.Decoder(Camera | Update | Start | Part | Gizmo | Pointer)
 VALUES: dict[str, Callable[[Any, Any], bool]] = {
     "GuiButtonHandle": lambda control, value: isinstance(value, bool),
     "GuiButtonGroupHandle": lambda control, value: value in control.options,
@@ -179,8 +199,14 @@ class Guard:
             return False
         match message:
             case Camera():
-                is_rotation = 0.5 < math.hypot(*message.wxyz) < 2
-                return is_rotation and message.image_width * message.image_height <= PIXELS
+                return is_rotation(message.wxyz) and message.image_width * message.image_height <= PIXELS
+            case Gizmo():
+                return is_rotation(message.wxyz)
+            case Pointer(event_type="click"):
+                is_ray = message.ray_origin is not None and message.ray_direction is not None
+                return is_ray and len(message.screen_pos) == 1
+            case Pointer():
+                return len(message.screen_pos) == 2
             case Update():
                 control = self.controls.get(message.uuid)
                 allowed = VALUES.get(type(control).__name__)
@@ -218,6 +244,11 @@ class Guard:
         if upload.next_part == upload.parts:
             self._upload = None
         return True
+
+
+def is_rotation(wxyz: Quaternion) -> bool:
+    """Whether a quaternion can be normalised to a rotation."""
+    return 0.5 < math.hypot(*wxyz) < 2
 
 
 def split(path: str) -> tuple[str, str]:

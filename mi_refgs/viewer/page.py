@@ -94,6 +94,7 @@ class Page:
         self.status: Callable[[str], None] = lambda text: None
         self.look_changed: Callable[[], None] = lambda: None
         self.moved: Callable[[int, Pose], None] = lambda number, pose: None
+        self._overlays: set[str] = set()  # that are displayed and need depth
         self._told = 0.0  # time of the last status
 
         # An image for a page that has been closed meanwhile is no problem.
@@ -194,6 +195,12 @@ class Page:
         """Set fields of the display options."""
         self.loop.display(**fields)
         self.look_changed()
+
+    def overlay(self, name: str, visible: bool) -> None:
+        """Say whether an overlay, which the image occludes, is displayed."""
+        if visible != (name in self._overlays):
+            self._overlays ^= {name}
+            self.set(overlays=bool(self._overlays))
 
     def complain(self, message: str) -> None:
         """Display a sentence about bad input, or about a failure."""

@@ -281,4 +281,4 @@ def add_cameras(page: Page, box: Any) -> None:
                     nodes.append(node)
         for node in nodes:
             node.visible = box.value
-        page.set(overlays=box.value)
+        page.overlay("cameras", box.value)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import Region
+from mi_refgs.editing.selection import selected_alpha
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.runs.relightable import lacking, relightable
@@ -24,10 +25,12 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.tonemap import IMAGE, backdrops_of
-from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
+from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
 
 OUTLIERS = 2.0
 """Percent of the surfels along each axis and side that do not count as the object."""
+TINT, TINT_SHARE = (1.0, 0.3, 0.0), 0.5
+"""Linear colour of highlighted surfels, and its share of theirs."""
 
 Change = Callable[[TrainedScene], TrainedScene]
 """An edit of a scene that keeps number and order of its surfels."""
@@ -74,6 +77,7 @@ class ReconstructionView(ViewerScene):
         self.turn = 0.0  # rotation of the light about z, degrees, counter-clockwise seen from above
         self.environment = scene.light
         self.changes: list[Change] = []
+        self.highlighted: np.ndarray | None = None  # surfels (N,) bool that are displayed in TINT
         self._relightable: TrainedScene | None = None
         self.set_relit(False)
 
@@ -131,6 +135,16 @@ class ReconstructionView(ViewerScene):
         return self.scene.near if self.environment is self.original.light and not self.turn else None
 
     # ---------------- images ----------------
+
+    def draw(self, sample: SampleRequest) -> SampleResult:
+        """See `ViewerScene`; displayed images, but not saved ones, have highlighted surfels in another
+        colour."""
+        drawn = super().draw(sample)
+        if self.highlighted is None or sample.look.what != IMAGE or sample.exact is not None:
+            return drawn
+        share = TINT_SHARE * selected_alpha(self.original, self.highlighted, sample.camera())
+        tinted = [dr.lerp(x, colour, share) for x, colour in zip(drawn.planes[:3], TINT, strict=True)]
+        return drawn._replace(planes=[*tinted, *drawn.planes[3:]])
 
     def frame(self, sample: SampleRequest) -> Frame:
         """See `ViewerScene`; a draft, with ambient shadows that may be outdated, unless it is `settled`."""

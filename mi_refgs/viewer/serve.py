@@ -9,9 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
+from mi_refgs.formats import write
+from mi_refgs.io.files import make_folder
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.export import newest
 from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -21,8 +25,10 @@ from mi_refgs.viewer.comparison import add_comparison
 from mi_refgs.viewer.loop import added
 from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.page import Page
+from mi_refgs.viewer.painting_panel import PaintingPanel, WriteMasks
 from mi_refgs.viewer.panels import MaterialsPanel, add_display, add_light, add_overlays
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.region_panel import RegionPanel
 from mi_refgs.viewer.saving import add_saving
 from mi_refgs.viewer.tonemap import displayed_planes, to_bytes
 from mi_refgs.viewer.viewer_scene import SampleRequest
@@ -52,7 +58,14 @@ def serve_run(
     scene = ReconstructionView(trained, None if some is None else some.region)
     page = Page(scene, found, run.path.resolve().name, address, output or run.path / "views")
     warm_up(page, tell)
-    add_panels(page, scene, trained)
+
+    def write_masks(chosen: np.ndarray, folder: Path | None) -> list[Path]:
+        source = Provenance.of(run).with_data(data)
+        shots, target = source.shots(trained, "test", "train"), folder or source.data or run.path
+        make_folder(target)
+        return write(trained, ["masks"], target, shots, {"where": chosen}, run.path)["masks"]
+
+    add_panels(page, scene, trained, write_masks)
     return page
 
 
@@ -66,7 +79,10 @@ def serve_scene(scene: Any, path: Path, address: tuple[str, int], output: Path |
 
 
 def add_panels(
-    page: Page, scene: ReconstructionView | MitsubaScene, trained: TrainedScene | None = None
+    page: Page,
+    scene: ReconstructionView | MitsubaScene,
+    trained: TrainedScene | None = None,
+    write_masks: WriteMasks | None = None,
 ) -> None:
     """Add all panels that a scene has something for, and accept pages."""
     add_display(page)
@@ -75,6 +91,12 @@ def add_panels(
         MaterialsPanel(page, scene)
     add_overlays(page, trained)
     add_comparison(page)
+    views = page.data.get("train") or page.data.get("test")
+    if views is not None and views.region is not None:
+        RegionPanel(page, views, views.region)
+    if views is not None and write_masks is not None and isinstance(scene, ReconstructionView):
+        if scene.original.surroundings is not None or not views.has_alpha:
+            PaintingPanel(page, scene, views, write_masks)
     add_saving(page)
     page.listen()
 

@@ -68,7 +68,14 @@ def _compare(place: Path) -> list[str]:
     return ["compare", str(place / "data"), "-o", str(place / "out"), *method]
 
 
-BAKED = ("--faces", "100", "--texture", "64")
+NEEDED = {"faces": ("--faces", "100", "--texture", "64"), "where": ("--where", "opacity > 0")}
+
+
+def _options_of(form: str) -> list[str]:
+    """Options by which a format takes little time, and takes this run."""
+    return [text for name, option in NEEDED.items() if name in options_of([form]) for text in option]
+
+
 SEED = "out/runs/data/tiny/seed0"
 CASES = [
     Case("doctor", lambda place: ["doctor", str(place / "data")], ("data",)),
@@ -126,7 +133,7 @@ CASES = [
     *(
         Case(
             "export",
-            _on("export", "--to", name, "-o", "@/out", *(BAKED if "faces" in options_of([name]) else ())),
+            _on("export", "--to", name, "-o", "@/out", *_options_of(name)),
             names=(f"out/{name}{made.suffix}",) if made.suffix else (),
             every=False,
         )

@@ -289,6 +289,52 @@ def test_a_camera_out_of_range_is_dropped(client: Connection) -> None:
     until(lambda: looking.window == (7680, 4320))
 
 
+GIZMO: dict[str, Any] = {
+    "type": "TransformControlsUpdateMessage",
+    **{"name": "/gizmo", "wxyz": (1, 0, 0, 0), "position": (1, 2, 3), "owner": ""},
+}
+CLICK: dict[str, Any] = {
+    "type": "ScenePointerMessage",
+    **{"event_type": "click", "modifier": "shift", "screen_pos": [(0.25, 0.5)]},
+    **{"ray_origin": (0, 0, 0), "ray_direction": (0, 0, 1)},
+}
+
+
+def test_a_moved_gizmo_is_taken_unless_it_is_out_of_range(client: Connection) -> None:
+    gizmo = client.page.server.scene.add_transform_controls("/gizmo", position=(0.0, 0.0, 0.0))
+    for field, value in itertools.product(("name", "wxyz", "position"), HOSTILE):
+        client.send(**GIZMO | {field: value})
+    client.send(**GIZMO | {"wxyz": (0, 0, 0, 0)})
+    client.settle()
+    assert tuple(gizmo.position) == (0, 0, 0)
+    client.send(**GIZMO)
+    until(lambda: tuple(gizmo.position) == (1, 2, 3))
+    gizmo.remove()
+
+
+def test_a_click_and_a_rectangle_are_taken_unless_they_are_malformed(client: Connection) -> None:
+    scene, taken = client.page.server.scene, list[Any]()
+    scene.on_click(modifier="shift")(taken.append)
+    scene.on_rect_select(modifier="shift")(taken.append)
+    rectangle = CLICK | {"event_type": "rect-select", "ray_origin": None, "ray_direction": None}
+    for field, value in itertools.product(set(CLICK) - {"type"}, HOSTILE):
+        client.send(**CLICK | {field: value})
+    for wrong in (
+        *(CLICK | {"ray_origin": None}, CLICK | {"screen_pos": [(0, 0), (1, 1)]}, CLICK | {"screen_pos": []}),
+        *(rectangle | {"screen_pos": [(0, 0)]}, rectangle | {"screen_pos": [(0, 0), (1, math.nan)]}),
+        *(CLICK | {"event_type": "drag"}, CLICK | {"modifier": "alt"}),
+    ):
+        client.send(**wrong)
+    client.settle()
+    assert taken == []
+    client.send(**CLICK)
+    client.send(**rectangle | {"screen_pos": [(0.1, 0.2), (0.3, 0.4)]})
+    until(lambda: len(taken) == 2)
+    assert [*taken[0].screen_pos] == [0.25, 0.5] and [*taken[1].screen_max] == [0.3, 0.4]
+    scene.remove_click_callback()
+    scene.remove_rect_select_callback()
+
+
 def test_bytes_that_are_no_message_are_dropped(client: Connection) -> None:
     nested = b"\x82\xa4type\xb0GuiUpdateMessage\xa7updates\x81\xa5value" + b"\x91" * 100_000
     for raw in (b"", b"\x80", b"\x93\x01", b"\xc1", nested, "text", msgspec.msgpack.encode([1])):
@@ -305,7 +351,9 @@ def test_other_kinds_of_messages_do_not_reach_viser() -> None:
                 taken.add(kind.__name__)
     assert taken == {"ViewerCameraMessage"}  # the others are of controls, of which this has none
     kinds = (guard_module.Update, guard_module.Start, guard_module.Part)
+    kinds = (*kinds, guard_module.Gizmo, guard_module.Pointer)
     tags = ["GuiUpdateMessage", "FileTransferStartUpload", "FileTransferPart"]
+    tags += ["TransformControlsUpdateMessage", "ScenePointerMessage"]
     assert [kind.__struct_config__.tag for kind in kinds] == tags
 
 

@@ -39,7 +39,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.viewer.pose import Pose
 from tests.helpers import ROOT
 from tests.scenes.known import other_sky, with_background
-from tests.scenes.tiny import train_command, write_data, write_method
+from tests.scenes.tiny import train_command, write_data, write_method, write_open_data
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -412,6 +412,45 @@ def test_a_photographed_object_is_displayed_with_background_then_without(
     tab.row("Mesh").first.uncheck(force=True)
     tab.choose("Backdrop", "background")
     tab.returns(before, "the background")
+
+
+@pytest.mark.slow
+def test_the_region_is_saved_and_a_painted_object_is_masked(
+    scene: TrainedScene, known_run: Path, chromium: Any, tmp_path: Path
+) -> None:
+    run, data = shutil.copytree(known_run, tmp_path / "run"), write_open_data(tmp_path / "data")
+    export(with_background(scene, 0.2), run, Pose(np.eye(4), 0.7, 1.0).camera(8, 8))
+    running = Server("view", run, "--data", data, "--port", "0")
+    page = chromium.new_page(viewport=WINDOW)
+    try:
+        tab = Tab(page, running.url)
+        before = tab.still()
+        page.get_by_text("Region of interest", exact=True).click()
+        tab.row("Border").first.evaluate("box => box.click()")
+        tab.differs(before, 0.5, "the border")
+        tab.type("Radius", "0.5")
+        tab.type("Region file", str(data / "region.json"))
+        tab.press("Save region")
+        page.get_by_text("saved").wait_for(timeout=1000 * PATIENCE)
+        assert json.loads((data / "region.json").read_text())["radius"] == pytest.approx(0.5, abs=0.01)
+        tab.row("Border").first.evaluate("box => box.click()")
+        tab.returns(before, "the image without the border")
+        page.get_by_text("Masks", exact=True).click()
+        box = page.locator("canvas").first.bounding_box()
+        page.keyboard.down("Shift")
+        page.mouse.move(box["x"] + 0.05 * box["width"], box["y"] + 0.05 * box["height"])
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"], steps=5)
+        page.mouse.move(box["x"] + 0.95 * box["width"], box["y"] + 0.95 * box["height"], steps=5)
+        page.mouse.up()
+        page.keyboard.up("Shift")
+        tab.differs(before, 2, "the painted ball")
+        tab.press("Write masks")
+        page.get_by_text("wrote 10 masks").wait_for(timeout=1000 * PATIENCE)
+        assert (data / "masks/train/r_7.png.png").is_file() and tab.errors == []
+    finally:
+        page.close()
+        running.stop()
 
 
 @pytest.mark.slow
