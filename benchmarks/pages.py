@@ -65,6 +65,12 @@ def files_of(text: str) -> set[str]:
     return {name for names in found for name in names}
 
 
+def names_of(file: str) -> set[str]:
+    """Return the names in a data file that the markers of PAGES name."""
+    text = "".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES)
+    return {name for first, name, _ in MARKER.findall(text) if first == file}
+
+
 def filled(text: str, folder: Path) -> str:
     """Return a page with the markers filled whose data files are in a folder.
 

@@ -146,6 +146,12 @@ def test_printed_json_becomes_a_data_file(tmp_path: Path) -> None:
     assert pages.filled("<!-- soak.steps -->?<!-- / -->", tmp_path) == "<!-- soak.steps -->1,000<!-- / -->"
 
 
+def test_markers_name_numbers_of_planned_fits() -> None:
+    for group, planned in GROUPS.items():
+        names = {f"{fit.source}_{fit.method}_{key}" for fit in planned for key in fits.NUMBERS}
+        assert pages.names_of(group) <= names | {"table", "budget", "relit_least", "relit_most"}
+
+
 def test_small_run_continues(tmp_path: Path) -> None:
     """A fit; a second call repeats neither a finished part nor a finished fit."""
     command = ("-m", "benchmarks.all", "--small", "-o", tmp_path, "--only", "images")
