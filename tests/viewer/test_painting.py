@@ -106,7 +106,7 @@ def test_the_region_of_a_page_is_displayed_changed_and_saved(page: Page) -> None
     data = page.data["train"]
     panel = RegionPanel(page, data, FITTED)
     panel.update()
-    assert panel.lines is None and not panel.arrows.visible and not page.loop.look.overlays
+    assert not panel.lines and not panel.arrows.visible and not page.loop.look.overlays
     panel.show.value, panel.radius.value, panel.heights[0].value = True, 0.5, 0.1
     panel.arrows.position = np.array([0.0, 0.2, 0.3])
     page.loop.step()

@@ -350,8 +350,8 @@ def test_other_kinds_of_messages_do_not_reach_viser() -> None:
             if guard.admits(None, msgspec.msgpack.encode(fields | {"type": kind.__name__})):
                 taken.add(kind.__name__)
     assert taken == {"ViewerCameraMessage"}  # the others are of controls, of which this has none
-    kinds = (guard_module.Update, guard_module.Start, guard_module.Part)
-    kinds = (*kinds, guard_module.Gizmo, guard_module.Pointer)
+    kinds: list[Any] = [guard_module.Update, guard_module.Start, guard_module.Part]
+    kinds += [guard_module.Gizmo, guard_module.Pointer]
     tags = ["GuiUpdateMessage", "FileTransferStartUpload", "FileTransferPart"]
     tags += ["TransformControlsUpdateMessage", "ScenePointerMessage"]
     assert [kind.__struct_config__.tag for kind in kinds] == tags
