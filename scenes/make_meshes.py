@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
 from skimage import measure
 
 Distance = Callable[[np.ndarray], np.ndarray]
@@ -166,6 +167,79 @@ def jug() -> trimesh.Trimesh:
     return lathe(np.array(profile))
 
 
+def can() -> trimesh.Trimesh:
+    """The metal of a drinks can, whose print is on a cylinder of radius 0.33; from z = -0.6 to 0.6."""
+    profile = [
+        (0, -0.52), (0.18, -0.55), (0.235, -0.598), (0.255, -0.6), (0.275, -0.585), (0.32, -0.53),
+        (0.328, -0.5), (0.328, 0.4), (0.322, 0.44), (0.285, 0.53), (0.277, 0.555), (0.28, 0.58),
+        (0.285, 0.595), (0.275, 0.6), (0.262, 0.59), (0.255, 0.54), (0.24, 0.535), (0.22, 0.55), (0, 0.553),
+    ]  # fmt: skip
+    return lathe(np.array(profile), 64, 60)
+
+
+def placed(
+    mesh: trimesh.Trimesh,
+    move: tuple[float, float, float],
+    size: tuple[float, float, float] = (1, 1, 1),
+    turn: tuple[str, float] = ("x", 0),
+) -> trimesh.Trimesh:
+    """A mesh scaled, turned about an axis by degrees, and moved, with its normals."""
+    rotation = Rotation.from_euler(*turn, degrees=True).as_matrix()
+    normals = np.asarray(mesh.vertex_normals) / size @ rotation.T
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    vertices = np.asarray(mesh.vertices) * size @ rotation.T + move
+    return trimesh.Trimesh(vertices, mesh.faces, vertex_normals=normals, process=False)
+
+
+def ball(subdivisions: int = 2) -> trimesh.Trimesh:
+    """The unit sphere with its exact normals."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.vertices, process=False)
+
+
+def limb(length: float, *radii: float) -> trimesh.Trimesh:
+    """A rounded limb upwards from the origin, of evenly spaced radii."""
+    low, high = radii[0], radii[-1]
+    middle = zip(radii, np.linspace(0.7 * low, length - 0.7 * high, len(radii)), strict=True)
+    ends = [(0, 0), (0.75 * low, 0.2 * low)], [(0.75 * high, length - 0.2 * high), (0, length)]
+    return lathe(np.array([*ends[0], *middle, *ends[1]]), 24, 20)
+
+
+def figure() -> dict[str, trimesh.Trimesh]:
+    """A toy figure of two materials, from z = -0.75 to 0.75, which looks along -y."""
+    leg, arm = limb(0.6, 0.05, 0.072, 0.058, 0.08, 0.07), limb(0.28, 0.038, 0.05, 0.045)
+    torso = [
+        (0, -0.13), (0.09, -0.12), (0.135, -0.06), (0.115, 0.05), (0.14, 0.16), (0.172, 0.29), (0.15, 0.38),
+        (0.07, 0.43), (0, 0.44),
+    ]  # fmt: skip
+    base = [(0, -0.75), (0.22, -0.75), (0.235, -0.735), (0.235, -0.71), (0.22, -0.695), (0, -0.69)]
+    red = [
+        placed(lathe(np.array(torso), 32, 28), (0, 0, 0), (1, 0.68, 1)),
+        placed(ball(3), (0, 0, 0.6), (0.1, 0.115, 0.13)),  # head
+        *(placed(leg, (0.1 * side, 0, -0.68), turn=("y", -3 * side)) for side in (-1, 1)),
+        *(placed(arm, (0.215 * side, 0, 0.1), turn=("y", -5 * side)) for side in (-1, 1)),
+        *(placed(ball(), hand, (0.04,) * 3) for hand in ((-0.222, -0.04, -0.15), (0.205, -0.27, 0.22))),
+    ]
+    silver = [
+        placed(lathe(np.array(base), 40, 18), (0, 0, 0)),
+        placed(torus(0.118, 0.024, 40, 10), (0, 0, 0.03), (1, 0.72, 1.2)),  # belt
+        placed(limb(0.14, 0.055, 0.05, 0.055), (0, 0, 0.4)),  # neck
+        placed(ball(3), (0, -0.03, 0.585), (0.078, 0.1, 0.1)),  # face
+        placed(ball(), (0, 0, 0.66), (0.014, 0.11, 0.09)),  # crest
+        placed(ball(), (0, -0.105, 0.27), (0.05, 0.03, 0.05)),  # badge
+        placed(arm, (-0.22, -0.035, -0.14), turn=("x", 8)),
+        placed(arm, (0.205, -0.25, 0.21), turn=("x", -65)),
+    ]
+    for side in (-1, 1):  # foot, knee, shoulder
+        silver.append(placed(ball(), (0.105 * side, -0.03, -0.66), (0.065, 0.105, 0.05)))
+        silver.append(placed(ball(), (0.085 * side, -0.018, -0.36), (0.055,) * 3))
+        silver.append(placed(ball(), (0.195 * side, 0, 0.36), (0.078,) * 3))
+    return {
+        f"figure_{name}": trimesh.util.concatenate(parts)  # type: ignore[misc]
+        for name, parts in (("red", red), ("silver", silver))
+    }
+
+
 def brick(columns: int, rows: int) -> trimesh.Trimesh:
     """A building brick, open below: walls, a top with studs, tubes between the studs. A stud a unit, z up."""
     wall, height, stud = 0.16, 1.2, (0.3, 0.22)
@@ -198,7 +272,7 @@ def main() -> None:
     target = Path(__file__).parent / "meshes"
     target.mkdir(exist_ok=True)
     meshes = {"torus": torus(0.82, 0.18), "trefoil": trefoil(0.27, 0.16), "rounded_cube": rounded_cube()}
-    meshes |= {"jug": jug(), "handle": torus(0.24, 0.055, 64, 20)}
+    meshes |= {"jug": jug(), "handle": torus(0.24, 0.055, 64, 20), "can": can(), **figure()}
     meshes |= {"hollow_block": surface(hollow_block, 0.75, 30), "shell": surface(shell, 0.95, 38)}
     whole = surface(cup, 0.9, 50)
     centres = whole.triangles_center

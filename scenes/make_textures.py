@@ -1,9 +1,9 @@
-"""Makes scenes/textures/*.png, the printed surfaces of the furnished room: wood, cloth, rug, paper, posters.
+"""Makes scenes/textures/*.png, the printed surfaces of the rooms: wood, cloth, paper, posters, tiles, a can.
 
 Run from the repository root: python scenes/make_textures.py
 
-Every texture is drawn from a seed. None repeats itself, so that images of the room can be matched by what
-they show.
+Every texture is drawn from a seed. None but the tiles repeats itself, so that images of the room can be
+matched by what they show.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 PALETTE = 48
@@ -89,6 +89,40 @@ def paper(rng: np.random.Generator, size: int = 512) -> np.ndarray:
     return base * (0.35 + 0.65 * prints)
 
 
+def tiles(rng: np.random.Generator, size: int = 512, count: int = 4) -> np.ndarray:
+    """Bright tiles of slightly different tones with thin grey grout, which continue at the edges."""
+    rows, columns = np.mgrid[:size, :size]
+    tone = rng.normal(0, 0.012, (count, count, 1)) + rng.normal(0, 0.004, (count, count, 3))
+    colour = np.array([0.90, 0.89, 0.86]) + tone[rows * count // size, columns * count // size]
+    colour += 0.006 * noise(rng, (size, size), (9, 9))[..., None]
+    grout = np.abs(np.stack([rows, columns]) * count / size % 1 - 0.5).max(axis=0) > 0.487
+    return mix(colour, (0.56, 0.54, 0.50), grout.astype(float))
+
+
+def can_label(rng: np.random.Generator, height: int = 256) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and metallic (rows, columns, 3) of a can's wall: metal under ink, none under white."""
+    width = 2 * height
+    rows, columns = np.mgrid[:height, :width]
+    angle, v = columns * 2 * np.pi / width, rows / height
+    colour = mix((0.05, 0.20, 0.55), (0.02, 0.07, 0.30), v)
+    wave = v - 0.55 + 0.14 * np.cos(2 * angle)
+    white = (np.abs(wave) < 0.1).astype(float)
+    colour = mix(colour, (0.85, 0.62, 0.20), (np.abs(wave - 0.16) < 0.025).astype(float))
+    for _ in range(46):  # drops
+        y, x, r = rng.uniform(0.06, 0.94), rng.uniform(0, width), rng.uniform(0.008, 0.03) * height
+        across = (columns - x + width / 2) % width - width / 2
+        colour = mix(colour, (0.55, 0.75, 0.92), 0.8 * np.clip(r - np.hypot(rows - y * height, across), 0, 1))
+    paint = Image.new("L", (width, height))
+    draw = ImageDraw.Draw(paint)
+    for x in (0.25, 0.75):
+        draw.text((x * width, 0.26 * height), "LUMEN", 255, ImageFont.load_default(48), anchor="mm")
+    for i in range(9):  # ingredients
+        top, end = (0.74 + 0.02 * i) * height, (0.50 + 0.06 * rng.random()) * width
+        draw.rectangle((0.45 * width, top, end, top + 0.01 * height - 1), fill=255)
+    white = np.maximum(white, np.asarray(paint) / 255)
+    return mix(colour, (0.88, 0.87, 0.84), white), 1 - np.repeat(white[..., None], 3, axis=-1)
+
+
 def bent(rng: np.random.Generator, image: np.ndarray, reach: float) -> np.ndarray:
     """An image with its lines bent by up to about `reach` pixels."""
     size = image.shape[0]
@@ -114,6 +148,9 @@ def main() -> None:
             mix(rng.uniform(0.05, 0.75, (1, 48, 3)), (0.02, 0.02, 0.02), rng.random((32, 48)) ** 6), 8, 0
         ),
     }
+    rng = np.random.default_rng(8)
+    textures["tiles"] = tiles(rng)
+    textures["can_label"], textures["can_metallic"] = can_label(rng)
     for name, colour in textures.items():
         wide = np.repeat(colour, 6, axis=1) if name == "books" else colour
         image = Image.fromarray((255 * np.clip(wide, 0, 1)).astype(np.uint8))

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import require_file
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -113,13 +114,14 @@ def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
     """Find the data set with test views under this light; return it and the light of its renders, or None.
 
     The light must be the map that `refgs dataset --relight` was given, by the content of the file, or an
-    environment.exr of the data set itself; a rotated light has no ground truth. Raises InputError for such an
-    environment.exr without `world`.
+    environment.exr of the data set itself, unless its images show an object in a room; a rotated light has no
+    ground truth. Raises InputError for such an environment.exr without `world`.
     """
     content = light.path.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     lights = recorded_lights(data / "dataset.json")
-    for folder in (data, *sorted((data / RELIGHT).glob("*"))):
+    own_views = [] if (data / REGION_FILE).is_file() else [data]
+    for folder in (*own_views, *sorted((data / RELIGHT).glob("*"))):
         map_ = folder / "environment.exr"
         if not (map_.is_file() and (folder / "transforms_test.json").is_file()):
             continue

@@ -90,10 +90,10 @@ def relight(
     # The views, and the ground truth under this light.
     provenance = Provenance.of(run).with_data(data)
     views = provenance.views("test") if provenance.has_data else None
-    requested, truth_folder = light, None
+    requested, true_views = light, None
     if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
-        truth_folder, light = known
-    measures = measures_of(protocol, None if truth_folder is None else views)
+        true_views, light = _true_views(provenance.method, known[0], views), known[1]
+    measures = measures_of(protocol, true_views)
 
     # The scene under the new light.
     fitted = write_if_stale(run, provenance.method, provenance.first_camera)
@@ -111,7 +111,7 @@ def relight(
         cameras, kind = turntable_cameras(bare, cameras, turntable, region), "turntable"
 
     # The folder.
-    name = light.path.stem if truth_folder is None else light.path.parent.name
+    name = light.path.stem if true_views is None else light.path.parent.name
     own = f"{name}{light.suffix}"
     output = _own_folder(run, own, requested) if out is None else _output(run, out, requested)
     images = [f"{kind}/{PREFIX[kind]}_{i:03d}.png" for i in range(len(cameras))]
@@ -141,8 +141,8 @@ def relight(
         "samples": samples_per_axis(samples) ** 2,
     } | {"psnr": None, "psnr_scaled": None, "score_reason": reason}
     truth: list[np.ndarray] = []
-    if truth_folder is not None and views is not None:
-        truth = _truth(provenance.method, truth_folder, light.exposure, views)
+    if true_views is not None and views is not None:
+        truth = _truth(true_views, light.exposure)
         result |= score([view.name for view in views.views], ours, truth, background) | {"score_reason": None}
         result["protocols"] = captions(protocol, truth[0].shape[1::-1], relit=True)
         if measures is not None:
@@ -189,17 +189,22 @@ def _prepare(output: OutputFolder, kind: str, images: Sequence[str]) -> None:
     output.claim(*names)
 
 
-def _truth(method: Method, folder: Path, exposure: float, views: Dataset) -> list[np.ndarray]:
-    """Read premultiplied linear RGBA (H, W, 4) of the test views under a light of the data set."""
+def _true_views(method: Method, folder: Path, views: Dataset) -> Dataset:
+    """Read the test views under a light of the data set; raises InputError unless they have its cameras."""
     found = read_dataset(
         folder, "test", downscale=method.data.downscale, background="black", images="exr", truth=False
-    ).views
-    if len(found) != len(views.views) or any(
-        np.abs(a.to_world - b.to_world).max() > 1e-6 for a, b in zip(found, views.views, strict=True)
+    )
+    if len(found.views) != len(views.views) or any(
+        np.abs(a.to_world - b.to_world).max() > 1e-6 for a, b in zip(found.views, views.views, strict=True)
     ):
         raise InputError(f"{folder}: transforms_test.json: not the cameras of {views.path}; make it again")
+    return found
+
+
+def _truth(views: Dataset, exposure: float) -> list[np.ndarray]:
+    """Return premultiplied linear RGBA (H, W, 4) of views."""
     images = []
-    for view in (view.load() for view in found):
+    for view in (view.load() for view in views.views):
         alpha = np.ones_like(view.image[..., 0]) if view.alpha is None else view.alpha
         images.append(np.dstack([view.image * np.float32(2.0**exposure), alpha]))
     return images

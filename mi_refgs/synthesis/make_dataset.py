@@ -14,7 +14,8 @@ A data set folder contains
     train/r_000_roughness.exr  Y: √α of GGX; like albedo and metallic with A = 1 where the BSDF defines it,
                                else 0
     train/r_000_metallic.exr   Y: 0 … 1
-    environment.exr    lat-long radiance of the environment for a Mitsuba `envmap` without `to_world`
+    environment.exr    lat-long radiance of the environment for a Mitsuba `envmap` without `to_world`; in an
+                       open scene the radiance that arrives at the object's centre without the object
     surface.ply        triangles of all shapes, world space
     region.json        only for an open scene: a sphere around the object
     relight/NAME/      the test views under another environment map, a data set with a test split:
@@ -22,14 +23,13 @@ A data set folder contains
     dataset.json       the settings, which decide whether a folder may be resumed; and other environment maps
 
 Maps are 0 off the object. An open scene is an object in its surroundings: images are RGB without alpha, maps,
-materials and surface are those of the object only, and there is no environment.exr, because not only distant
-light arrives at the object.
+materials and surface are those of the object only, and so are relit views, which have alpha.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +46,22 @@ from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.progress import with_bar
 from mi_refgs.synthesis.ground_truth import surface_mesh
 from mi_refgs.synthesis.options import DatasetOptions, LightFile
-from mi_refgs.synthesis.pathtrace import MAPS, Cameras, Tracer, bounding_sphere, environment_image, reach
+from mi_refgs.synthesis.pathtrace import (
+    MAPS,
+    Cameras,
+    Tracer,
+    bounding_sphere,
+    environment_image,
+    incident_image,
+    reach,
+)
 from mi_refgs.synthesis.settings import (
     RELIGHT,
     SURFACE,
     load_scene,
     prepare_folder,
     under_light,
+    without,
 )
 from mi_refgs.synthesis.write_colmap import colmap_output, write_colmap
 
@@ -100,8 +109,6 @@ def make_dataset(
     given = DatasetOptions(**options).checked(scene)
     lights = [relight] if isinstance(relight, str | Path) else relight
     settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
-    if given.objects and others:
-        raise InputError(f"{scene}: --relight: an open scene keeps its emitters; leave it out, or --shapes")
 
     # The scene under each light, and its surface; all input is read before anything is written.
     loaded = load_scene(scene, whole=bool(given.objects))
@@ -112,7 +119,7 @@ def make_dataset(
         vertices, faces = surface_mesh(shapes)
     except InputError as error:
         raise InputError(f"{scene}: {error}") from error
-    relit = [under_light(loaded, other.path) for other in others]
+    relit = [under_light(loaded, other.path, about) for other in others]
 
     # Cameras.
     centre, radius = bounding_sphere(shapes)
@@ -135,7 +142,8 @@ def make_dataset(
     if points is not None:
         write_colmap(points, out, tracer)
     for other, scene_there in zip(others, relit, strict=True):
-        write_views(output, f"{RELIGHT}/{other.name}/", ("test",), Tracer(scene_there, cameras), progress)
+        alone = Tracer(scene_there, replace(cameras, objects=()))
+        write_views(output, f"{RELIGHT}/{other.name}/", ("test",), alone, progress)
     return out
 
 
@@ -198,8 +206,10 @@ def write_views(
 
     # Their content.
     light, height = out / "environment.exr", cameras.options.environment_height
-    known = tracer.scene.environment() is not None and not cameras.objects  # see the head of this file
-    if height and known and not light.exists():
+    if height and cameras.objects and not light.exists():
+        room = without(tracer.scene, cameras.objects)
+        write_exr(light, incident_image(room, cameras.centre, cameras.options))
+    elif height and tracer.scene.environment() is not None and not light.exists():
         write_exr(light, environment_image(tracer.scene, height))
     jobs = [job for split in splits for job in views[split]]
     for name, pose, seed in with_bar(jobs, f"dataset {out.name}", unit="view", disable=not progress):

@@ -46,6 +46,8 @@ class DatasetOptions:
     """distance of cameras from the object's centre, scene units (default: the object fills the image)"""
     elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)
     """elevation of cameras, degrees"""
+    azimuth: Annotated[Range, arg(metavar="LOW HIGH")] = (0.0, 360.0)
+    """azimuth of cameras, degrees from +x, counter-clockwise seen from above; less than 360° before a wall"""
     fov: Annotated[float, arg(metavar="DEG")] = 40.0
     """field of view of the shorter side"""
     fill: Annotated[float, Suppress] = 0.95
@@ -96,6 +98,8 @@ class DatasetOptions:
         need("size", int, lambda *numbers: min(numbers) >= 1, remedy, sides)
         remedy = "give two angles in degrees, -90 < low < high < 90"
         need("elevation", REAL, lambda low, high: -90 < low < high < 90, remedy, 2)
+        remedy = "give two angles in degrees, -360 <= low < high <= low + 360"
+        need("azimuth", REAL, lambda low, high: -360 <= low < high <= low + 360, remedy, 2)
         need("fov", REAL, lambda angle: 0 < angle < 170, "give degrees between 0 and 170")
         need("fill", REAL, lambda fraction: 0 < fraction <= 1, "give a fraction between 0 and 1")
         if self.distance is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis.ground_truth import materials_at
 from mi_refgs.synthesis.options import DatasetOptions
-from mi_refgs.types import Point2f
+from mi_refgs.types import Color3f, Point2f, Vector3f
 
 SAMPLES_PER_LAUNCH = 1 << 24
 """Largest number of paths per launch; the path tracer keeps about 100 bytes for each."""
@@ -58,19 +58,22 @@ def camera_poses(
     distance: tuple[float, float],
     elevation: tuple[float, float],
     rng: np.random.Generator,
+    azimuth: tuple[float, float] = (0.0, 360.0),
 ) -> np.ndarray:
     """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up.
 
     A spherical Fibonacci lattice over the band of elevations (degrees): equal areas, rotated by a random
-    azimuth and jittered by a third of its spacing. Distances from the centre are uniform between the two.
+    azimuth and jittered by a third of its spacing, then compressed into the range of azimuths (degrees).
+    Distances from the centre are uniform between the two.
     """
     low, high = (math.sin(math.radians(e)) for e in elevation)
     jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
     z = low + (high - low) * (np.arange(count) + 0.5 + jitter[:, 0]) / count
     spacing = math.sqrt(2 * math.pi * (high - low) / count)
     ring = np.sqrt(1 - z**2)
-    azimuth = rng.uniform(0, 2 * math.pi) + GOLDEN_ANGLE * np.arange(count) + jitter[:, 1] * spacing / ring
-    outward = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+    turn = rng.uniform(0, 2 * math.pi) + GOLDEN_ANGLE * np.arange(count) + jitter[:, 1] * spacing / ring
+    angle = math.radians(azimuth[0]) + turn % (2 * math.pi) * (azimuth[1] - azimuth[0]) / 360
+    outward = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
     return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
 
 
@@ -90,16 +93,50 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
         # Without the columns that Mitsuba adds on either side for its interpolation.
         texels = np.array(params["data"], dtype=np.float64)[:, 1:-1, :3]
         return (lobe_matrices.resample(texels, height) * np.array(params["scale"])).astype(np.float32)
+
+    def radiance(direction: Vector3f) -> Color3f:
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+        si.wi = -direction
+        return emitter.eval(si)
+
+    return _panorama(radiance, height)
+
+
+def incident_image(scene: Any, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
+    """Path-traced radiance (h, 2 h, 3) that arrives at a point (3,), h = `environment_height`.
+
+    Emitters are visible; the grid is that of `environment_image`.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    integrator = mi.load_dict({"type": "path", "max_depth": options.max_depth})
+    sampler = mi.load_dict({"type": "independent"})
+    passes = max(1, options.spp // ENVIRONMENT_OVERSAMPLING**2)
+    seeds = iter(np.random.SeedSequence(options.seed).generate_state(passes))
+
+    def radiance(direction: Vector3f) -> Color3f:
+        sampler.seed(int(next(seeds)), dr.width(direction))
+        ray = mi.RayDifferential3f(mi.Point3f(*map(float, point)), direction)
+        return integrator.sample(scene, sampler, ray)[0]
+
+    return np.mean([_panorama(radiance, options.environment_height) for _ in range(passes)], axis=0)
+
+
+def _panorama(radiance: Callable[[Vector3f], Color3f], height: int) -> np.ndarray:
+    """Radiance (height, 2·height, 3) by world direction, on the grid of `environment_image`."""
+    import drjit as dr
+    import mitsuba as mi
+
     rows = (height - 1) * ENVIRONMENT_OVERSAMPLING + 1
     columns = 2 * height * ENVIRONMENT_OVERSAMPLING
     index = dr.arange(mi.UInt32, rows * columns)
     phi = (index % columns + 0.5) * (2 * dr.pi / columns)
     theta = (index // columns) * (dr.pi / (rows - 1))
-    si = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
-    si.wi = -mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
+    direction = mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
     # A constant emitter returns one value for all directions.
-    radiance = np.array(emitter.eval(si) + dr.zeros(mi.Float, rows * columns))
-    image = lobe_matrices.resample(radiance.T.reshape(rows, columns, 3), height)
+    found = np.array(radiance(direction) + dr.zeros(mi.Float, rows * columns))
+    image = lobe_matrices.resample(found.T.reshape(rows, columns, 3), height)
     image[[0, -1]] = image[[0, -1]].mean(axis=1, keepdims=True)  # a pole is one point
     return image.astype(np.float32)
 
@@ -127,7 +164,7 @@ class Cameras:
         """
         options, index = self.options, ("train", "test").index(split)
         rng, count = np.random.default_rng([options.seed, index]), options.count(split)
-        poses = camera_poses(count, self.centre, self.distance, options.elevation, rng)
+        poses = camera_poses(count, self.centre, self.distance, options.elevation, rng, options.azimuth)
         streams = (np.random.SeedSequence([options.seed, index, i]) for i in range(count))
         return [(p, int(stream.generate_state(1)[0])) for p, stream in zip(poses, streams, strict=True)]
 

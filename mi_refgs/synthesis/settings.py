@@ -29,7 +29,7 @@ VIEW_FILES = (*OWN_FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in OWN
 """Files of a data set except its settings; overwriting removes them."""
 Z_UP = (1, 0, 0), 90.0
 """Axis and angle in degrees that rotate y of a lat-long map to z, in scenes without an `envmap`."""
-LATER = {"light": "", "light_sha256": "", "height": 0, "objects": [], "distance": [0, 0]}
+LATER = {"light": "", "light_sha256": "", "height": 0, "objects": [], "distance": [0, 0], "azimuth": [0, 360]}
 """Values of settings that records of older versions lack."""
 
 
@@ -52,8 +52,10 @@ def load_scene(scene: Path, whole: bool = False) -> Any:
     return loaded
 
 
-def under_light(scene: Any, light: Path) -> Any:
+def under_light(scene: Any, light: Path, objects: Sequence[Any] = ()) -> Any:
     """The scene with a lat-long map (EXR, HDR) in place of its environment; its other emitters are kept.
+
+    `objects`: shapes that are lit alone, without the other shapes and emitters.
 
     The map is rotated as the scene's own `envmap` is; without one, its y becomes z, which is up. Raises
     InputError for a file that contains no such map.
@@ -66,12 +68,30 @@ def under_light(scene: Any, light: Path) -> Any:
         params = mi.traverse(environment)
         if "data" in params and "to_world" in params:
             turned = mi.ScalarTransform4f(np.array(params["to_world"].matrix, np.float64).reshape(4, 4))
-    radiance = read_radiance(light)
+    environment = {"type": "envmap", "bitmap": mi.Bitmap(read_radiance(light)), "to_world": turned}
+    return _scene_of([*(objects or _all_but(scene, ())), mi.load_dict(environment)])
+
+
+def without(scene: Any, objects: Sequence[Any]) -> Any:
+    """The scene without some of its shapes."""
+    environment = scene.environment()
+    return _scene_of([*_all_but(scene, objects), *([] if environment is None else [environment])])
+
+
+def _all_but(scene: Any, objects: Sequence[Any]) -> list[Any]:
+    """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
+    import mitsuba as mi
+
+    left_out = {shape.id() for shape in objects}
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
     lamps = [lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)]
-    parts = {f"part_{i}": part for i, part in enumerate([*scene.shapes(), *lamps])}
-    environment = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
-    return mi.load_dict({"type": "scene", **parts, "environment": environment})
+    return [*(shape for shape in scene.shapes() if shape.id() not in left_out), *lamps]
+
+
+def _scene_of(parts: Sequence[Any]) -> Any:
+    import mitsuba as mi
+
+    return mi.load_dict({"type": "scene"} | {f"part_{i}": part for i, part in enumerate(parts)})
 
 
 def prepare_folder(

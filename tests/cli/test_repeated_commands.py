@@ -106,6 +106,7 @@ KEPT: dict[str, dict[str, Row]] = {
         "--seed": refuses("--seed", "1"),
         "--max-depth": refuses("--max-depth", "3"),
         "--elevation": refuses("--elevation", "-10", "20"),
+        "--azimuth": refuses("--azimuth", "0", "90"),
         "--fov": refuses("--fov", "30"),
         "--light": refuses("--light", "{light}"),
         "--relight": Shows(("--relight", "{light}"), "relight/sky/transforms_test.json"),

@@ -69,6 +69,14 @@ def test_ground_truth_is_found_by_the_content_of_the_light(known: Path, tmp_path
     refused(lambda: truth_under(NewLight(data / "environment.exr"), data), "add --world")
 
 
+def test_images_of_a_room_are_no_ground_truth_under_its_light(known: Path, tmp_path: Path) -> None:
+    """environment.exr of an open scene: its test views show the room, too."""
+    shutil.copytree(known / "data", tmp_path / "data")
+    (tmp_path / "data" / "region.json").write_text("{}")
+    light = NewLight(tmp_path / "data" / "environment.exr", world=True)
+    assert truth_under(light, tmp_path / "data") is None
+
+
 def test_data_set_may_have_the_name_of_a_light(tmp_path: Path) -> None:
     """The data set's own images are not those under that light."""
     data, light = tmp_path / "dusk", tmp_path / "dusk.exr"

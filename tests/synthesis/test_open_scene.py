@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.cli import main
 from mi_refgs.data.region import read_region
+from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import read_png
 from mi_refgs.synthesis.make_dataset import REGION_MARGIN, make_dataset
 from tests.helpers import read_loaded, refused
@@ -47,7 +49,7 @@ ROOM = f"""<scene version="3.0.0">
     </shape>
 </scene>"""
 OPTIONS: dict[str, Any] = {"views": 6, "test_views": 2, "size": (WIDTH, HEIGHT), "spp": 16, "progress": False}
-OPTIONS |= {"objects": ["ball"], "elevation": (20.0, 60.0), "distance": (2.0, 2.6)}
+OPTIONS |= {"objects": ["ball"], "elevation": (20.0, 60.0), "distance": (2.0, 2.6), "environment_height": 32}
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +87,52 @@ def test_open_scene_surface_and_region_are_those_of_the_object(made: Path) -> No
     assert region is not None
     np.testing.assert_allclose(region.centre, CENTRE, atol=1e-6)
     np.testing.assert_allclose(region.radius, REGION_MARGIN * RADIUS, rtol=1e-3)
-    assert not (made / "environment.exr").exists()
     vertices = np.asarray(trimesh.load_mesh(made / "surface.ply", process=False).vertices)
     np.testing.assert_allclose(np.linalg.norm(vertices - CENTRE, axis=1), RADIUS, rtol=1e-4)
+
+
+def test_environment_of_open_scene_is_the_room_without_the_object(made: Path) -> None:
+    """Lamp, distant light and wall in their directions from the ball's centre, which the ball would hide."""
+    light = mi.load_dict({"type": "envmap", "filename": str(read_loaded(made, "test").environment)})
+    directions = np.array([[0, 0, 5], [CENTRE[0], CENTRE[1] - 9, 2], [WALL - 0.1, CENTRE[1], 1]]) - CENTRE
+    si = dr.zeros(mi.SurfaceInteraction3f, 3)
+    si.wi = -mi.Vector3f((directions / np.linalg.norm(directions, axis=1, keepdims=True)).T)
+    lamp, distant, wall = light.eval(si).numpy()[0]
+    np.testing.assert_allclose((lamp, distant), (4, 0.4), rtol=1e-3)
+    assert 0.1 < wall < 0.35  # half of what it receives: up to 0.4, and of the lamp
+
+
+def test_relit_object_of_open_scene_is_alone(made: Path, tmp_path: Path) -> None:
+    """Under light of radiance 2 from everywhere: no lamp, no table, and its outline as alpha."""
+    write_exr(tmp_path / "even.exr", np.full((8, 16, 3), 2, np.float32))
+    out = make_dataset(made.parent / "room.xml", tmp_path / "out", relight=tmp_path / "even.exr", **OPTIONS)
+    relit = read_loaded(out / "relight" / "even", "test", images="exr", background="black")
+    for view, room in zip(relit.views, read_loaded(out, "test").views, strict=True):
+        assert view.alpha is not None and room.depth is not None
+        np.testing.assert_array_equal(view.to_world, room.to_world)
+        inside, outside = (np.all(sliding(mask), axis=-1) for mask in (room.depth > 0, room.depth == 0))
+        assert inside.any() and (view.alpha[inside] == 1).all() and not view.alpha[outside].any()
+        assert not view.image[outside].any()
+        np.testing.assert_allclose(view.image[inside].mean(axis=0), (1.6, 0.6, 0.2), rtol=0.05)
+
+
+def sliding(mask: np.ndarray) -> np.ndarray:
+    """The 3 × 3 neighbours (H, W, 9) of each pixel; edges are repeated."""
+    padded = np.pad(mask, 1, mode="edge")
+    return np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*mask.shape, 9)
+
+
+def test_cameras_stay_within_their_azimuths(made: Path, tmp_path: Path) -> None:
+    """A photographer before a wall; and the whole range is all around."""
+    tiny = {**OPTIONS, "views": 12, "size": 2, "spp": 1}
+    for low, high in ((150.0, 230.0), (-180.0, 180.0)):
+        out = make_dataset(made.parent / "room.xml", tmp_path / f"{high:g}", azimuth=(low, high), **tiny)
+        eyes = np.stack([view.to_world[:3, 3] - CENTRE for view in read_loaded(out, "train").views])
+        azimuth = np.sort(np.degrees(np.arctan2(eyes[:, 1], eyes[:, 0])) % 360)
+        if high == 180:
+            assert np.diff([*azimuth, azimuth[0] + 360]).max() < 60
+        else:
+            assert low < azimuth[0] < low + 15 and high - 15 < azimuth[-1] < high
 
 
 def test_emitter_is_visible_in_open_scene(made: Path, tmp_path: Path) -> None:
@@ -178,7 +223,7 @@ def test_every_eighth_image_is_a_test_view(made: Path, tmp_path: Path) -> None:
         ({"distance": (0.55, 2.0)}, ("--distance: 0.5", "inside of the region")),
         ({"distance": (6.0, 6.0)}, ("--distance: something is between",)),
         ({"distance": (3.0, 2.0)}, ("distance: ", "out of range")),
-        ({"relight": [__file__]}, ("--relight",)),
+        ({"azimuth": (90.0, 30.0)}, ("azimuth: ", "out of range")),
         ({"vews": 3}, ("make_dataset: vews: unknown option; use some of views",)),
     ],
 )
