@@ -329,13 +329,9 @@ def test_rooms_are_closed_and_show_the_whole_object(name: str, tmp_path: Path) -
     used = {e.get("value") or "" for e in ElementTree.parse(SCENES / f"{name}.xml").iter("string")}
     assert all((SCENES / u).stat().st_size < 310_000 for u in used if "/" in u)
     objects, distance, azimuth = ROOMS[name]
-    out = make_dataset(
-        SCENES / f"{name}.xml",
-        tmp_path,
-        **{**OPTIONS, "views": 12, "size": (18, 32), "spp": 1, "environment_height": 0},
-        **{"objects": objects, "distance": distance, "azimuth": azimuth, "elevation": (8, 55), "fov": 42},
-    )
-    data = read_loaded(out, "train")
+    tiny = OPTIONS | {"views": 12, "size": (18, 32), "spp": 1, "environment_height": 0}
+    tiny |= {"objects": objects, "distance": distance, "azimuth": azimuth, "elevation": (8, 55), "fov": 42}
+    data = read_loaded(make_dataset(SCENES / f"{name}.xml", tmp_path, **tiny), "train")
     inner = np.zeros((32, 18), bool)
     inner[1:-1, 1:-1] = True
     masks = [view.depth > 0 for view in data.views if view.depth is not None]
