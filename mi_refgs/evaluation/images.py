@@ -5,6 +5,7 @@ An image is (H, W, 3), display-encoded, in [0, 1].
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -167,7 +168,7 @@ def _line(cells: dict[str, np.ndarray]) -> np.ndarray:
     fonts = [ImageFont.load_default(size) for size in TITLE_SIZES]
     fits = (f for f in fonts if all(f.getlength(text) < cells[text].shape[1] - 2 for text in cells))
     font = next(fits, fonts[-1])
-    title_height = sum(font.getmetrics()) + 2
+    title_height = math.ceil(font.getbbox("Åg")[3]) + 2
     height = max(image.shape[0] for image in cells.values())
     columns = []
     for text, image in cells.items():
