@@ -431,7 +431,7 @@ def test_the_region_is_saved_and_a_painted_object_is_masked(
         tab.type("Radius", "0.5")
         tab.type("Region file", str(data / "region.json"))
         tab.press("Save region")
-        page.get_by_text("saved").wait_for(timeout=1000 * PATIENCE)
+        page.get_by_text("; next: ").wait_for(timeout=1000 * PATIENCE)
         assert json.loads((data / "region.json").read_text())["radius"] == pytest.approx(0.5, abs=0.01)
         tab.row("Border").first.evaluate("box => box.click()")
         tab.returns(before, "the image without the border")
