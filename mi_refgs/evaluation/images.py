@@ -5,7 +5,6 @@ An image is (H, W, 3), display-encoded, in [0, 1].
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -165,15 +164,15 @@ def _line(cells: dict[str, np.ndarray]) -> np.ndarray:
     """Place titled images side by side."""
     from PIL import Image, ImageDraw, ImageFont
 
-    fonts = [ImageFont.load_default(size) for size in TITLE_SIZES]
-    fits = (f for f in fonts if all(f.getlength(text) < cells[text].shape[1] - 2 for text in cells))
-    font = next(fits, fonts[-1])
-    title_height = math.ceil(font.getbbox("Åg")[3]) + 2
+    fonts = {size: ImageFont.load_default(size) for size in TITLE_SIZES}
+    fits = (s for s, f in fonts.items() if all(f.getlength(t) < cells[t].shape[1] - 2 for t in cells))
+    size = next(fits, TITLE_SIZES[-1])
+    title_height = round(1.2 * size) + 2
     height = max(image.shape[0] for image in cells.values())
     columns = []
     for text, image in cells.items():
         label = Image.new("RGB", (image.shape[1], title_height), "white")
-        ImageDraw.Draw(label).text((2, 0), text, fill="black", font=font)
+        ImageDraw.Draw(label).text((2, 0), text, fill="black", font=fonts[size])
         title = np.asarray(label, dtype=np.float32) / 255
         columns.append(_padded(np.concatenate([title, image]), height - image.shape[0], MARGIN))
     return np.concatenate(columns, axis=1)[:, :-MARGIN]
