@@ -22,34 +22,52 @@ from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 EPOCHS = 2
 """Passes over the training views that contain each view at least once, wherever they begin: every epoch has
 an order of its own."""
+REACH = 2.0
+"""Standard deviations to which a surfel extends: one that extends through the plane below the object is the
+table's. On *tabletop*, the opacity of the object alone has an intersection over union with the jug's mask of
+0.90 by centres, 0.94 with 1, 0.96 with 2 and 3."""
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 
-def depth_outside(position: np.ndarray, region: Region) -> np.ndarray:
-    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside."""
+def depth_outside(position: np.ndarray, region: Region, reach: np.ndarray | float = 0.0) -> np.ndarray:
+    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside.
+
+    From planes, it is the distance of the lower ends of what extends by `reach` (N, P) along their normals.
+    """
     sphere = np.linalg.norm(position - np.array(region.centre), axis=1) / region.radius - 1
-    below = -region.heights(position) / region.radius
+    below = (reach - region.heights(position)) / region.radius
     return np.asarray(np.maximum(sphere, below.max(axis=1, initial=-np.inf)))
+
+
+def reach_of(table: dict[str, np.ndarray], region: Region) -> np.ndarray:
+    """Extent (N, P) of surfels along the normals of a region's planes, scene units: REACH deviations."""
+    axes, deviations = primitive_of(table).extent(table)
+    normals = np.array(region.planes).reshape(-1, 4)[:, :3]
+    along = np.einsum("nai,pi->npa", axes, normals) * deviations[:, None]
+    return np.asarray(REACH * np.linalg.norm(along, axis=-1))
 
 
 def exchanged(
     inner: Surfels, outer: Surfels, method: Method, region: Region, rng: np.random.Generator
 ) -> list[TableEdit]:
-    """Both tables after surfels beyond the border have changed tables."""
-    options = method.surroundings
-    assert options is not None
+    """Both tables after surfels beyond the border have changed tables.
+
+    A table may become larger than its method allows, and does not grow then.
+    """
     tables = [inner.to_numpy(), outer.to_numpy()]
-    own_depth, other_depth = (depth_outside(table["position"], region) for table in tables)
+    own_depth, other_depth = (
+        depth_outside(table["position"], region, reach_of(table, region)) for table in tables
+    )
     leaves = [own_depth > MARGIN, other_depth < -MARGIN]
-    for i, limit in enumerate((options.max_count, method.surfels.most)):  # of the destination
-        room = limit - len(leaves[1 - i])
-        leaves[i] &= np.cumsum(leaves[i]) <= min(max(room, 0), len(leaves[i]) - 1)
+    for gone in leaves:  # one surfel stays
+        gone &= np.cumsum(gone) < len(gone)
     edits = []
     for own, other, gone, comes in zip(tables, tables[::-1], leaves, leaves[::-1], strict=True):
         stays = np.flatnonzero(~gone)

@@ -255,6 +255,10 @@ class Trainer:
         self._photograph_light()
         mesh = self.method.mesh
         if mesh is not None and self.fit.shading(stage).traceable and mesh.extract.due(iteration):
+            if self.setup.open_scene:  # what moved since the last densification is the object's, or is not
+                self.check()
+                assert self.region is not None
+                control.exchange(self.region, iteration)
             last = mesh.extract.count(iteration) == mesh.extract.count(self.method.iterations)
             self.extract_mesh(None if last else self._few_cameras())
 

@@ -118,7 +118,7 @@ def test_sparse_points_start_on_their_side_of_border(data: Dataset, method: Meth
 
 
 def test_surfels_beyond_border_change_tables(method: Method) -> None:
-    """Beyond the margin; with their geometry and SH, without history, and within the limits."""
+    """Beyond the margin; with their geometry and SH, and without history; one stays."""
     rng = np.random.default_rng(0)
 
     def table(names: tuple[str, ...], distance: list[float], degree: int) -> Surfels:
@@ -146,8 +146,8 @@ def test_surfels_beyond_border_change_tables(method: Method) -> None:
     assert np.all(entered["radiance_sh"][3, 3:] == 0)
     assert 1 / (1 + np.exp(-entered["metallic"][3, 0])) == pytest.approx(method.surfels.start("metallic"))
 
-    full = replace(method, surfels=replace(method.surfels, max_count=5))
-    assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 3
+    full = replace(method, surfels=replace(method.surfels, max_count=3))
+    assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 4  # for one came and two left
     gone = table(method.surfels.names, [2.0, 3.0], 1)
     assert exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
 
@@ -157,10 +157,12 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     rng = np.random.default_rng(0)
     region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1), (1.0, 0.0, 0.0, -0.5)))
 
-    def table(names: tuple[str, ...], places: list[list[float]]) -> Surfels:
+    def table(names: tuple[str, ...], places: list[list[float]], size: float = 1e-4) -> Surfels:
         raw = {n: rng.normal(size=(len(places), method.surfels.columns(n))) for n in names}
         raw["radiance_sh"] = rng.normal(size=(len(places), 3))
-        return Surfels.from_numpy(raw | {"position": np.array(places)})
+        raw |= {"position": np.array(places), "scale": np.full((len(places), 2), np.log(size))}
+        raw["rotation"] = np.tile([1.0, 0, 0, 0], (len(places), 1))
+        return Surfels.from_numpy(raw)
 
     inner = table(method.surfels.names, [[0, 0, 0.4], [0, 0, 0.05], [-0.6, 0, 0.2], [0, 0, 0.095]])
     outer = table(SurroundingsOptions(degree=0).names("surfel"), [[0, 0, 0], [0, 0.1, 0.3], [0, 0, 0.105]])
@@ -170,6 +172,11 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     np.testing.assert_allclose(own, [[0.0, 0.0, 0.4], [0.0, 0.0, 0.095], [0.0, 0.1, 0.3]], atol=1e-6)
     outside = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.105], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]]
     np.testing.assert_allclose(other, outside, atol=1e-6)
+    # Tangents along x and y, deviations of 0.1: they extend through the second plane, not through the first.
+    wide = table(method.surfels.names, [[0, 0, 0.2], [-0.35, 0, 0.2]], 0.1)
+    own, _ = (edit.surfels.to_numpy()["position"] for edit in exchanged(wide, outer, method, region, rng))
+    np.testing.assert_allclose(own[:1], [[0, 0, 0.2]], atol=1e-6)
+    assert not np.any(own[:, 0] < -0.1)
 
 
 def test_points_start_on_their_side_of_planes(data: Dataset, method: Method) -> None:
