@@ -15,11 +15,11 @@ from mi_refgs.data.region import Region
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
+from mi_refgs.render.panorama import SURFACE
 from mi_refgs.types import Float
 
 AFTER = 1 / 3  # fraction of the iterations after which the region follows the object
 DEPTH_VIEWS = 24  # training views whose depth is rendered
-OPAQUE = 0.5  # opacity from which a pixel shows a surface
 LEVEL = 0.05  # difference of depth, in radii of the region, up to which two pixels show one surface
 LEVEL_COUNT = 3  # of the eight neighbours of a pixel; fewer are where an outline mixes near and far
 
@@ -49,7 +49,7 @@ def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.
     shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
     beside = np.stack([around[r : r + view.height, c : c + view.width] for r, c in shifts])
     level = np.count_nonzero(abs(beside - z) < LEVEL * radius, axis=0) >= LEVEL_COUNT
-    row, column = np.nonzero((opaque > OPAQUE) & level)
+    row, column = np.nonzero((opaque > SURFACE) & level)
     local = np.stack(
         [(view.cx - 0.5 - column) / view.fx, (view.cy - 0.5 - row) / view.fy, np.ones(len(row))], 1
     )

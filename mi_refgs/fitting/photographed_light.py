@@ -17,15 +17,15 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import Region
+from mi_refgs.data.view import View
 from mi_refgs.fitting.losses import light_difference
 from mi_refgs.kernels.device import upload
-from mi_refgs.render.panorama import Panorama, panorama
+from mi_refgs.render.panorama import SURFACE, Panorama, panorama
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.lobe_matrices import map_directions, row_areas
 from mi_refgs.shade.light.near_field import NearField
-from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
@@ -47,22 +47,22 @@ class PhotographedLight:
         surfels: Surfels,
         surroundings: Surroundings,
         region: Region,
-        cameras: Sequence[Camera],
+        views: Sequence[View],
         height: int,
     ) -> PhotographedLight:
         """Render the background from the region's centre, with `height` rows.
 
-        A texel counts if cameras show the surface there: it is in their image, and nothing is in front.
+        A texel counts if views show the surface there: it is in their image, and nothing is in front.
         """
         centre, radius = np.array(region.centre), region.radius
         seen = panorama(surroundings, centre, height, NEAR * radius)
         points = seen.points(FARTHEST * radius).reshape(-1, 3)
         shown = np.zeros(len(points))
-        for camera in cameras:
+        for view in views:
             with dr.suspend_grad():
-                depth, alpha = render_depth(surfels, camera, surroundings.surfels)
-            shown += _shown(points, camera, depth.numpy(), alpha.numpy())
-        weight = np.minimum(shown / (SEEN_SHARE * len(cameras)), 1)
+                depth, alpha = render_depth(surfels, view.camera(), surroundings.surfels)
+            shown += _shown(points, view, depth.numpy(), alpha.numpy())
+        weight = np.minimum(shown / (SEEN_SHARE * len(views)), 1)
         return PhotographedLight(seen, weight.reshape(height, 2 * height))
 
     @cached_property
@@ -81,9 +81,11 @@ class PhotographedLight:
         shown = seen * area[..., None]
         mean = np.sum(shown * self.panorama.radiance, axis=(0, 1)) / max(shown.sum(), 1e-9)
         radiance = seen * self.panorama.radiance + (1 - seen) * mean
-        vectors = (x.reshape(-1, 3).T.astype(np.float32) for x in (map_directions(height), radiance))
-        scalars = (upload(x.astype(np.float32)) for x in (self.weight, area))
-        return mi.Vector3f(next(vectors)), mi.Color3f(next(vectors)), *scalars
+        direction, colour = (
+            x.reshape(-1, 3).T.astype(np.float32) for x in (map_directions(height), radiance)
+        )
+        weight, size = (upload(x.astype(np.float32)) for x in (self.weight, area))
+        return mi.Vector3f(direction), mi.Color3f(colour), weight, size
 
     def difference(self, light: Light) -> Float:
         """How far a light is from the panorama, as `losses.light_difference` weighs it (width 1)."""
@@ -107,14 +109,13 @@ class PhotographedLight:
         return PhotographedLight(seen, arrays["weight"])
 
 
-def _shown(points: np.ndarray, camera: Camera, depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Whether a camera shows points (N, 3) rather than something in front of them: (N,) bool."""
-    pose = camera.pose()
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    z = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-    fx, fy, cx, cy = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
-    column, row = np.floor(fx * local[:, 0] / z + cx), np.floor(fy * local[:, 1] / z + cy)
-    inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    pixel = (np.where(inside, row * camera.width + column, 0)).astype(int)
-    surface = np.where(alpha > 0.5, depth, np.inf)
-    return inside & (local[:, 2] <= BEHIND * surface[pixel])
+def _shown(points: np.ndarray, view: View, depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Whether a view shows points (N, 3) rather than something in front of them: (N,) bool."""
+    row, column, inside = view.project(points)
+    pixel = (
+        np.clip(np.rint(where), 0, size - 1).astype(int)
+        for where, size in ((row, view.height), (column, view.width))
+    )
+    surface = np.where(alpha > SURFACE, depth, np.inf).reshape(view.height, view.width)
+    distance = (points - view.to_world[:3, 3]) @ view.to_world[:3, 2]
+    return inside & (distance <= BEHIND * surface[tuple(pixel)])

@@ -260,15 +260,15 @@ class Trainer:
                 assert self.region is not None
                 control.exchange(self.region, iteration)
             last = mesh.extract.count(iteration) == mesh.extract.count(self.method.iterations)
-            self.extract_mesh(None if last else self._few_cameras())
+            self.extract_mesh(None if last else [self.camera(i) for i in self._few_views()])
 
     def camera(self, index: int) -> Camera:
         """The camera of a training view, with the correction that was fitted."""
         return poses.camera_of(self.setup, self.fit.params, index)
 
-    def _few_cameras(self) -> list[Camera]:
-        """Cameras of FUSED_VIEWS training views, spread over all of them."""
-        return [self.camera(i) for i in evenly_spread(len(self.data.views), FUSED_VIEWS)]
+    def _few_views(self) -> list[int]:
+        """Indices of FUSED_VIEWS training views, spread over all of them."""
+        return evenly_spread(len(self.data.views), FUSED_VIEWS)
 
     def extract_mesh(self, cameras: Sequence[Camera] | None = None) -> Mesh:
         """Fuse the rendered depth of all training views, or of `cameras`, into a mesh: the new occluder."""
@@ -429,8 +429,9 @@ class Trainer:
         if not options.photographed.due(self.iteration):
             return
         self.check()
+        posed = [replace(self.data.views[i], to_world=self.camera(i).pose()) for i in self._few_views()]
         self.fit.photographed = PhotographedLight.of(
-            self.surfels.detach(), around, region, self._few_cameras(), options.height
+            self.surfels.detach(), around, region, posed, options.height
         )
 
 

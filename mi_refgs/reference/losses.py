@@ -126,13 +126,12 @@ def light_colour(level: Array, scale: float) -> float:
     return float(np.mean(np.abs(irradiance - irradiance.mean(1, keepdims=True))) / scale)
 
 
-CLIPPED = 0.9  # linear radiance from which a photograph may be clipped
-
-
-def light_difference(radiance: Array, photographed: Array, seen: Array, area: Array, hue: float) -> float:
+def light_difference(
+    radiance: Array, photographed: Array, seen: Array, area: Array, clipped: float, hue: float
+) -> float:
     """Mean over channels and directions (N, …) of |d| where seen, and of the deviation from the mean d."""
     off = np.log((1 + radiance) / (1 + photographed))
-    dark = np.where((photographed > CLIPPED) & (off > 0), 0, np.abs(off))
+    dark = np.where((photographed > clipped) & (off > 0), 0, np.abs(off))
     colour = np.abs(off - off.mean(axis=1, keepdims=True))
     each = seen[:, None] * dark + hue * (1 - seen[:, None]) * colour
     return float(np.sum(area[:, None] * each) / 3)

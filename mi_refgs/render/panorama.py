@@ -16,7 +16,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 
 MARGIN = 2  # pixels of a cube face beyond its edges, so that interpolation never leaves an image
-SURFACE = 0.5  # opacity from which a pixel has a distance
+SURFACE = 0.5  # opacity from which a pixel shows a surface
 
 
 @dataclass(frozen=True)

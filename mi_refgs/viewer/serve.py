@@ -13,9 +13,9 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.formats import write
 from mi_refgs.io.files import make_folder
 from mi_refgs.reconstruction.provenance import Provenance
+from mi_refgs.reconstruction.reconstruction import Reconstruction
 from mi_refgs.runs.export import newest
 from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -61,9 +61,9 @@ def serve_run(
 
     def write_masks(chosen: np.ndarray, folder: Path | None) -> list[Path]:
         source = Provenance.of(run).with_data(data)
-        shots, target = source.shots(trained, "test", "train"), folder or source.data or run.path
+        target = folder or source.data or run.path
         make_folder(target)
-        return write(trained, ["masks"], target, shots, {"where": chosen}, run.path)["masks"]
+        return Reconstruction(trained, source, run.path).export("masks", target, where=chosen)
 
     add_panels(page, scene, trained, write_masks)
     return page

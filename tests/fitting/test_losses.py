@@ -219,7 +219,7 @@ def test_difference_of_lights(rng: np.random.Generator) -> None:
     seen, area = rng.choice([0, 0.4, 1], 40).astype(np.float32), rng.random(40).astype(np.float32)
 
     def define(values: np.ndarray) -> float:
-        return reference.light_difference(values, photographed, seen, area, losses.HUE)
+        return reference.light_difference(values, photographed, seen, area, losses.CLIPPED, losses.HUE)
 
     light = mi.Color3f(radiance.T.astype(np.float32))
     dr.enable_grad(light)

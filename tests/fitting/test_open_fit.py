@@ -326,7 +326,6 @@ def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None
     """A wall behind a nearer wall has no weight; without the nearer one it has."""
     assert data.region is not None
     centre = np.array(data.region.centre)
-    cameras = [view.camera() for view in data.views]
     towards = centre - data.views[0].to_world[:3, 3]
     towards /= np.linalg.norm(towards)
 
@@ -342,7 +341,7 @@ def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None
     far = Surroundings(wall(3.0), EnvironmentLight.constant(0.5, 8))
     behind = map_directions(8) @ towards > 0.95
     for nearer, share in ((wall(30.0), 1.0), (wall(0.5), 0.0)):
-        found = PhotographedLight.of(nearer, far, data.region, cameras, 8)
+        found = PhotographedLight.of(nearer, far, data.region, data.views, 8)
         assert np.all(found.weight[behind] == share)
 
 
