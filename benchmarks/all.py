@@ -47,7 +47,7 @@ class Part:
     small: str | None = None  # arguments of a small instance
 
 
-TRACING = {"images": 28, "relighting": 10, "methods": 4, "photographs": 14}
+TRACING = {"front": 5, "images": 24, "relighting": 10, "methods": 4, "photographs": 14}
 """Minutes of path tracing in a group."""
 FITS = [
     Part(name, round(sum(fit.minutes for fit in fits)) + TRACING.get(name, 0), small="")

@@ -22,7 +22,7 @@ from mi_refgs import __version__, methods
 from mi_refgs.editing.options import EditOptions
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import evaluate as evaluation
-from mi_refgs.evaluation.images import contact_sheet, displayed_over
+from mi_refgs.evaluation.images import contact_sheet, displayed_over, normal_colours
 from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
 from mi_refgs.io.images import read_png, to_8_bits
 from mi_refgs.io.ownership import OutputFolder
@@ -34,6 +34,9 @@ from mi_refgs.reconstruction.reconstruction import Reconstruction
 from mi_refgs.relighting import relight as relighting
 from mi_refgs.runs.run import Run
 from mi_refgs.synthesis.make_dataset import make_dataset
+from mi_refgs.synthesis.options import DatasetOptions
+from mi_refgs.synthesis.pathtrace import Cameras, Tracer, bounding_sphere
+from mi_refgs.synthesis.settings import load_scene
 
 RECORD, PAGE = "gallery.json", "README.md"
 PURPOSE = "relighting"
@@ -47,7 +50,11 @@ TURN, TURN_SECONDS = 30, 3.0
 """Frames of a turntable, and seconds per turn."""
 EDIT_VIEWS = (0, TEST_VIEWS // 2)
 """Test views of the edited scenes."""
-TURNTABLE, DECOMPOSITION, RELIT, EDITS = "turntable.webp", "decomposition.webp", "relit.webp", "edits.webp"
+FINE, SHOWN = 4, 2
+"""Pixels of a displayed image per pixel of a training image, along a side: of the first image of an exhibit,
+and of turntables and edits."""
+FIRST, TURNTABLE, DECOMPOSITION = "first.webp", "turntable.webp", "decomposition.webp"
+RELIT, EDITS = "relit.webp", "edits.webp"
 """Image files of an exhibit, in its folder."""
 HEAD = """\
 | scene | PSNR | normals | albedo | roughness error | metallic error | relit |
@@ -65,6 +72,7 @@ class Exhibit:
     caption: str
     edits: Mapping[str, EditOptions]  # by title: keywords of `Reconstruction.edit`, on materials alone
     samples: int = 64  # per pixel of the path-traced images
+    view: int = 0  # test view of the first image
 
 
 EXHIBITS: dict[str, Exhibit] = {
@@ -139,14 +147,14 @@ def make_gallery(
             f"{out / RECORD}: the gallery was made with {record['settings']}, not {settings}; repeat "
             "that, or choose another --out"
         )
-    files = (DECOMPOSITION, RELIT, TURNTABLE, EDITS)
+    files = (FIRST, DECOMPOSITION, RELIT, TURNTABLE, EDITS)
     output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{file}" for file in files)), marker=RECORD)
     output.claim(RECORD, PAGE, *(f"{name}/{file}" for name in scenes for file in files))
     found = dict(record["scenes"])
     for number, name in enumerate(scenes):
         say(f"{number + 1} of {len(scenes)}: {name}")
         run, found[name] = _fitted(name, work / name, settings)
-        _write_images(EXHIBITS[name], run, out / name, size)
+        _write_images(name, run, out / name, settings)
         made = {name: found[name] for name in EXHIBITS if name in found}
         write_json(out / RECORD, {"settings": settings, "scenes": made})
         write_bytes(out / PAGE, page(settings, made).encode())
@@ -156,16 +164,8 @@ def _fitted(name: str, work: Path, settings: dict[str, Any]) -> tuple[Reconstruc
     """Fit, evaluate and relight an exhibit where that is missing; returns the run and its scores."""
     scenes = resource_dir("scenes")
     light = scenes / "lights" / LIGHT
-    data = make_dataset(
-        scenes / f"{name}.xml",
-        work / "data",
-        views=settings["views"],
-        test_views=TEST_VIEWS,
-        size=settings["size"],
-        spp=EXHIBITS[name].samples,
-        relight=[light],
-        progress=True,
-    )
+    traced = _traced(name, settings)
+    data = make_dataset(scenes / f"{name}.xml", work / "data", relight=[light], progress=True, **traced)
     method = methods.for_purpose(PURPOSE)
     folder = Run(work / "run")
     run = fit(
@@ -195,9 +195,29 @@ def _fitted(name: str, work: Path, settings: dict[str, Any]) -> tuple[Reconstruc
     return run, {key: metrics[key] for key in keys} | {"relit_psnr": read_json(record)["psnr_scaled"]}
 
 
-def _write_images(exhibit: Exhibit, run: Reconstruction, out: Path, size: int) -> None:
+def _traced(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the path tracer for an exhibit (`DatasetOptions`)."""
+    sizes = {"views": settings["views"], "test_views": TEST_VIEWS, "size": settings["size"]}
+    return sizes | {"spp": EXHIBITS[name].samples}
+
+
+def _write_images(name: str, run: Reconstruction, out: Path, settings: Mapping[str, Any]) -> None:
     """Write the images of an exhibit that are missing."""
     assert run.folder is not None
+    exhibit, size = EXHIBITS[name], SHOWN * settings["size"]
+    other = run.relight(resource_dir("scenes") / "lights" / LIGHT)
+    if not is_file(out / FIRST):
+        traced = _traced(name, settings)
+        large = FINE * settings["size"]
+        maps = run.aovs(exhibit.view, ["normal"], size=large, samples=SAMPLES)
+        alpha = run.render(exhibit.view, size=large, samples=SAMPLES)[..., 3]
+        first = {
+            "ground truth": _path_traced(name, DatasetOptions(**traced | {"size": large}), exhibit.view),
+            "ours": _shown(run, exhibit.view, large),
+            "our normals": normal_colours(maps["normal"], alpha),
+            "relit": _shown(other, exhibit.view, large),
+        }
+        write_still(out / FIRST, contact_sheet([_cropped(first)]))
     sheets = {
         DECOMPOSITION: run.folder / evaluation.DECOMPOSITION,
         RELIT: run.folder / "relight" / Path(LIGHT).stem / relighting.SHEET,
@@ -206,7 +226,6 @@ def _write_images(exhibit: Exhibit, run: Reconstruction, out: Path, size: int) -
         if not is_file(out / target):
             write_still(out / target, read_png(source))
     if not is_file(out / TURNTABLE):
-        other = run.relight(resource_dir("scenes") / "lights" / LIGHT)
         frames = [
             np.concatenate([_shown(scene, camera, size) for scene in (run, other)], axis=1)
             for camera in run.turntable(TURN)
@@ -224,6 +243,22 @@ def _write_images(exhibit: Exhibit, run: Reconstruction, out: Path, size: int) -
 def _shown(run: Reconstruction, camera: Any, size: int) -> np.ndarray:
     """Render a camera (size, size, 3) on a white background, display-encoded."""
     return displayed_over(run.render(camera, size=size, samples=SAMPLES), np.ones(3))
+
+
+def _path_traced(name: str, options: DatasetOptions, view: int) -> np.ndarray:
+    """Path-trace a test view of an exhibit (size, size, 3) on a white background, display-encoded."""
+    scene = load_scene(resource_dir("scenes") / f"{name}.xml")
+    centre, radius = bounding_sphere(scene.shapes())
+    cameras = Cameras(options, centre, radius, radius)
+    return displayed_over(Tracer(scene, cameras).image(*cameras.of("test")[view]), np.ones(3))
+
+
+def _cropped(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The rows and columns (H, W, 3) in which one of the images is not white."""
+    shown = np.any([image.min(axis=-1) < 1 for image in images.values()], axis=0)
+    rows, columns = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
+    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    return {title: image[part] for title, image in images.items()}
 
 
 # ---------- Image files ----------
@@ -273,6 +308,7 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any]) -> str:
         text += [
             f"## {name}",
             f"{EXHIBITS[name].caption} [The scene](../../scenes/README.md).",
+            f"![{name}: ground truth, fit, normals, and under another environment map]({name}/{FIRST})",
             f"![{name} turning, under the estimated environment map and under another]({name}/{TURNTABLE})",
             "Left: the estimated environment map. Right: one that the fit has not seen.",
             f"![Images and materials of {name} compared with ground truth]({name}/{DECOMPOSITION})",

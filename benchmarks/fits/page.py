@@ -43,6 +43,7 @@ MATERIALS = ("albedo=albedo_psnr", "metallic error=metallic_mae", "roughness err
 TIME = ("surfels=surfels", "training=train_minutes")
 TRIALS = ("SH alone=colour_alone", "twice the surfels=surfels_2x", "four times=surfels_4x")
 TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]]]] = {
+    "front": (_fit, lambda rows: _columns("PSNR=psnr", *SHAPE[:2], *TIME)),
     "images": (
         _about,
         lambda rows: [

@@ -74,6 +74,10 @@ ABLATIONS = """ref_gaussian gaussians_3d no_interreflection no_material_aware no
 REPEATED = ["ref_gaussian", "base_3dgs_dr", "base_2dgs"]  # with two seeds
 
 GROUPS: dict[str, list[Fit]] = {
+    "front": [
+        RING,
+        *(Fit(RING.source, method) for method in ("base_3dgs_dr", "base_2dgs", "relighting")),
+    ],
     "images": [
         fit
         for name in ("mirror_ring", "gold_cavities", "studded", "chair", "mirror_balls", "mixed", "diffuse")

@@ -350,7 +350,7 @@ def _state() -> dict[str, np.ndarray]:
         state |= {f"{moments}/second": np.zeros(values.size, np.float32), f"{moments}/factor": np.float32(1)}
         state[f"{moments}/usual"] = 0.0
     state |= {"iteration": 3, "seconds": 1.5, "held_until": 0}
-    state |= {"error_sum": np.zeros(7, np.float32), "unseen": np.zeros(7, np.float32)}
+    state["error_sum"] = np.zeros(7, np.float32)
     state |= {"mesh/vertices": CUBE, "mesh/faces": TRIANGLES, "mesh/voxel": 0.1}
     return {name: np.asarray(value) for name, value in state.items()}
 

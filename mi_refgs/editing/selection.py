@@ -19,6 +19,7 @@ from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera, splat
+from mi_refgs.splat.weights import blended_weights
 from mi_refgs.types import Float
 
 PAINTED_SHARE = 0.5
@@ -86,16 +87,8 @@ def shown_weights(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> tupl
     table = own if others is None else own.followed_by(others)
     with dr.suspend_grad():
         depth, _ = render_depth(own, camera, others)
-    weights = [upload(mask.astype(np.float32)), mi.Float(1), depth]
-    # The gradient of a weighted sum of a blended feature is the blended weight per surfel, so weighted.
-    features = [dr.opaque(mi.Float, 0, table.count) for _ in weights]
-    for feature in features:
-        dr.enable_grad(feature)
-    blended = splat(table, features, camera).features
-    total = dr.sum(sum(weight * image for weight, image in zip(weights, blended, strict=True)))
-    if dr.grad_enabled(total):  # unless the view sees nothing
-        dr.backward(total)
-    inside, every, far = (np.array(dr.grad(x), np.float64)[: own.count] for x in features)
+    maps = [upload(mask.astype(np.float32)), mi.Float(1), depth]
+    inside, every, far = (weight[: own.count] for weight in blended_weights(table, camera, maps))
     centre = np.array(camera.to_camera(own.position()).z, np.float64)
     pixel_depth = far / np.maximum(every, np.finfo(np.float64).tiny)
     behind = centre - pixel_depth > BEHIND_SIZES * SurfelValues(scene)["size"]

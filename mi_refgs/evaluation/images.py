@@ -25,7 +25,9 @@ LIGHT_KEY = 0.36
 CELL_MIN = 128
 """Pixels: smaller images are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
 MARGIN = 4  # pixels between images
-TITLE_SIZES = range(22, 9, -1)  # pixels: the first size at which all titles of a line fit is used
+TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 16
+"""Heights of titles in pixels: the largest at which all of a line fit, up to TITLE_MAX or, of large images,
+their width over TITLE_PART."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
 
@@ -164,9 +166,10 @@ def _line(cells: dict[str, np.ndarray]) -> np.ndarray:
     """Place titled images side by side."""
     from PIL import Image, ImageDraw, ImageFont
 
-    fonts = {size: ImageFont.load_default(size) for size in TITLE_SIZES}
+    most = max(TITLE_MAX, min(image.shape[1] for image in cells.values()) // TITLE_PART)
+    fonts = {size: ImageFont.load_default(size) for size in range(most, TITLE_MIN - 1, -1)}
     fits = (s for s, f in fonts.items() if all(f.getlength(t) < cells[t].shape[1] - 2 for t in cells))
-    size = next(fits, TITLE_SIZES[-1])
+    size = next(fits, TITLE_MIN)
     title_height = round(1.2 * size) + 2
     height = max(image.shape[0] for image in cells.values())
     columns = []

@@ -6,7 +6,7 @@ Nothing is fitted again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,26 +23,12 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import displayed
 from mi_refgs.runs.trained_scene import Pruned, TrainedScene
 from mi_refgs.shade.options import TRACED, ShadingOptions
-from mi_refgs.splat import Camera, splat
+from mi_refgs.splat.weights import blended_weights
 from mi_refgs.surfels.attributes import attribute, sh_columns
 from mi_refgs.surfels.ply import encode_ply
 from mi_refgs.surfels.table import Surfels
 
 COUNT_STEP = 1 / 1000  # fraction of the surfels to which the number of those that are removed is bisected
-
-
-def contributions(surfels: Surfels, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the blended weight Σ w of each surfel over all pixels of the views (N,) float64, in pixels.
-
-    The gradient of a blended feature Σ w f with respect to f.
-    """
-    table, total = surfels.detach(), np.zeros(surfels.count)
-    for camera in cameras:
-        feature = dr.opaque(mi.Float, 0, table.count)
-        dr.enable_grad(feature)
-        dr.backward(dr.sum(splat(table, [feature], camera).features[0]))
-        total += np.array(dr.grad(feature), dtype=np.float64)
-    return total
 
 
 def prune(
@@ -74,7 +60,8 @@ def prune(
     search = _Search(unread, images, limit, tell)
     if unread.surfels.count:
         search.drop_optional()
-        search.drop_surfels(contributions(whole.surfels, images.cameras))
+        weights = [blended_weights(whole.surfels, camera)[0] for camera in images.cameras]
+        search.drop_surfels(np.sum(weights, axis=0))
     pruned = search.scene
 
     # The report.

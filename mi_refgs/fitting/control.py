@@ -16,19 +16,21 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import Region
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.initial import converted, first_light
 from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.splat.weights import blended_weights
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
-EPOCHS = 2
-"""Passes over the training views that contain each view at least once, wherever they begin: every epoch has
-an order of its own."""
+WEIGHED_VIEWS, WEIGHED_SIZE = 48, 128
+"""Training views in which faint surfels are looked for at most, and the longer side of their images there in
+pixels: an event then takes as long as 5 to 10 steps."""
 REACH = 2.0
 """Standard deviations to which a surfel extends: one that extends through the plane below the object is the
 table's. On *tabletop*, the opacity of the object alone has an intersection over union with the jug's mask of
@@ -137,8 +139,8 @@ class AdaptiveControl:
     def fill(self) -> None:
         """Split the object's surfels with the largest error, as many as there is room for; prune none."""
         table, options = self.state.tables[0], replace(self.options, grow=1.0, prune_opacity=0.0)
-        error, unseen = table.error_sum.numpy(), np.zeros(table.surfels.count, bool)
-        table.apply(refine.densify_and_prune(table.surfels, error, unseen, np.inf, options, table.max_count))
+        error, weight = table.error_sum.numpy(), np.ones(table.surfels.count)
+        table.apply(refine.densify_and_prune(table.surfels, error, weight, np.inf, options, table.max_count))
         self.state.occluder.vertex_surfels = None
         table.clear()
 
@@ -149,7 +151,7 @@ class AdaptiveControl:
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
-        for table in state.tables:
+        for table, weight in zip(state.tables, self._weights(), strict=True):
             surfels, is_background = table.surfels, bool(table.prefix)
             largest: float | np.ndarray = options.prune_extent * data.scene_extent
             if is_background:  # its surfels may grow with their distance
@@ -157,10 +159,10 @@ class AdaptiveControl:
                 offset = surfels.raw["position"].numpy() - np.array(region.centre)
                 distance = np.maximum(np.linalg.norm(offset, axis=1), region.radius)
                 largest = method.surroundings.prune_extent * distance
-            error, unseen = table.error_sum.numpy(), table.unseen.numpy() >= EPOCHS * self.setup.epoch
+            error = table.error_sum.numpy()
             table.apply(
                 refine.densify_and_prune(
-                    surfels, error, unseen, largest, options, table.max_count, keep_one=is_background
+                    surfels, error, weight, largest, options, table.max_count, keep_one=is_background
                 )
             )
         if self.setup.open_scene:
@@ -169,6 +171,16 @@ class AdaptiveControl:
         state.occluder.vertex_surfels = None
         for table in state.tables:
             table.clear()
+
+    def _weights(self) -> list[np.ndarray]:
+        """Blending weights (N,) of each table's surfels in training views, pixels of reduced images."""
+        tables = [table.surfels.detach() for table in self.state.tables]
+        every = tables[0] if len(tables) == 1 else tables[0].followed_by(tables[1])
+        views = self.setup.data.views
+        cameras = (views[i].camera() for i in evenly_spread(len(views), WEIGHED_VIEWS))
+        small = (c.resized(min(WEIGHED_SIZE, max(c.width, c.height))) for c in cameras)
+        total = sum(blended_weights(every, camera)[0] for camera in small)
+        return np.split(np.asarray(total), [tables[0].count])[: len(tables)]
 
     def exchange(self, region: Region, iteration: int) -> None:
         """Let the surfels beyond the border of a region change tables."""

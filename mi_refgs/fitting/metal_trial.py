@@ -13,8 +13,6 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -24,7 +22,7 @@ from mi_refgs.fitting.select import Decision
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload
-from mi_refgs.splat import splat
+from mi_refgs.splat.weights import blended_weights
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
@@ -117,11 +115,7 @@ def _attributed(surfels: Surfels, views: list[View], errors: list[np.ndarray]) -
     """The error (N,) that each surfel is responsible for: Σ w e over the pixels of maps (H, W) of views."""
     total = np.zeros(surfels.count)
     for view, error in zip(views, errors, strict=True):
-        responsible = dr.opaque(mi.Float, 0, surfels.count)
-        dr.enable_grad(responsible)
-        (blended,) = splat(surfels.detach(), [responsible], view.camera()).features
-        dr.backward(dr.sum(upload(error) * blended))
-        total += dr.grad(responsible).numpy()
+        total += blended_weights(surfels, view.camera(), [upload(error)])[0]
     return total
 
 

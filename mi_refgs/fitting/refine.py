@@ -68,18 +68,19 @@ def split_opacity(opacity: np.ndarray) -> np.ndarray:
 def densify_and_prune(
     surfels: Surfels,
     error: np.ndarray,  # (N,) squared error that the surfels are responsible for: Σ w e² over recent pixels
-    unseen: np.ndarray,  # (N,) bool: contributes to no view
+    weight: np.ndarray,  # (N,) blending weights of the surfels, summed over pixels of views
     largest: float | np.ndarray,  # scene units, one or (N,): larger surfels are removed
     options: Refine,
     most: int,
     keep_one: bool = False,
 ) -> TableEdit:
-    """Split the surfels with the largest error; remove unseen, transparent and oversized ones.
+    """Split the surfels with the largest error; remove faint, transparent and oversized ones.
 
-    At most `most` surfels result. A surfel is split along its longest axis into two that together look like
-    it, so that the image hardly changes. With prune_opacity = 0 transparent ones stay: wait `prune_wait`
-    iterations after an opacity reset. `keep_one`: the most opaque surfel stays in any case. Raises InputError
-    if no surfel would be left.
+    Faint are those of the least weight, together at most `options.prune_weight` of all. At most `most`
+    surfels result. A surfel is split along its longest axis into two that together look like it, so that the
+    image hardly changes. With prune_opacity = 0 faint and transparent ones stay: wait `prune_wait` iterations
+    after an opacity reset. `keep_one`: the most opaque surfel stays in any case. Raises InputError if no
+    surfel would be left.
 
     Growth by error: Rota Bulò et al., Revising Densification in Gaussian Splatting, ECCV 2024, §3.1.
     """
@@ -87,7 +88,9 @@ def densify_and_prune(
     primitive = primitive_of(raw)
     opacity = sigmoid(raw["opacity"][:, 0])
     size = primitive.extent(raw)[1].max(axis=1)
-    keep = ~unseen & (size <= largest) & (opacity >= options.prune_opacity)
+    keep = (size <= largest) & (opacity >= options.prune_opacity)
+    if options.prune_opacity:
+        keep &= ~faint(weight, options.prune_weight)
     if keep_one and not keep.any():
         keep[np.argmax(opacity)] = True
     if not keep.any():
@@ -119,6 +122,14 @@ def densify_and_prune(
         primitive.shrink(table, children, longest, SPLIT_SCALE)
         table["opacity"][children, 0] = logit(split_opacity(opacity[parent[children]]))
     return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
+
+
+def faint(weight: np.ndarray, share: float) -> np.ndarray:
+    """The surfels (N,) bool of the least weight (N,) that together have at most this share of all weight."""
+    order = np.argsort(weight, kind="stable")
+    found = np.zeros(len(weight), bool)
+    found[order[np.cumsum(weight[order]) <= share * weight.sum()]] = True
+    return found
 
 
 def reset_opacity(surfels: Surfels, options: Refine, floors: Mapping[str, float]) -> Surfels:

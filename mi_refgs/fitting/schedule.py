@@ -3,7 +3,6 @@ of parameters, lights that steps share."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -113,12 +112,6 @@ class FitSetup:
             first = draws.integers(-(side // PATCH_EDGE), whole // PATCH_EDGE + 1)
             corner.append(min(max(PATCH_EDGE * int(first), 0), whole - side))
         return corner[0], corner[1], *size
-
-    @cached_property
-    def epoch(self) -> float:
-        """Steps that render each pixel of the training views once on average, at full resolution."""
-        sizes = [(view.width, view.height) for view in self.data.views]
-        return sum(math.prod(size) / math.prod(self.method.data.crop_of(*size)) for size in sizes)
 
     def sh_degree(self, iteration: int) -> int:
         """SH degree of the radiance that is in use."""

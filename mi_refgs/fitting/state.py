@@ -3,7 +3,7 @@
 A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes the files):
 
     params/NAME  optimiser/NAME/PART       parameters, and Adam's moments and counters of each
-    error_sum  unseen                      per surfel, with the prefix "surroundings/" for the background
+    error_sum                              per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
     photographed/PART                      the background as the object's light, if it was rendered
     iteration  seconds  held_until  decisions  exposure  cameras  region  light_gradient
@@ -61,7 +61,6 @@ class ParameterTable:
     prefix: str  # "" of the object, AROUND of the background
     max_count: int  # most surfels that the method allows
     error_sum: Float = None  # (N,) squared error that each is responsible for, since the last densification
-    unseen: Float = None  # (N,) steps since the last one that showed it
 
     @property
     def surfels(self) -> Surfels:
@@ -77,10 +76,8 @@ class ParameterTable:
         error: Float,  # (N,) squared error of a step that each surfel is responsible for: Σ w e²
     ) -> None:
         """Add to the statistics."""
-        seen = (error > 0) & dr.isfinite(error)
-        self.error_sum += dr.select(seen, error, 0.0)
-        self.unseen = dr.select(seen, 0.0, self.unseen + 1)
-        dr.schedule(self.error_sum, self.unseen)
+        self.error_sum += dr.select(dr.isfinite(error), error, 0.0)
+        dr.schedule(self.error_sum)
 
     def apply(self, edit: TableEdit) -> None:
         """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows."""
@@ -101,8 +98,7 @@ class ParameterTable:
         self.replace(surfels)
         self.optimiser.gather(parent, self._names(surfels), fresh)
         self.error_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.error_sum, parent))
-        self.unseen = dr.select(fresh, 0, dr.gather(mi.Float, self.unseen, parent))
-        dr.eval(self.error_sum, self.unseen)
+        dr.eval(self.error_sum)
 
     def replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
         """Replace the surfels; the attributes in `cleared` lose their moments."""
@@ -143,7 +139,6 @@ class FitState:
         made.optimiser.set_factor(GAIN, 0.0)
         for table in made.tables:
             table.clear()
-            table.unseen = dr.opaque(mi.Float, 0, table.surfels.count)
         return made
 
     @staticmethod
@@ -194,7 +189,6 @@ class FitState:
         state |= {f"{OPTIMISER}{name}": value for name, value in self.optimiser.state_dict().items()}
         for table in self.tables:
             state[f"{table.prefix}error_sum"] = table.error_sum.numpy()
-            state[f"{table.prefix}unseen"] = table.unseen.numpy()
         state |= {name: np.array(getattr(self, name)) for name in ("iteration", "seconds", "held_until")}
         state |= self.prefilter.state()
         region = None if self.region is None else self.region.content
@@ -220,7 +214,6 @@ class FitState:
         made.optimiser.load_state_dict(part(state, OPTIMISER))
         for table in made.tables:
             table.error_sum = upload(state[f"{table.prefix}error_sum"])
-            table.unseen = upload(state[f"{table.prefix}unseen"])
         made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
         made.held_until = int(state["held_until"])
         made.decisions = decisions_of(state)

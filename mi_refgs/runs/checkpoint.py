@@ -88,7 +88,7 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
     for prefix in ("", AROUND):  # version 0.1: screen-space gradients in place of errors
         if f"{prefix}gradient_sum" in state:
             state[f"{prefix}error_sum"] = state.pop(f"{prefix}gradient_sum")
-            state[f"{prefix}unseen"] = np.zeros_like(state.pop(f"{prefix}gradient_count"))
+            del state[f"{prefix}gradient_count"]
     check(state)
     return state
 
@@ -139,7 +139,7 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     _check(state, scalars, ())
     tables = {"": table} | ({} if around is None else {AROUND: around.surfels})
     for prefix, rows in tables.items():
-        _check(state, [f"{prefix}error_sum", f"{prefix}unseen"], (rows.count,))
+        _check(state, [f"{prefix}error_sum"], (rows.count,))
     _check(state, signed, signed=True)
     if part(state, PHOTOGRAPHED):
         if LIGHT not in params:

@@ -53,8 +53,9 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 
     A diffuse part that was fitted as an SH colour becomes an albedo (`albedo_from_radiance`). Attributes that
     are fitted to the light (radiance, indirect) are removed; interreflection is traced instead, if the scene
-    has a mesh. The light stays, infinitely far, and so do other shading options. The background is removed:
-    its brightness is that of the photographs. A scene that has only materials keeps them as they are.
+    has a mesh. The light stays, infinitely far, and so do other shading options. Any reflectance model is
+    replaced by `split_sum`. The background is removed: its brightness is that of the photographs. A scene
+    that has only materials keeps them as they are.
 
     Raises InputError for a scene without light or one of the materials.
     """
@@ -66,7 +67,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     surfels, mesh = scene.surfels.detach(), scene.mesh
     if mesh is not None and scene.surroundings is not None:
         mesh = _near(mesh, surfels)
-    if scene.shading.diffuse == "sh":
+    if scene.shading.diffuse == "sh" and "radiance_sh" in scene.shading.required_attributes:
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
     rays, bounces, ambient_rays = (1, 0, 0) if mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)

@@ -98,6 +98,12 @@ class Attribute:
 
 
 def _check(attribute: Attribute) -> None:
+    if attribute.aov not in ("", "Y", "RGB", "XYZ") or len(attribute.aov) not in (0, *attribute.widths):
+        widths = " or ".join(map(str, attribute.widths))
+        raise InputError(
+            f"attribute '{attribute.name}': aov: {attribute.aov!r} does not fit {widths} columns; use "
+            'Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""'
+        )
     for other in ATTRIBUTES.values():
         if {*other.properties} & {*attribute.properties}:
             raise InputError(f"attribute '{attribute.name}': '{other.name}' has its PLY property; rename it")
@@ -112,7 +118,8 @@ Channel = Attribute  # former name, for one release
 def register(attribute: Attribute) -> Attribute:
     """Add an attribute, which is returned, to surfel models, PLY files, method files, AOVs and the plugin.
 
-    Raises InputError if another attribute has its name or one of its PLY properties.
+    Raises InputError if another attribute has its name or one of its PLY properties, or if its AOV's suffixes
+    are not those of its columns.
     """
     return ATTRIBUTES.register(attribute)
 

@@ -8,21 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.data.dataset import Dataset, read_dataset
-from mi_refgs.evaluation.prune import contributions, prune
+from mi_refgs.evaluation.prune import prune
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import Pruned, TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import splat
 from mi_refgs.surfels.attributes import sh_columns
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
@@ -173,22 +170,6 @@ def test_prune_accepts_empty_and_invisible_scenes(train: Dataset, rng: np.random
 def test_prune_limit_out_of_range_is_refused(limit: float, train: Dataset, rng: np.random.Generator) -> None:
     whole = scene(Surfels.from_numpy(needed(train, rng)), RADIANCE)
     refused(lambda: prune(whole, train, limit=limit), "--limit: ", " dB is out of range; give")
-
-
-def test_contributions_equal_blended_weights(train: Dataset, rng: np.random.Generator) -> None:
-    """They equal the forward blend of a feature that is 1 for one surfel, and sum to alpha."""
-    surfels = with_useless(needed(train, rng), rng)
-    cameras = [view.camera() for view in train.views]
-    weight = contributions(surfels, cameras)
-    expected, alpha = np.zeros(surfels.count), 0.0
-    features = [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)]
-    for camera in cameras:
-        blended = splat(surfels, features, camera)
-        expected += [float(dr.sum(one)[0]) for one in blended.features]
-        alpha += float(dr.sum(blended.alpha)[0])
-    np.testing.assert_allclose(weight, expected, rtol=1e-4, atol=1e-5)
-    assert weight.sum() == pytest.approx(alpha, rel=1e-5)
-    assert np.count_nonzero(weight == 0) >= CLEAR + BEHIND
 
 
 # ---------------- the command ----------------

@@ -44,10 +44,10 @@ def densify(
     most: int = 100,
     largest: float = 0.1,
     options: Refine = OPTIONS,
-    unseen: np.ndarray | None = None,
+    weight: np.ndarray | None = None,
 ) -> refine.TableEdit:
-    unseen = np.zeros(surfels.count, bool) if unseen is None else unseen
-    return refine.densify_and_prune(surfels, error, unseen, largest, options, most)
+    weight = np.ones(surfels.count) if weight is None else weight
+    return refine.densify_and_prune(surfels, error, weight, largest, options, most)
 
 
 def test_surfels_with_the_largest_error_are_split() -> None:
@@ -100,9 +100,14 @@ def test_no_child_is_too_transparent_to_stay() -> None:
     assert len(densify(surfels, error, options=dataclasses.replace(OPTIONS, prune_opacity=0.0)).parent) == 8
 
 
-def test_surfels_that_no_view_shows_are_removed() -> None:
-    unseen = np.arange(6) == 2
-    assert densify(table(), np.zeros(6), unseen=unseen).parent.tolist() == [0, 1, 3, 4, 5]
+def test_faint_surfels_are_removed() -> None:
+    """Those of the least weight, as long as they have at most a share of it; none after a reset."""
+    weight = np.array([0.4, 0, 3, 0.4, 1, 0.2])
+    for share, left in ((0, [0, 2, 3, 4, 5]), (0.05, [0, 2, 3, 4]), (0.13, [2, 3, 4]), (0.21, [2, 4])):
+        options = dataclasses.replace(OPTIONS, prune_weight=share)
+        assert densify(table(), np.zeros(6), weight=weight, options=options).parent.tolist() == left, share
+    waiting = dataclasses.replace(OPTIONS, prune_weight=0.2, prune_opacity=0.0)
+    assert len(densify(table(), np.zeros(6), weight=weight, options=waiting).parent) == 6
 
 
 def test_ordered_rows_keep_their_values_and_parents() -> None:

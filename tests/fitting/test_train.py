@@ -18,8 +18,8 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import refine, train
-from mi_refgs.fitting.control import EPOCHS, AdaptiveControl
+from mi_refgs.fitting import train
+from mi_refgs.fitting.control import AdaptiveControl
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
@@ -148,7 +148,6 @@ def test_statistics_distribute_the_squared_error_over_surfels(
     found = trainer.fit.tables[0].error_sum.numpy()
     total = float(dr.sum(errors[0] * dr.detach(frames[0].alpha))[0])
     assert total > 0 and found.sum() == pytest.approx(total, rel=1e-4)
-    assert ((found > 0) == (trainer.fit.tables[0].unseen.numpy() == 0)).all()
 
 
 def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
@@ -186,27 +185,6 @@ def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
         largest = np.abs(gradients[1][name]).max()
         np.testing.assert_allclose(found, gradients[1][name], atol=2e-5 * largest, err_msg=name)
     assert np.abs(gradients[0]["position"]).max() > 0
-
-
-def test_what_crops_have_not_shown_for_an_epoch_stays(
-    method: Method, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The epochs after which unseen surfels are removed are those of crops: a ninth of the pixels each."""
-    trainer = Trainer(dataclasses.replace(method, data=DataOptions(crop=12 * 12)), ball())
-    whole, found = EPOCHS * len(trainer.data.views), []
-    assert trainer.setup.epoch == 9 * len(trainer.data.views)
-
-    def prune(surfels: Any, error: Any, unseen: np.ndarray, *others: Any, **options: Any) -> Any:
-        found.append(unseen.copy())
-        return densify(surfels, error, np.zeros_like(unseen), *others, **options)
-
-    densify = refine.densify_and_prune
-    monkeypatch.setattr(refine, "densify_and_prune", prune)
-    table = trainer.fit.tables[0]
-    for steps in (whole, 9 * whole - 1, 9 * whole):
-        table.unseen = dr.opaque(mi.Float, steps, table.surfels.count)
-        AdaptiveControl(trainer.setup, trainer.fit).refine(12)
-    assert [unseen.any() for unseen in found] == [False, False, True] and found[2].all()
 
 
 def send_in_iteration_7(monkeypatch: pytest.MonkeyPatch, *numbers: signal.Signals) -> list[int]:

@@ -60,7 +60,8 @@ class Built:
 
 
 def aov_types(case: Case) -> tuple[str, ...]:
-    return {"none": (), "some": SOME, "all": tuple(suffixes())}[case["aovs"]]
+    known = tuple(kind for kind in suffixes() if kind not in ATTRIBUTES or kind in raw_channels())
+    return {"none": (), "some": SOME, "all": known}[case["aovs"]]
 
 
 def rotation(case: Case) -> np.ndarray:

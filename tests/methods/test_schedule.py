@@ -77,13 +77,6 @@ def test_crops_cover_an_image_with_its_border(size: tuple[int, int]) -> None:
 
 def test_small_images_are_not_cropped() -> None:
     assert schedule().crop(1, 1000, 1000) is None and cropped(1_800).crop(1, 45, 40) is None
-    assert schedule().epoch == 7
-
-
-def test_an_epoch_of_crops_is_longer() -> None:
-    """7 images of 64 × 64 pixels, 40 × 40 of them a step."""
-    setup = FitSetup(cropped(1_800).method, ball(size=64, views=7))
-    assert setup.epoch == pytest.approx(7 * 64**2 / 40**2)
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_gallery_has_its_pictures(made: Path) -> None:
     folder = made / "out" / SCENE
     with Image.open(folder / "turntable.webp") as turntable:
-        assert turntable.n_frames == maker.TURN and turntable.size == (2 * SIZE, SIZE)  # type: ignore[attr-defined]
-    for name in ("decomposition", "relit", "edits"):
+        assert turntable.n_frames == maker.TURN  # type: ignore[attr-defined]
+        assert turntable.size == (2 * maker.SHOWN * SIZE, maker.SHOWN * SIZE)
+    for name in ("first", "decomposition", "relit", "edits"):
         with Image.open(folder / f"{name}.webp") as picture:
             assert np.asarray(picture.convert("RGB")).std() > 5, name
 

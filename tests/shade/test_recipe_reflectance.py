@@ -13,7 +13,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import mi_refgs
 from mi_refgs.cli import main
+from mi_refgs.io.exr import write_exr
 from mi_refgs.shade import reflectance
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
@@ -63,11 +65,22 @@ reflectance = "phong"
 def phong() -> Iterator[None]:
     attributes.register(SHININESS)
     reflectance.register(Phong())
+    reflectance.register(Velvet())
     yield
+    reflectance.unregister("velvet")
     if "phong" in reflectance.MODELS:
         reflectance.unregister("phong")
     if "shininess" in attributes.ATTRIBUTES:
         attributes.ATTRIBUTES.unregister("shininess")
+
+
+class Velvet(Phong):
+    """Phong's model, of all materials."""
+
+    name = "velvet"
+
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
+        return ("albedo", "metallic", "roughness", "shininess")
 
 
 def raw() -> dict[str, np.ndarray]:
@@ -117,3 +130,25 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     attributes.ATTRIBUTES.unregister("shininess")
     assert "export" not in refused(view, "model.json", "'shininess' is unknown", "register it")
     assert "damaged" not in refused(command, "0000006.npz: surfels: shininess", "register it")
+
+
+def test_runs_of_a_model_of_all_materials_are_scored_and_relit(tmp_path: Path) -> None:
+    """No SH colour is converted to an albedo where the model does not use it."""
+    needed = '"albedo", "metallic", "roughness", "shininess"'
+    text = METHOD.replace('"albedo", "shininess"', needed).replace("phong", "velvet")
+    (tmp_path / "own.toml").write_text(text)
+    data = write_data(tmp_path / "data")
+    assert main(train_command(data, tmp_path / "run", tmp_path / "own.toml")) == 0
+    run = mi_refgs.load(tmp_path / "run")
+    assert run.evaluate()["psnr"] > 0
+    write_exr(tmp_path / "sky.exr", np.full((4, 8, 3), 0.5, np.float32))
+    relit = run.relight(tmp_path / "sky.exr")
+    assert np.isfinite(relit.render(0)).all()
+    fitted = run.trained.surfels.to_numpy()["albedo"]
+    assert np.array_equal(relit.trained.surfels.to_numpy()["albedo"], fitted)
+
+
+@pytest.mark.parametrize("aov, widths", [("S", (1,)), ("RGB", (1,)), ("Y", (3,))])
+def test_suffixes_of_an_aov_are_those_of_its_columns(aov: str, widths: tuple[int, ...]) -> None:
+    wrong = Attribute("sheen", widths, "sigmoid", 0.02, ("sheen",) * widths[0], aov=aov)
+    refused(lambda: attributes.register(wrong), "attribute 'sheen': aov: ", "columns; use Mitsuba's")

@@ -197,8 +197,8 @@ def test_a_gaussian_is_split_along_its_longest_axis() -> None:
         "scale": np.log([[0.3, 0.1, 0.05], [0.05, 0.1, 0.3]]),
         "opacity": np.zeros((2, 1)),
     }
-    gaussians, unseen = Surfels.from_numpy(raw), np.zeros(2, bool)
-    edited = refine.densify_and_prune(gaussians, np.ones(2), unseen, 1.0, Refine(grow=1.0), 4)
+    gaussians = Surfels.from_numpy(raw)
+    edited = refine.densify_and_prune(gaussians, np.ones(2), np.ones(2), 1.0, Refine(grow=1.0), 4)
     children = edited.surfels.to_numpy()
     assert edited.parent.tolist() == [0, 1, 0, 1] and edited.fresh.all()
     offsets = children["position"] - 1

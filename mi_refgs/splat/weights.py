@@ -1,0 +1,28 @@
+"""Blending weights of surfels: how much of an image each one is responsible for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.splat import splat
+from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float
+
+
+def blended_weights(surfels: Surfels, camera: Camera, maps: Sequence[Float] = (1.0,)) -> list[np.ndarray]:
+    """Sums Σ w m (N,) float64 of the blending weights of N surfels, for each map m (H·W,) of an image.
+
+    A map of 1 gives weights in pixels. They are the gradient of Σ m Σ w f with respect to a feature f.
+    """
+    features = [dr.opaque(mi.Float, 0, surfels.count) for _ in maps]
+    dr.enable_grad(features)
+    blended = splat(surfels.detach(), features, camera).features
+    total = dr.sum(sum(m * image for m, image in zip(maps, blended, strict=True)))
+    if dr.grad_enabled(total):  # unless the view shows nothing
+        dr.backward(total)
+    return [np.array(dr.grad(feature), dtype=np.float64) for feature in features]

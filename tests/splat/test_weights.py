@@ -1,0 +1,39 @@
+"""Blending weights of surfels, against the blended image of one surfel alone."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.splat import splat
+from mi_refgs.splat.camera import Camera
+from mi_refgs.splat.weights import blended_weights
+from mi_refgs.surfels.table import Surfels
+from tests.scenes.integrator import raw_channels
+
+
+def camera(eye: tuple[float, float, float]) -> Camera:
+    return Camera.look_at(eye, [0, 0, 0], fov=40, size=24)
+
+
+def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) -> None:
+    """Also with a map; the weights of all surfels sum to alpha."""
+    surfels = Surfels.from_numpy(raw_channels())
+    view = camera((0, -4, 1))
+    values = rng.random(24 * 24).astype(np.float32)
+    weight, weighted = blended_weights(surfels, view, [mi.Float(1), mi.Float(values)])
+    features = [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)]
+    blended = splat(surfels, features, view)
+    images = np.array([image.numpy() for image in blended.features], np.float64)
+    assert images.any()
+    np.testing.assert_allclose(weight, images.sum(axis=1), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(weighted, images @ values, rtol=1e-4, atol=1e-5)
+    assert weight.sum() == pytest.approx(float(dr.sum(blended.alpha)[0]), rel=1e-5)
+
+
+def test_surfels_behind_the_camera_have_no_weights() -> None:
+    surfels = Surfels.from_numpy(raw_channels())
+    away = Camera.look_at((0, -4, 1), (0, -8, 1), fov=40, size=24)
+    assert not blended_weights(surfels, away)[0].any()
