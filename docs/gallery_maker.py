@@ -84,6 +84,7 @@ EXHIBITS: dict[str, Exhibit] = {
             "red glaze": {"set": ["metallic=0", "albedo=0.5,0.03,0.03", "roughness=0.1"]},
         },
         samples=128,
+        view=12,
     ),
     "plastic_hollows": Exhibit(
         "A block of green plastic, roughness 0.22, with bowls and a hole: a dielectric with cavities.",
@@ -207,17 +208,7 @@ def _write_images(name: str, run: Reconstruction, out: Path, settings: Mapping[s
     exhibit, size = EXHIBITS[name], SHOWN * settings["size"]
     other = run.relight(resource_dir("scenes") / "lights" / LIGHT)
     if not is_file(out / FIRST):
-        traced = _traced(name, settings)
-        large = FINE * settings["size"]
-        maps = run.aovs(exhibit.view, ["normal"], size=large, samples=SAMPLES)
-        alpha = run.render(exhibit.view, size=large, samples=SAMPLES)[..., 3]
-        first = {
-            "ground truth": _path_traced(name, DatasetOptions(**traced | {"size": large}), exhibit.view),
-            "ours": _shown(run, exhibit.view, large),
-            "our normals": normal_colours(maps["normal"], alpha),
-            "relit": _shown(other, exhibit.view, large),
-        }
-        write_still(out / FIRST, contact_sheet([_cropped(first)]))
+        write_still(out / FIRST, first_image(name, run, other, settings))
     sheets = {
         DECOMPOSITION: run.folder / evaluation.DECOMPOSITION,
         RELIT: run.folder / "relight" / Path(LIGHT).stem / relighting.SHEET,
@@ -243,6 +234,22 @@ def _write_images(name: str, run: Reconstruction, out: Path, settings: Mapping[s
 def _shown(run: Reconstruction, camera: Any, size: int) -> np.ndarray:
     """Render a camera (size, size, 3) on a white background, display-encoded."""
     return displayed_over(run.render(camera, size=size, samples=SAMPLES), np.ones(3))
+
+
+def first_image(
+    name: str, run: Reconstruction, relit: Reconstruction, settings: Mapping[str, Any]
+) -> np.ndarray:
+    """Ground truth, fit, normals and relit fit (H, W, 3) of an exhibit, next to each other."""
+    size, view = FINE * settings["size"], EXHIBITS[name].view
+    maps = run.aovs(view, ["normal"], size=size, samples=SAMPLES)
+    alpha = run.render(view, size=size, samples=SAMPLES)[..., 3]
+    images = {
+        "ground truth": _path_traced(name, DatasetOptions(**_traced(name, settings) | {"size": size}), view),
+        "ours": _shown(run, view, size),
+        "our normals": normal_colours(maps["normal"], alpha),
+        "relit": _shown(relit, view, size),
+    }
+    return contact_sheet([_cropped(images)])
 
 
 def _path_traced(name: str, options: DatasetOptions, view: int) -> np.ndarray:

@@ -92,8 +92,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - ``split_sum`` (diffuse and GGX specular), ``radiance`` (the SH colour alone, needs no light; the two
          orders of shading are then the same), ``mirror`` (the SH colour mixed with a perfect mirror by
          ``metallic``, 3DGS-DR), ``gaussian_shader`` (SH colour, diffuse and tinted specular layer) or
-         ``monte_carlo`` (light summed over the hemisphere, R3DG). (Default: the first of these whose
-         attributes the surfels have)
+         ``monte_carlo`` (light summed over the hemisphere, R3DG), ``displayed`` (encoded SH colours of
+         a splat), or a registered model. (Default: the first of these whose attributes the surfels have)
 
      * - diffuse
        - |string|
@@ -135,7 +135,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - |string|
        - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator, appended to RGB(A). Types:
          ``albedo``, ``metallic``, ``roughness``, ``tint``, ``normal`` (world, towards the camera), ``depth``,
-         ``alpha``, ``visibility``, ``diffuse``, ``specular``, ``indirect``. (Default: none)
+         ``alpha``, ``visibility``, ``diffuse``, ``specular``, ``indirect``, registered attributes.
+         (Default: none)
 
      * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh, tint,
          normal_offset *or any registered attribute*

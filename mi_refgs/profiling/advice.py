@@ -33,7 +33,7 @@ def _of_work(found: Profile) -> Iterator[str]:
         yield (
             f"{work.unseen_share:.0%} of the surfels contribute in none of {work.views} views, and are "
             "projected and optimised all the same: start with fewer (--set surfels.count), or prune more "
-            "(refine.prune_opacity)."
+            "(refine.prune_weight)."
         )
     if work.single_share > MANY:
         yield (

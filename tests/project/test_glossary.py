@@ -1,13 +1,15 @@
 """Words that the project does not use, and what to write instead: the field's term, one for each thing.
 
 Checked are docstrings, comments and sentences in strings of Python files (error messages, help texts), the
-comments of TOML files, and the text of the pages. Code is not: names, values, and text between backticks.
+comments of TOML files, and the text of the pages and notebooks. Code is not: names, values, and text between
+backticks.
 """
 
 from __future__ import annotations
 
 import ast
 import io
+import json
 import re
 import tokenize
 from collections.abc import Iterator
@@ -84,7 +86,7 @@ def files() -> list[Path]:
     found = [
         path
         for folder in ("mi_refgs", "benchmarks", "docs", "scenes", "tests", "variants")
-        for ending in ("py", "toml", "md")
+        for ending in ("py", "toml", "md", "ipynb")
         for path in (ROOT / folder).rglob(f"*.{ending}")
         if not (ending == "toml" and folder != "variants")
     ]
@@ -95,7 +97,12 @@ def files() -> list[Path]:
 def prose(path: Path) -> Iterator[tuple[int, str]]:
     """Line numbers and texts of what a file says to its readers."""
     text = path.read_text()
-    if path.suffix == ".py":
+    if path.suffix == ".ipynb":
+        for number, cell in enumerate(json.loads(text)["cells"]):
+            source = "".join(cell["source"])
+            lines = python_prose(re.sub(r"^%.*", "", source, flags=re.MULTILINE))
+            yield from lines if cell["cell_type"] == "code" else [(number, source)]
+    elif path.suffix == ".py":
         yield from python_prose(text)
     elif path.suffix == ".toml":
         yield from ((i, line) for i, line in enumerate(text.splitlines(), 1) if "#" in line)
