@@ -16,8 +16,8 @@ from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
 from mi_refgs.data.images import ImageFile
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import object_surface
-from mi_refgs.fitting.control import depth_outside, exchanged
+from mi_refgs.fitting import object_surface, refine
+from mi_refgs.fitting.control import AdaptiveControl, depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.runner import begin, default_method
@@ -232,6 +232,27 @@ def test_region_is_adapted_to_points_when_fit_begins(data: Dataset, method: Meth
     assert run.region() == trainer.region
     again = begin(method, replace(data, region=replace(REGION, estimated=True)), run, said.append)
     assert again.region == trainer.region and not any("changed" in text for text in said)
+
+
+def test_surfels_without_weight_are_removed_from_their_own_table(
+    data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Transparent ones of the object and of the background have no weight in any view; others have."""
+    trainer, hidden, found = Trainer(method, data), (np.arange(5), np.arange(20, 32)), []
+    for table, rows in zip(trainer.fit.tables, hidden, strict=True):
+        raw = table.surfels.to_numpy()
+        raw["opacity"][rows] = -10
+        table.replace(Surfels.from_numpy(raw))
+
+    def edited(surfels: Surfels, error: Any, weight: np.ndarray, *others: Any, **options: Any) -> Any:
+        found.append(weight)
+        return densify(surfels, error, weight, *others, **options)
+
+    densify = refine.densify_and_prune
+    monkeypatch.setattr(refine, "densify_and_prune", edited)
+    AdaptiveControl(trainer.setup, trainer.fit).refine(4)
+    for weight, count, rows in zip(found, (80, 60), hidden, strict=True):
+        assert weight.shape == (count,) and not weight[rows].any() and np.mean(weight > 0) > 0.5
 
 
 def test_resume_repeats_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:
