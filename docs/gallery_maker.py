@@ -242,11 +242,11 @@ def first_image(
     """Ground truth, fit, normals and relit fit (H, W, 3) of an exhibit, next to each other."""
     size, view = FINE * settings["size"], EXHIBITS[name].view
     maps = run.aovs(view, ["normal"], size=size, samples=SAMPLES)
-    alpha = run.render(view, size=size, samples=SAMPLES)[..., 3]
+    ours = run.render(view, size=size, samples=SAMPLES)
     images = {
         "ground truth": _path_traced(name, DatasetOptions(**_traced(name, settings) | {"size": size}), view),
-        "ours": _shown(run, view, size),
-        "our normals": normal_colours(maps["normal"], alpha),
+        "ours": displayed_over(ours, np.ones(3)),
+        "our normals": normal_colours(maps["normal"], ours[..., 3]),
         "relit": _shown(relit, view, size),
     }
     return contact_sheet([_cropped(images)])

@@ -139,8 +139,8 @@ class AdaptiveControl:
     def fill(self) -> None:
         """Split the object's surfels with the largest error, as many as there is room for; prune none."""
         table, options = self.state.tables[0], replace(self.options, grow=1.0, prune_opacity=0.0)
-        error, weight = table.error_sum.numpy(), np.ones(table.surfels.count)
-        table.apply(refine.densify_and_prune(table.surfels, error, weight, np.inf, options, table.max_count))
+        error = table.error_sum.numpy()
+        table.apply(refine.densify_and_prune(table.surfels, error, None, np.inf, options, table.max_count))
         self.state.occluder.vertex_surfels = None
         table.clear()
 
@@ -151,7 +151,8 @@ class AdaptiveControl:
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
-        for table, weight in zip(state.tables, self._weights(), strict=True):
+        weights = self._weights() if options.prune_opacity else [None] * len(state.tables)
+        for table, weight in zip(state.tables, weights, strict=True):
             surfels, is_background = table.surfels, bool(table.prefix)
             largest: float | np.ndarray = options.prune_extent * data.scene_extent
             if is_background:  # its surfels may grow with their distance

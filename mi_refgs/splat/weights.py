@@ -14,7 +14,9 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 
-def blended_weights(surfels: Surfels, camera: Camera, maps: Sequence[Float] = (1.0,)) -> list[np.ndarray]:
+def blended_weights(
+    surfels: Surfels, camera: Camera, maps: Sequence[Float | float] = (1.0,)
+) -> list[np.ndarray]:
     """Sums Σ w m (N,) float64 of the blending weights of N surfels, for each map m (H·W,) of an image.
 
     A map of 1 gives weights in pixels. They are the gradient of Σ m Σ w f with respect to a feature f.

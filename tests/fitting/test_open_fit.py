@@ -25,6 +25,7 @@ from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.method import LossWeight, Method, Refine, SurroundingsOptions
+from mi_refgs.methods.window import Window
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -253,6 +254,20 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
     AdaptiveControl(trainer.setup, trainer.fit).refine(4)
     for weight, count, rows in zip(found, (80, 60), hidden, strict=True):
         assert weight.shape == (count,) and not weight[rows].any() and np.mean(weight > 0) > 0.5
+
+
+def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Method) -> None:
+    """Transparent surfels without weight stay: opacities have not had the time to rise."""
+    for reset, left in ((Window(0, 3, 3), 5), (None, 0)):
+        refined = replace(method.refine, reset=reset, propagate=None, prune_extent=10.0)
+        trainer = Trainer(replace(method, refine=refined), data)
+        table = trainer.fit.tables[0]
+        raw = table.surfels.to_numpy()
+        raw["opacity"][:5] = -10
+        table.replace(Surfels.from_numpy(raw))
+        AdaptiveControl(trainer.setup, trainer.fit).refine(4)
+        opacity = table.surfels.raw["opacity"].numpy()
+        assert np.sum(opacity < -9) == left and len(opacity) > 50
 
 
 def test_resume_repeats_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:

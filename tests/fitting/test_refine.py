@@ -46,7 +46,6 @@ def densify(
     options: Refine = OPTIONS,
     weight: np.ndarray | None = None,
 ) -> refine.TableEdit:
-    weight = np.ones(surfels.count) if weight is None else weight
     return refine.densify_and_prune(surfels, error, weight, largest, options, most)
 
 
@@ -101,13 +100,13 @@ def test_no_child_is_too_transparent_to_stay() -> None:
 
 
 def test_faint_surfels_are_removed() -> None:
-    """Those of the least weight, as long as they have at most a share of it; none after a reset."""
+    """Those of the least weight, as long as they have at most a share of it; none without weights."""
     weight = np.array([0.4, 0, 3, 0.4, 1, 0.2])
     for share, left in ((0, [0, 2, 3, 4, 5]), (0.05, [0, 2, 3, 4]), (0.13, [2, 3, 4]), (0.21, [2, 4])):
         options = dataclasses.replace(OPTIONS, prune_weight=share)
         assert densify(table(), np.zeros(6), weight=weight, options=options).parent.tolist() == left, share
-    waiting = dataclasses.replace(OPTIONS, prune_weight=0.2, prune_opacity=0.0)
-    assert len(densify(table(), np.zeros(6), weight=weight, options=waiting).parent) == 6
+    without = densify(table(), np.zeros(6), options=dataclasses.replace(OPTIONS, prune_weight=0.2))
+    assert without.parent.tolist() == [*range(6)]
 
 
 def test_ordered_rows_keep_their_values_and_parents() -> None:
