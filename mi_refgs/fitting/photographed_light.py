@@ -110,7 +110,7 @@ class PhotographedLight:
 
 
 def _shown(points: np.ndarray, view: View, depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Whether a view shows points (N, 3) rather than something in front of them: (N,) bool."""
+    """Whether points (N, 3) are visible in a view, not hidden by what is in front of them: (N,) bool."""
     row, column, inside = view.project(points)
     pixel = (
         np.clip(np.rint(where), 0, size - 1).astype(int)
