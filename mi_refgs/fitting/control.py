@@ -175,13 +175,12 @@ class AdaptiveControl:
 
     def _weights(self) -> list[np.ndarray]:
         """Blending weights (N,) of each table's surfels in training views, pixels of reduced images."""
-        tables = [table.surfels.detach() for table in self.state.tables]
-        every = tables[0] if len(tables) == 1 else tables[0].followed_by(tables[1])
+        every, own = self.state.geometry(), self.state.surfels.count
         views = self.setup.data.views
         cameras = (views[i].camera() for i in evenly_spread(len(views), WEIGHED_VIEWS))
         small = (c.resized(min(WEIGHED_SIZE, max(c.width, c.height))) for c in cameras)
         total = sum(blended_weights(every, camera)[0] for camera in small)
-        return np.split(np.asarray(total), [tables[0].count])[: len(tables)]
+        return np.split(np.asarray(total), [own])[: len(self.state.tables)]
 
     def exchange(self, region: Region, iteration: int) -> None:
         """Let the surfels beyond the border of a region change tables."""

@@ -154,6 +154,11 @@ class FitState:
         """The object, attached to the leaves that the optimiser owns."""
         return self.tables[0].surfels
 
+    def geometry(self) -> Surfels:
+        """Detached geometry of all surfels: the object's, then the background's."""
+        own, *others = (table.surfels.detach() for table in self.tables)
+        return own.followed_by(others[0]) if others else own
+
     @property
     def surroundings(self) -> Surroundings | None:
         """The background in images without alpha, also attached."""

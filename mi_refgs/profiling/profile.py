@@ -225,8 +225,8 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
 
 
 def count_work(trainer: Trainer) -> Work:
-    """Count the mean work of up to VIEWS training views."""
-    surfels = trainer.surfels.detach()
+    """Count the mean work of up to VIEWS training views, the background's included."""
+    surfels = trainer.fit.geometry()
     chosen = evenly_spread(len(trainer.targets), VIEWS)
     counts: list[Counts] = []
     pixels = []

@@ -38,16 +38,16 @@ from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, Composited, Footprints
 from tests.helpers import refused
-from tests.scenes.tiny import SETTINGS, SIZE
+from tests.scenes.tiny import SETTINGS, SIZE, write_open_data
 
 PAUSE = 0.25
 """Seconds that a planted sleep takes: far more than any stage of the tiny scene, on a busy machine too."""
 
 
-def new_trainer(data: Path, method: Path) -> Trainer:
+def new_trainer(data: Path, method: Path, *settings: str) -> Trainer:
     """Stages up to iterations 30 and 60."""
     until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
-    resolved = methods.load(str(method), "quick", [*SETTINGS, *until])
+    resolved = methods.load(str(method), "quick", [*SETTINGS, *until, *settings])
     return Trainer(resolved, data_module.read_dataset(data, "train"))
 
 
@@ -316,6 +316,18 @@ def test_work_is_counted_over_views(trainer: Trainer) -> None:
     fewer = count_work(trainer)
     assert fewer.unseen_share >= 0.25 > work.unseen_share
     assert fewer.contributing < work.contributing
+
+
+def test_work_includes_the_background(method: Path, tmp_path: Path) -> None:
+    """Its surfels cost what those of the object do."""
+    open_method = tmp_path / "open.toml"
+    open_method.write_text(method.read_text() + "[surroundings]\nheight = 8\n")
+    trainer = new_trainer(write_open_data(tmp_path / "data"), open_method, "surroundings.count=60")
+    both = count_work(trainer)
+    assert both.surfels == 140
+    del trainer.fit.tables[1]
+    alone = count_work(trainer)
+    assert alone.surfels == 80 and alone.pairs < both.pairs and alone.contributing < both.contributing
 
 
 def quiet_profile() -> Profile:
