@@ -23,7 +23,7 @@ from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import LIGHT, Method
-from mi_refgs.splat.weights import blended_weights
+from mi_refgs.splat.weights import blended_weights, listed_tiles
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
@@ -151,8 +151,8 @@ class AdaptiveControl:
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
-        weights = self._weights() if options.prune_opacity else [None] * len(state.tables)
-        for table, weight in zip(state.tables, weights, strict=True):
+        faint = self._faint() if options.prune_opacity else [None] * len(state.tables)
+        for table, few in zip(state.tables, faint, strict=True):
             surfels, is_background = table.surfels, bool(table.prefix)
             largest: float | np.ndarray = options.prune_extent * data.scene_extent
             if is_background:  # its surfels may grow with their distance
@@ -163,7 +163,7 @@ class AdaptiveControl:
             error = table.error_sum.numpy()
             table.apply(
                 refine.densify_and_prune(
-                    surfels, error, weight, largest, options, table.max_count, keep_one=is_background
+                    surfels, error, few, largest, options, table.max_count, keep_one=is_background
                 )
             )
         if self.setup.open_scene:
@@ -173,14 +173,19 @@ class AdaptiveControl:
         for table in state.tables:
             table.clear()
 
-    def _weights(self) -> list[np.ndarray]:
-        """Blending weights (N,) of each table's surfels in training views, pixels of reduced images."""
+    def _faint(self) -> list[np.ndarray]:
+        """The surfels (N,) bool of each table that have the least blending weight for the tiles they cost."""
         every, own = self.state.geometry(), self.state.surfels.count
         views = self.setup.data.views
         cameras = (views[i].camera() for i in evenly_spread(len(views), WEIGHED_VIEWS))
-        small = (c.resized(min(WEIGHED_SIZE, max(c.width, c.height))) for c in cameras)
-        total = sum(blended_weights(every, camera)[0] for camera in small)
-        return np.split(np.asarray(total), [own])[: len(self.state.tables)]
+        weight, cost = np.zeros(every.count), np.zeros(every.count)
+        for camera in cameras:
+            small = camera.resized(min(WEIGHED_SIZE, max(camera.width, camera.height)))
+            weight += blended_weights(every, small)[0]
+            cost += listed_tiles(every, small)
+        tables = zip(np.split(weight, [own]), np.split(cost, [own]), strict=True)
+        share, count = self.options.prune_weight, len(self.state.tables)
+        return [refine.least_weight(w, c, share) for w, c in tables][:count]
 
     def exchange(self, region: Region, iteration: int) -> None:
         """Let the surfels beyond the border of a region change tables."""

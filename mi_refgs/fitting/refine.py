@@ -68,7 +68,7 @@ def split_opacity(opacity: np.ndarray) -> np.ndarray:
 def densify_and_prune(
     surfels: Surfels,
     error: np.ndarray,  # (N,) squared error that the surfels are responsible for: Σ w e² over recent pixels
-    weight: np.ndarray | None,  # (N,) blending weights of the surfels, summed over pixels of views
+    faint: np.ndarray | None,  # (N,) bool, `least_weight`; None: none
     largest: float | np.ndarray,  # scene units, one or (N,): larger surfels are removed
     options: Refine,
     most: int,
@@ -76,11 +76,10 @@ def densify_and_prune(
 ) -> TableEdit:
     """Split the surfels with the largest error; remove faint, transparent and oversized ones.
 
-    Faint are those of the least weight, together at most `options.prune_weight` of all; without weights none
-    is. At most `most` surfels result. A surfel is split along its longest axis into two that together look
-    like it, so that the image hardly changes. After an opacity reset, neither faint nor transparent ones are
-    removed for `prune_wait` iterations: no weights and prune_opacity = 0. `keep_one`: the most opaque surfel
-    stays in any case. Raises InputError if no surfel would be left.
+    At most `most` surfels result. A surfel is split along its longest axis into two that together look like
+    it, so that the image hardly changes. After an opacity reset, neither faint nor transparent ones are
+    removed for `prune_wait` iterations: `faint` is None and prune_opacity 0. `keep_one`: the most opaque
+    surfel stays in any case. Raises InputError if no surfel would be left.
 
     Growth by error: Rota Bulò et al., Revising Densification in Gaussian Splatting, ECCV 2024, §3.1.
     """
@@ -89,8 +88,8 @@ def densify_and_prune(
     opacity = sigmoid(raw["opacity"][:, 0])
     size = primitive.extent(raw)[1].max(axis=1)
     keep = (size <= largest) & (opacity >= options.prune_opacity)
-    if weight is not None:
-        keep &= ~faint(weight, options.prune_weight)
+    if faint is not None:
+        keep &= ~faint
     if keep_one and not keep.any():
         keep[np.argmax(opacity)] = True
     if not keep.any():
@@ -124,9 +123,12 @@ def densify_and_prune(
     return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
 
 
-def faint(weight: np.ndarray, share: float) -> np.ndarray:
-    """The surfels (N,) bool of the least weight (N,) that together have at most this share of all weight."""
-    order = np.argsort(weight, kind="stable")
+def least_weight(weight: np.ndarray, cost: np.ndarray, share: float) -> np.ndarray:
+    """The surfels (N,) bool of the least weight per cost that together have at most this share of all weight.
+
+    `weight`: blending weights (N,); `cost`: tiles (N,) in whose lists they are.
+    """
+    order = np.argsort(weight / np.maximum(cost, 1), kind="stable")
     found = np.zeros(len(weight), bool)
     found[order[np.cumsum(weight[order]) <= share * weight.sum()]] = True
     return found

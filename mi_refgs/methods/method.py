@@ -161,7 +161,7 @@ class Refine:
     grow: float = 0.25  # fraction of the surfels, those with the largest error, that an event splits at most
     prune_opacity: float = 0.05  # surfels of less opacity are removed
     prune_extent: float = 0.1  # scene extents; larger surfels are removed
-    prune_weight: float = 0.002  # share of all blending weight; the surfels of the least are removed up to it
+    prune_weight: float = 0.01  # share of all blending weight; the surfels of the least per tile are removed
     reset: Window | None = None  # opacity to at most reset_opacity
     reset_opacity: float = 0.01  # after a reset, at most
     reset_raise: tuple[str, ...] = ()  # attributes that a reset raises to at least their initial value

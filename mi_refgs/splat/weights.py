@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.splat import splat
+from mi_refgs.splat import list_by_tile, project, splat
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
@@ -28,3 +28,10 @@ def blended_weights(
     if dr.grad_enabled(total):  # unless the view shows nothing
         dr.backward(total)
     return [np.array(dr.grad(feature), dtype=np.float64) for feature in features]
+
+
+def listed_tiles(surfels: Surfels, camera: Camera) -> np.ndarray:
+    """Tiles (N,) of an image in whose lists each of N surfels is: what it costs, wherever it is hidden."""
+    with dr.suspend_grad():
+        lists = list_by_tile(project(surfels, camera), camera)
+    return np.bincount(np.array(lists.surfel_from_pair), minlength=surfels.count)

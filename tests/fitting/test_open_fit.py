@@ -245,15 +245,15 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
         raw["opacity"][rows] = -10
         table.replace(Surfels.from_numpy(raw))
 
-    def edited(surfels: Surfels, error: Any, weight: np.ndarray, *others: Any, **options: Any) -> Any:
-        found.append(weight)
-        return densify(surfels, error, weight, *others, **options)
+    def edited(surfels: Surfels, error: Any, faint: np.ndarray, *others: Any, **options: Any) -> Any:
+        found.append(faint)
+        return densify(surfels, error, faint, *others, **options)
 
     densify = refine.densify_and_prune
     monkeypatch.setattr(refine, "densify_and_prune", edited)
     AdaptiveControl(trainer.setup, trainer.fit).refine(4)
-    for weight, count, rows in zip(found, (80, 60), hidden, strict=True):
-        assert weight.shape == (count,) and not weight[rows].any() and np.mean(weight > 0) > 0.5
+    for faint, count, rows in zip(found, (80, 60), hidden, strict=True):
+        assert faint.shape == (count,) and faint[rows].all() and np.mean(faint) < 0.5
 
 
 def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Method) -> None:

@@ -44,9 +44,9 @@ def densify(
     most: int = 100,
     largest: float = 0.1,
     options: Refine = OPTIONS,
-    weight: np.ndarray | None = None,
+    faint: np.ndarray | None = None,
 ) -> refine.TableEdit:
-    return refine.densify_and_prune(surfels, error, weight, largest, options, most)
+    return refine.densify_and_prune(surfels, error, faint, largest, options, most)
 
 
 def test_surfels_with_the_largest_error_are_split() -> None:
@@ -100,13 +100,18 @@ def test_no_child_is_too_transparent_to_stay() -> None:
 
 
 def test_faint_surfels_are_removed() -> None:
-    """Those of the least weight, as long as they have at most a share of it; none without weights."""
+    faint = np.array([False, True, False, False, True, False])
+    assert densify(table(), np.zeros(6), faint=faint).parent.tolist() == [0, 2, 3, 5]
+    assert densify(table(), np.zeros(6)).parent.tolist() == [*range(6)]
+
+
+def test_least_weight_is_counted_per_tile_up_to_a_share_of_it() -> None:
     weight = np.array([0.4, 0, 3, 0.4, 1, 0.2])
-    for share, left in ((0, [0, 2, 3, 4, 5]), (0.05, [0, 2, 3, 4]), (0.13, [2, 3, 4]), (0.21, [2, 4])):
-        options = dataclasses.replace(OPTIONS, prune_weight=share)
-        assert densify(table(), np.zeros(6), weight=weight, options=options).parent.tolist() == left, share
-    without = densify(table(), np.zeros(6), options=dataclasses.replace(OPTIONS, prune_weight=0.2))
-    assert without.parent.tolist() == [*range(6)]
+    for share, found in ((0, [1]), (0.05, [1, 5]), (0.13, [0, 1, 5]), (0.21, [0, 1, 3, 5])):
+        assert np.flatnonzero(refine.least_weight(weight, np.ones(6), share)).tolist() == found, share
+    cost = np.array([1, 0, 100, 1, 20, 1])
+    for share, found in ((0.5, [1]), (0.65, [1, 2]), (0.82, [1, 2, 4]), (0.85, [1, 2, 4, 5])):
+        assert np.flatnonzero(refine.least_weight(weight, cost, share)).tolist() == found, share
 
 
 def test_ordered_rows_keep_their_values_and_parents() -> None:

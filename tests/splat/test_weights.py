@@ -9,7 +9,7 @@ import pytest
 
 from mi_refgs.splat import splat
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.weights import blended_weights
+from mi_refgs.splat.weights import blended_weights, listed_tiles
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import raw_channels
 
@@ -37,3 +37,18 @@ def test_surfels_behind_the_camera_have_no_weights() -> None:
     surfels = Surfels.from_numpy(raw_channels())
     away = Camera.look_at((0, -4, 1), (0, -8, 1), fov=40, size=24)
     assert not blended_weights(surfels, away)[0].any()
+    assert not listed_tiles(surfels, away).any()
+
+
+def test_surfels_are_listed_in_the_tiles_that_they_cover(rng: np.random.Generator) -> None:
+    """A surfel contributes to the pixels of no other tile; behind others it costs as much."""
+    surfels, view = Surfels.from_numpy(raw_channels()), camera((0, -4, 1))
+    tiles = listed_tiles(surfels, view)
+    width, height = view.tile
+    for index in range(surfels.count):
+        alone = surfels.gather(mi.UInt32(index))
+        alpha = splat(alone, [], view).alpha.numpy().reshape(24, 24) > 0
+        rows, columns = np.nonzero(alpha)
+        shown = {(row // height, column // width) for row, column in zip(rows, columns, strict=True)}
+        assert len(shown) <= tiles[index] == listed_tiles(alone, view)[0]
+    assert tiles.max() > tiles.min() >= 1
