@@ -140,7 +140,9 @@ class AdaptiveControl:
         """Split the object's surfels with the largest error, as many as there is room for; prune none."""
         table, options = self.state.tables[0], replace(self.options, grow=1.0, prune_opacity=0.0)
         error = table.error_sum.numpy()
-        table.apply(refine.densify_and_prune(table.surfels, error, None, np.inf, options, table.max_count))
+        table.apply(
+            refine.densify_and_prune(table.surfels, error, refine.NO_ROWS, np.inf, options, table.max_count)
+        )
         self.state.occluder.vertex_surfels = None
         table.clear()
 
@@ -151,7 +153,7 @@ class AdaptiveControl:
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
-        faint = self._faint() if options.prune_opacity else [None] * len(state.tables)
+        faint = self._faint() if options.prune_opacity else [refine.NO_ROWS] * len(state.tables)
         for table, few in zip(state.tables, faint, strict=True):
             surfels, is_background = table.surfels, bool(table.prefix)
             largest: float | np.ndarray = options.prune_extent * data.scene_extent
@@ -174,7 +176,7 @@ class AdaptiveControl:
             table.clear()
 
     def _faint(self) -> list[np.ndarray]:
-        """The surfels (N,) bool of each table that have the least blending weight for the tiles they cost."""
+        """The rows of each table with the least blending weight for the tiles they cost, these first."""
         every, own = self.state.geometry(), self.state.surfels.count
         views = self.setup.data.views
         cameras = (views[i].camera() for i in evenly_spread(len(views), WEIGHED_VIEWS))

@@ -33,6 +33,7 @@ fit better, but the children then differ too little."""
 PRUNE_PATIENCE = 4.5
 """Factor of the fewest steps in which an opacity can grow back after a reset: 150 iterations as shipped.
 Factor 2 (67 iterations) was too small on a diffuse scene, which lost every surfel."""
+NO_ROWS = np.empty(0, np.int64)
 
 
 def prune_wait(options: Refine, rate: float) -> float:
@@ -68,18 +69,19 @@ def split_opacity(opacity: np.ndarray) -> np.ndarray:
 def densify_and_prune(
     surfels: Surfels,
     error: np.ndarray,  # (N,) squared error that the surfels are responsible for: Σ w e² over recent pixels
-    faint: np.ndarray | None,  # (N,) bool, `least_weight`; None: none
+    faint: np.ndarray,  # rows that may be removed for others, the first ones first: `least_weight`
     largest: float | np.ndarray,  # scene units, one or (N,): larger surfels are removed
     options: Refine,
     most: int,
     keep_one: bool = False,
 ) -> TableEdit:
-    """Split the surfels with the largest error; remove faint, transparent and oversized ones.
+    """Split the surfels with the largest error; remove transparent and oversized ones, and faint ones.
 
-    At most `most` surfels result. A surfel is split along its longest axis into two that together look like
-    it, so that the image hardly changes. After an opacity reset, neither faint nor transparent ones are
-    removed for `prune_wait` iterations: `faint` is None and prune_opacity 0. `keep_one`: the most opaque
-    surfel stays in any case. Raises InputError if no surfel would be left.
+    At most `most` surfels result; faint ones are removed as far as splits lack room. A surfel is split along
+    its longest axis into two that together look like it, so that the image hardly changes. After an opacity
+    reset, neither faint nor transparent ones are removed for `prune_wait` iterations: `faint` is empty and
+    prune_opacity 0. `keep_one`: the most opaque surfel stays in any case. Raises InputError if no surfel
+    would be left.
 
     Growth by error: Rota Bulò et al., Revising Densification in Gaussian Splatting, ECCV 2024, §3.1.
     """
@@ -88,8 +90,6 @@ def densify_and_prune(
     opacity = sigmoid(raw["opacity"][:, 0])
     size = primitive.extent(raw)[1].max(axis=1)
     keep = (size <= largest) & (opacity >= options.prune_opacity)
-    if faint is not None:
-        keep &= ~faint
     if keep_one and not keep.any():
         keep[np.argmax(opacity)] = True
     if not keep.any():
@@ -97,6 +97,10 @@ def densify_and_prune(
             "refine.prune_opacity: no surfel is opaque and small enough to stay; lower it, raise "
             "refine.prune_extent, or check that the images and their cameras belong together"
         )
+
+    # Early in a fit most surfels are faint, those that will be needed, too: they only make room.
+    needed = math.ceil((1 + options.grow) * keep.sum()) - most
+    keep[faint[keep[faint]][: max(needed, 0)]] = False
 
     # The surfels to split: those with the largest error, as many as there is room for.
     left = int(keep.sum())
@@ -124,14 +128,12 @@ def densify_and_prune(
 
 
 def least_weight(weight: np.ndarray, cost: np.ndarray, share: float) -> np.ndarray:
-    """The surfels (N,) bool of the least weight per cost that together have at most this share of all weight.
+    """Rows of the surfels that together have at most this share of all weight, least weight per cost first.
 
     `weight`: blending weights (N,); `cost`: tiles (N,) in whose lists they are.
     """
     order = np.argsort(weight / np.maximum(cost, 1), kind="stable")
-    found = np.zeros(len(weight), bool)
-    found[order[np.cumsum(weight[order]) <= share * weight.sum()]] = True
-    return found
+    return order[np.cumsum(weight[order]) <= share * weight.sum()]
 
 
 def reset_opacity(surfels: Surfels, options: Refine, floors: Mapping[str, float]) -> Surfels:

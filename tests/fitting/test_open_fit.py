@@ -253,14 +253,15 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
     monkeypatch.setattr(refine, "densify_and_prune", edited)
     AdaptiveControl(trainer.setup, trainer.fit).refine(4)
     for faint, count, rows in zip(found, (80, 60), hidden, strict=True):
-        assert faint.shape == (count,) and faint[rows].all() and np.mean(faint) < 0.5
+        assert np.isin(rows, faint).all() and len(faint) < count / 2
 
 
 def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Method) -> None:
-    """Transparent surfels without weight stay: opacities have not had the time to rise."""
+    """Transparent surfels without weight stay in a full table: opacities have not had the time to rise."""
     for reset, left in ((Window(0, 3, 3), 5), (None, 0)):
         refined = replace(method.refine, reset=reset, propagate=None, prune_extent=10.0)
-        trainer = Trainer(replace(method, refine=refined), data)
+        full = replace(method.surfels, max_count=method.surfels.count)
+        trainer = Trainer(replace(method, refine=refined, surfels=full), data)
         table = trainer.fit.tables[0]
         raw = table.surfels.to_numpy()
         raw["opacity"][:5] = -10

@@ -44,7 +44,7 @@ def densify(
     most: int = 100,
     largest: float = 0.1,
     options: Refine = OPTIONS,
-    faint: np.ndarray | None = None,
+    faint: np.ndarray = refine.NO_ROWS,
 ) -> refine.TableEdit:
     return refine.densify_and_prune(surfels, error, faint, largest, options, most)
 
@@ -99,19 +99,22 @@ def test_no_child_is_too_transparent_to_stay() -> None:
     assert len(densify(surfels, error, options=dataclasses.replace(OPTIONS, prune_opacity=0.0)).parent) == 8
 
 
-def test_faint_surfels_are_removed() -> None:
-    faint = np.array([False, True, False, False, True, False])
-    assert densify(table(), np.zeros(6), faint=faint).parent.tolist() == [0, 2, 3, 5]
-    assert densify(table(), np.zeros(6)).parent.tolist() == [*range(6)]
+def test_faint_surfels_make_room_for_splits() -> None:
+    """As many as splits need, the first ones first."""
+    options = dataclasses.replace(OPTIONS, grow=0.5)  # three of six
+    for most, kept in ((9, [0, 1, 2, 3, 4, 5]), (8, [0, 1, 2, 3, 5]), (7, [0, 2, 3, 5]), (6, [0, 2, 3, 5])):
+        edited = densify(table(), np.zeros(6), most, options=options, faint=np.array([4, 1]))
+        assert edited.parent.tolist() == kept, most
+    assert densify(table(), np.zeros(6), 6).parent.tolist() == [*range(6)]
 
 
 def test_least_weight_is_counted_per_tile_up_to_a_share_of_it() -> None:
     weight = np.array([0.4, 0, 3, 0.4, 1, 0.2])
-    for share, found in ((0, [1]), (0.05, [1, 5]), (0.13, [0, 1, 5]), (0.21, [0, 1, 3, 5])):
-        assert np.flatnonzero(refine.least_weight(weight, np.ones(6), share)).tolist() == found, share
+    for share, found in ((0, [1]), (0.05, [1, 5]), (0.13, [1, 5, 0]), (0.21, [1, 5, 0, 3])):
+        assert refine.least_weight(weight, np.ones(6), share).tolist() == found, share
     cost = np.array([1, 0, 100, 1, 20, 1])
     for share, found in ((0.5, [1]), (0.65, [1, 2]), (0.82, [1, 2, 4]), (0.85, [1, 2, 4, 5])):
-        assert np.flatnonzero(refine.least_weight(weight, cost, share)).tolist() == found, share
+        assert refine.least_weight(weight, cost, share).tolist() == found, share
 
 
 def test_ordered_rows_keep_their_values_and_parents() -> None:

@@ -198,7 +198,7 @@ def test_a_gaussian_is_split_along_its_longest_axis() -> None:
         "opacity": np.zeros((2, 1)),
     }
     gaussians = Surfels.from_numpy(raw)
-    edited = refine.densify_and_prune(gaussians, np.ones(2), None, 1.0, Refine(grow=1.0), 4)
+    edited = refine.densify_and_prune(gaussians, np.ones(2), refine.NO_ROWS, 1.0, Refine(grow=1.0), 4)
     children = edited.surfels.to_numpy()
     assert edited.parent.tolist() == [0, 1, 0, 1] and edited.fresh.all()
     offsets = children["position"] - 1

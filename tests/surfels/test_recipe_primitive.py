@@ -192,7 +192,7 @@ def test_balls_are_splatted_and_differentiated() -> None:
 def test_balls_are_split_and_written(tmp_path: Path) -> None:
     surfels = balls()
     error = np.arange(30.0) - 9  # two thirds have one
-    edited = refine.densify_and_prune(surfels, error, None, 10.0, Refine(grow=1.0), 90)
+    edited = refine.densify_and_prune(surfels, error, refine.NO_ROWS, 10.0, Refine(grow=1.0), 90)
     before, after = surfels.to_numpy(), edited.surfels.to_numpy()
     assert len(edited.parent) == 50 and edited.fresh.sum() == 40
     shrunk = np.where(edited.fresh, np.log(refine.SPLIT_SCALE), 0)
