@@ -129,9 +129,11 @@ def shown_whole(views: Sequence[View], region: Region, points: np.ndarray) -> bo
 def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region | None:
     """The region of an object from points (N, 3) on all surfaces of a fit; else as `object_region`.
 
-    It is a ball and a box around the object, above the planes of `region`; None if no group of points is the
-    object.
+    It is a ball and a box around the object, above the planes of `region`, or, if it has none, of these
+    points: a table without texture has no sparse points. None if no group of points is the object.
     """
+    if not region.planes:
+        region = replace(region, planes=support_planes(points, origins, region))
     group = object_points(region, points, seen, FITTED_LINK)
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
         return None
