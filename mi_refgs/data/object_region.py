@@ -24,6 +24,9 @@ PLANE_REACH = 2.0  # distance from the centre, in radii, up to which points dete
 PLANE_WIDTH = 0.01
 """Half the thickness, in radii, of the points of a plane: on *tabletop* of 98 % of those on the cloth (images
 of 135 × 240 pixels)."""
+FITTED_PLANE_WIDTH = 0.1
+"""The same of points on fitted surfaces, halfway through a fit: the varnished table of `figure` is off by a
+tenth of a radius there. Of widths from 0.06 to 0.15, all find it, 0.03 does not."""
 PLANE_MARGIN = 0.04
 """Height, in radii, above a plane at which the region begins. Half as much leaves surfels of the table with
 the object, which adds 4 % to its outline in short fits."""
@@ -58,18 +61,24 @@ Seen = Callable[[np.ndarray], np.ndarray]
 """Fraction (N,) of the views that show points (N, 3)."""
 
 
-def support_planes(points: np.ndarray, origins: np.ndarray, region: Region) -> tuple[Plane, ...]:
-    """The planes that support an object in a sphere, from points (N, 3) and camera positions (V, 3).
+def support_planes(
+    points: np.ndarray,  # (N, 3)
+    origins: np.ndarray,  # (V, 3) of the cameras
+    region: Region,
+    width: float = PLANE_WIDTH,  # half the thickness of a plane, radii
+    most: int = PLANE_COUNT,
+) -> tuple[Plane, ...]:
+    """The planes that support an object in a sphere, at most so many.
 
     Each is a PLANE_MARGIN above the surface. There are none without enough points on a plane that nearly all
     cameras look down at.
     """
     rng = np.random.default_rng(0)
-    radius, width = region.radius, PLANE_WIDTH * region.radius
+    radius, width = region.radius, width * region.radius
     points = points[np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * radius]
     points = rng.permutation(points)[:MOST_POINTS]
     least, found = max(PLANE_POINTS, PLANE_SHARE * len(points)), list[Plane]()
-    while len(points) >= least and len(found) < PLANE_COUNT:
+    while len(points) >= least and len(found) < most:
         # Planes through three points, with the cameras above.
         corner = points[rng.integers(len(points), size=(PLANE_DRAWS, 3))]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -129,11 +138,12 @@ def shown_whole(views: Sequence[View], region: Region, points: np.ndarray) -> bo
 def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region | None:
     """The region of an object from points (N, 3) on all surfaces of a fit; else as `object_region`.
 
-    It is a ball and a box around the object, above the planes of `region`, or, if it has none, of these
-    points: a table without texture has no sparse points. None if no group of points is the object.
+    It is a ball and a box around the object, above the planes of `region`, or, if it has none, above one of
+    these points: a table without texture has no sparse points. None if no group of points is the object.
     """
     if not region.planes:
-        region = replace(region, planes=support_planes(points, origins, region))
+        plane = support_planes(points, origins, region, FITTED_PLANE_WIDTH, most=1)
+        region = replace(region, planes=plane)
     group = object_points(region, points, seen, FITTED_LINK)
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
         return None

@@ -122,8 +122,10 @@ def test_surfaces_of_fit_enclose_object_alone(rng: np.random.Generator) -> None:
     assert found.contains(item[item[:, 2] > TABLE + 0.05]).all()
     assert not found.contains(beside).any() and not found.contains(table(rng)).any()
     # The plane may have had no sparse points; and there may be nothing.
+    points[:20_000, 2] -= abs(rng.normal(scale=0.1, size=20_000))  # a polished table is fitted too low
     again = fitted_region(Region((0, 0, 0.3), 1.2), origins, points, seen)
-    assert again is not None and not again.contains(beside).any() and not again.contains(table(rng)).any()
+    assert again is not None and again.contains(item[item[:, 2] > TABLE + 0.1]).all()
+    assert not again.contains(beside).any() and np.mean(again.contains(table(rng))) < 0.05
     assert fitted_region(region, origins, table(rng), seen) is None
 
 
