@@ -26,7 +26,7 @@ PLANE_WIDTH = 0.01
 of 135 × 240 pixels)."""
 FITTED_PLANE_WIDTH = 0.1
 """The same of points on fitted surfaces, halfway through a fit: the varnished table of `figure` is off by a
-tenth of a radius there. Of widths from 0.06 to 0.15, all find it, 0.03 does not."""
+tenth of a radius there. Widths from 0.06 to 0.15 find it, 0.03 does not."""
 PLANE_MARGIN = 0.04
 """Height, in radii, above a plane at which the region begins. Half as much leaves surfels of the table with
 the object, which adds 4 % to its outline in short fits."""
