@@ -1,7 +1,7 @@
 """Make docs/gallery: data, fit, scores and images of scenes of the package. A tool of maintainers.
 
 `python docs/gallery_maker.py --out docs/gallery` continues where an interrupted call stopped; files that
-exist are not made again.
+exist are not made again, except images of an exhibit that has been fitted anew.
 """
 
 from __future__ import annotations
@@ -148,13 +148,17 @@ def make_gallery(
             f"{out / RECORD}: the gallery was made with {record['settings']}, not {settings}; repeat "
             "that, or choose another --out"
         )
-    files = (FIRST, DECOMPOSITION, RELIT, TURNTABLE, EDITS)
-    output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{file}" for file in files)), marker=RECORD)
-    output.claim(RECORD, PAGE, *(f"{name}/{file}" for name in scenes for file in files))
+    images = (FIRST, DECOMPOSITION, RELIT, TURNTABLE, EDITS)
+    output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{image}" for image in images)), marker=RECORD)
+    output.claim(RECORD, PAGE, *(f"{name}/{image}" for name in scenes for image in images))
     found = dict(record["scenes"])
     for number, name in enumerate(scenes):
         say(f"{number + 1} of {len(scenes)}: {name}")
-        run, found[name] = _fitted(name, work / name, settings)
+        run, scores = _fitted(name, work / name, settings)
+        if scores != found.get(name):  # images of another fit
+            for image in images:
+                (out / name / image).unlink(missing_ok=True)
+        found[name] = scores
         _write_images(name, run, out / name, settings)
         made = {name: found[name] for name in EXHIBITS if name in found}
         write_json(out / RECORD, {"settings": settings, "scenes": made})

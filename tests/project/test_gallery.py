@@ -71,6 +71,16 @@ def test_existing_files_are_not_made_again(made: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
+def test_images_of_an_earlier_fit_are_made_again(made: Path) -> None:
+    record = made / "out" / maker.RECORD
+    stored = json.loads(record.read_text())
+    record.write_text(json.dumps(stored | {"scenes": {SCENE: stored["scenes"][SCENE] | {"psnr": 0.0}}}))
+    before = {path: path.stat().st_mtime_ns for path in (made / "out" / SCENE).iterdir()}
+    maker.make_gallery(made / "out", made / "work", (SCENE,), **SETTINGS)
+    assert all(path.stat().st_mtime_ns > before[path] for path in before)
+    assert json.loads(record.read_text()) == stored
+
+
 def test_unknown_scenes_and_other_settings_are_refused(made: Path) -> None:
     with pytest.raises(InputError, match="use some of mirror_ring"):
         maker.make_gallery(made / "other", scenes=("nothing",))
