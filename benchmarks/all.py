@@ -28,7 +28,7 @@ from benchmarks.common.build import RESULTS, commit, recorded, write_result
 from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
 from benchmarks.fits.measure import Workplace, group
-from benchmarks.fits.plan import GROUPS, RING
+from benchmarks.fits.plan import GROUPS, TIMED
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 
@@ -37,7 +37,7 @@ from mi_refgs.io.files import is_file, read_json
 class Part:
     """A data file, and the module with arguments that measures it.
 
-    {data} is --data, {work} the folder of the fits, {run} that of RING. A module with a page of its own
+    {data} is --data, {work} the folder of the fits, {run} that of TIMED. A module with a page of its own
     writes its file itself; others print JSON, which becomes `result`. Groups of fits have no module.
     """
 
@@ -47,7 +47,7 @@ class Part:
     small: str | None = None  # arguments of a small instance
 
 
-TRACING = {"front": 5, "images": 24, "relighting": 10, "methods": 4, "photographs": 14}
+TRACING = {"front": 5, "decisions": 20, "photographs": 14}
 """Minutes of path tracing in a group."""
 FITS = [
     Part(name, round(sum(fit.minutes for fit in fits)) + TRACING.get(name, 0), small="")
@@ -61,7 +61,7 @@ PARTS = (
     Part("memory", 6, "benchmarks.memory"),
     *FITS,
     Part("frames", 2, "mi_refgs profile {run} --json"),
-    Part("viewer", 9, "benchmarks.viewer {run} --minutes 7"),
+    Part("viewer", 4, "benchmarks.viewer {run} --minutes 2"),
     Part("capture", 1, "benchmarks.capture {work}/data/tabletop_captured {work}/data/tabletop_colmap --json"),
     Part("kill", 10, "benchmarks.survival kill", "--times 2"),
     Part("soak", 25, "benchmarks.survival soak", "--steps 1000"),
@@ -113,7 +113,7 @@ def is_done(path: Path, build: str) -> bool:
 def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
     """Measure a part, and print how long it took; returns whether that succeeded."""
     begin, work = time.monotonic(), folder / "work" if options.small else Path("runs", "all")
-    words = part.module.format(data=options.data, work=work, run=work / commit() / RING.name / "run").split()
+    words = part.module.format(data=options.data, work=work, run=work / commit() / TIMED.name / "run").split()
     words += (part.small or "").split() if options.small else []
     has_page = part.name in pages.TEMPLATES
     if has_page:

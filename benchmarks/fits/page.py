@@ -47,7 +47,7 @@ TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]
     "images": (
         _about,
         lambda rows: [
-            *_columns("PSNR=psnr", "2 × 2 samples=psnr_samples", method="auto"),
+            *_columns("PSNR=psnr", "4 × 4 samples=psnr_samples", method="auto"),
             *_columns("2DGS, PSNR=psnr", "2DGS, normals=normal_mae_deg", method="base_2dgs"),
             *_columns(*SHAPE, *TIME, method="auto"),
         ],
@@ -68,8 +68,10 @@ TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]
             for column in _columns(f"`{name}`=psnr", SHAPE[0], source=name)
         ],
     ),
-    "photographs": (_fit, lambda rows: _columns("PSNR=psnr", "region=psnr_region", SHAPE[0], *TIME)),
-    "times": (_fit, lambda rows: _columns("PSNR=psnr", *TIME)),
+    "photographs": (
+        _fit,
+        lambda rows: _columns("PSNR=psnr", "region=psnr_region", *SHAPE[:2], *MATERIALS, TIME[1]),
+    ),
 }
 """Group → title of a row (those of one title share a line), and columns."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 MAPS = ("potsdamer_platz_1k", "venice_sunset_1k")  # of Poly Haven, in envmaps/ of --data
 
@@ -22,22 +23,44 @@ class Source:
     images_of: str | None = None  # source whose images `refgs capture` gets
 
 
-TABLETOP = "--shapes jug handle knob --fov 42 --distance 2.7 3.4 --elevation 5 65".split()
+ROOM: dict[str, Any] = {"samples": 64, "views": (48, 8), "downscale": 1}
 SOURCES = {
     "mirror_ring": Source("gold ring around a steel ball, roughness 0.1"),
-    "mirror_balls": Source("steel and gold balls, roughness 0.1"),
-    "mixed": Source("metal and glaze, roughness 0.1 to 0.6", 256),
-    "diffuse": Source("clay and paint, the control"),
     "gold_cavities": Source("gold shell, roughness 0.15, around a ball of clay", 64),
     "plastic_hollows": Source("green plastic, roughness 0.22", 64),
-    "ceramic_cup": Source("blue and cream glaze, roughness 0.15", 64),
     "studded": Source("matte bricks, open below", 64),
-    "patched_ball": Source("bronze ball, roughness 0.1 and 0.3"),
     "glossy_demo": Source("glazed ball on a bronze block", 64, (60, 8), "112"),
-    "tabletop": Source("copper jug in a room", 64, size="270x480", options=(*TABLETOP,), downscale=1),
-    "tabletop_captured": Source("cameras and points by `refgs capture`", images_of="tabletop", downscale=1),
     "chair": Source("NeRF-Synthetic, at half its size", folder="chair_400", downscale=2),
-    "chair_full": Source("NeRF-Synthetic", folder="chair_400", downscale=1),
+    "tabletop": Source(
+        "copper jug in a room",
+        size="135x240",
+        options=(*"--shapes jug handle knob --fov 42 --distance 2.7 3.4 --elevation 5 65".split(),),
+        **ROOM,
+    ),
+    "tabletop_captured": Source("cameras and points by `refgs capture`", images_of="tabletop", downscale=1),
+    "figure": Source(
+        "red gloss and silver in a kitchen",
+        size="180x320",
+        options=(
+            *"--shapes red_parts silver_parts --fov 30 --distance 1.9 2.3 --elevation 8 55".split(),
+        ),
+        **ROOM,
+    ),
+    "can": Source(
+        "printed aluminium on bright tiles",
+        size="320x180",
+        options=(*"--shapes ends wall tab --fov 30 --distance 3.2 3.8 --elevation 10 55".split(),),
+        **ROOM,
+    ),
+    "glass_shelf": Source(
+        "glazed mug on glass",
+        size="180x320",
+        options=(
+            *"--shapes mug_outside mug_inside --max-depth 8 --fov 30 --distance 3.4 4.2".split(),
+            *"--elevation 5 55 --azimuth -160 -20".split(),
+        ),
+        **ROOM,
+    ),
 }
 
 
@@ -63,47 +86,29 @@ class Fit:
     def minutes(self) -> float:
         """Expected time with its evaluation, on an idle machine."""
         length = 9.0 if self.preset == "standard" else 4.5
-        return length * {"relighting": 1.6, "auto": 1.0}.get(self.method, 0.8) + (self.samples or 0) / 8
+        factor = {"relighting": 1.6, "auto": 1.0, "photographs": 2.4}.get(self.method, 0.8)
+        return length * factor + (self.samples or 0) / 8
 
 
 RING = Fit("mirror_ring", samples=4)
-"""The fit of which frames and the viewer are timed."""
 SHINY = ("mirror_ring", "gold_cavities", "plastic_hollows", "studded")
+ROOMS = ("tabletop", "figure", "can", "glass_shelf")
 ABLATIONS = """ref_gaussian gaussians_3d no_interreflection no_material_aware no_pbr no_initial_stage
     no_deferred ref_gaussian_paper base_3dgs_dr base_gaussian_shader base_r3dg base_3dgs base_2dgs""".split()
-REPEATED = ["ref_gaussian", "base_3dgs_dr", "base_2dgs"]  # with two seeds
+DECIDED = [Fit(name, preset="quick", samples=16) for name in (*SHINY, "glossy_demo", "chair")]
+TIMED = DECIDED[0]  # the fit of which frames and the viewer are timed
 
 GROUPS: dict[str, list[Fit]] = {
     "front": [
         RING,
         *(Fit(RING.source, method) for method in ("base_3dgs_dr", "base_2dgs", "relighting")),
     ],
-    "images": [
-        fit
-        for name in ("mirror_ring", "gold_cavities", "studded", "chair", "mirror_balls", "mixed", "diffuse")
-        for fit in (Fit(name, samples=4), Fit(name, "base_2dgs"))
-    ]
-    + [Fit("chair", "ref_gaussian")],
-    "decisions": [
-        *(Fit(x, preset="quick", samples=16) for x in (*SHINY, "glossy_demo", "chair", "chair_full")),
-        Fit("mirror_ring", settings=("select.surfels=40000",)),
-    ],
-    "relighting": [Fit(name, "relighting") for name in (*SHINY, "ceramic_cup")],
-    "methods": [
-        Fit(name, method, "quick", seed=seed)
-        for seed in (0, 1)
-        for name in ("mirror_ring", "patched_ball", "glossy_demo")
-        for method in (REPEATED if seed else ABLATIONS)
-    ],
+    "decisions": DECIDED,
+    "images": [fit for own in DECIDED for fit in (own, Fit(own.source, "base_2dgs", "quick"))],
+    "relighting": [Fit(name, "relighting", "quick") for name in SHINY],
+    "methods": [Fit("glossy_demo", method, "quick") for method in ABLATIONS],
     "photographs": [
-        Fit("tabletop", "photographs", "quick"),
+        *(Fit(name, method, "quick") for name in ROOMS for method in ("photographs", "base_3dgs")),
         Fit("tabletop_captured", "photographs", "quick"),
-        Fit("tabletop", "base_2dgs", "quick"),
-        Fit("tabletop", "base_3dgs", "quick"),
-    ],
-    "times": [
-        *(Fit(name, preset="quick", threads=2) for name in ("mirror_ring", "chair", "chair_full")),
-        Fit("chair", "base_2dgs", "quick", threads=2),
-        Fit("chair", "base_2dgs", "2000:40000", threads=2),
     ],
 }
