@@ -79,6 +79,8 @@ TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]
 def values(group: str, result: dict[str, Any]) -> dict[str, str]:
     """Return the tables of a group, and its numbers as SOURCE_METHOD_KEY, of the first row of both.
 
+    budget_CLASS_KEY are the shares of the error budget of the first row.
+
     Raises InputError for rows of several builds.
     """
     if {row["build"] for row in result["rows"]} != {result["build"]["commit"]}:
@@ -96,7 +98,10 @@ def values(group: str, result: dict[str, Any]) -> dict[str, str]:
     if relit := [score for row in rows for score in row.get("relit", {}).values()]:
         found |= {"relit_least": f"{min(relit):.1f} dB", "relit_most": f"{max(relit):.1f} dB"}
     if fine := rows[0].get("error_budget_samples"):
-        found["budget"] = _budget(rows[0]["error_budget"], fine)
+        budget = rows[0]["error_budget"]
+        found["budget"] = _budget(budget, fine)
+        for name, of in budget.items():
+            found |= {f"budget_{name}_{key}": _share(of[key]) for key in ("pixels", "squared_error")}
     return found
 
 
@@ -119,13 +124,14 @@ def _cell(rows: list[Row], key: str) -> str:
     return form.format(number.mean) + ("" if number.sd is None else f" ± {form.format(number.sd)}")
 
 
-def _budget(budget: dict[str, Any], fine: dict[str, Any]) -> str:
-    def share(x: float) -> str:
-        return f"{100 * x:.1f} %"
+def _share(x: float) -> str:
+    return f"{100 * x:.1f} %"
 
+
+def _budget(budget: dict[str, Any], fine: dict[str, Any]) -> str:
     lines = []
     for name, found in budget.items():
         angle = _cell([found], "normal_mae_deg")
-        squared = share(found["squared_error"]), angle, share(fine[name]["squared_error"])
-        lines.append([PIXEL_CLASSES[name], share(found["pixels"]), *squared])
+        squared = _share(found["squared_error"]), angle, _share(fine[name]["squared_error"])
+        lines.append([PIXEL_CLASSES[name], _share(found["pixels"]), *squared])
     return table(["class", "pixels", "squared error", "normal error", "squared error, 4 × 4 samples"], lines)

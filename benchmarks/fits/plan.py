@@ -85,7 +85,7 @@ class Fit:
     @property
     def minutes(self) -> float:
         """Expected time with its evaluation, on an idle machine."""
-        length = 9.0 if self.preset == "standard" else 4.5
+        length = 9.0 if self.preset == "standard" else 1.7 if self.source == "glossy_demo" else 4.5
         factor = {"relighting": 1.6, "auto": 1.0, "photographs": 2.4}.get(self.method, 0.8)
         return length * factor + (self.samples or 0) / 8
 

@@ -20,6 +20,7 @@ from benchmarks.common.build import RESULTS, merged, recorded, write_result
 from benchmarks.fits import page as fits
 from benchmarks.fits.plan import GROUPS, RING, SOURCES
 from mi_refgs.errors import InputError
+from mi_refgs.evaluation.scores import PIXEL_CLASSES
 from tests.helpers import ROOT, run_process
 
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in pages.PAGES}
@@ -77,20 +78,20 @@ def results(tmp_path: Path) -> Path:
     """A folder with two data files of one build."""
     build = recorded(dict)["build"] | {"commit": "abc", "clean": True}
     first = {"build": build, "seconds": 1.0, "rows": [row(), row(psnr=30.04), row(source="chair")]}
-    write_result(tmp_path / "times.json", first)
+    write_result(tmp_path / "front.json", first)
     write_result(tmp_path / "viewer.json", {"build": build, "seconds": 1.0, "result": {"a": [{"b": 7}]}})
     return tmp_path
 
 
 def test_markers_are_filled(results: Path) -> None:
-    names = ("times.mirror_ring_auto_psnr", "viewer.a_0_b", "kill.not_measured")
+    names = ("front.mirror_ring_auto_psnr", "viewer.a_0_b", "kill.not_measured")
     text = " ".join(f"<!-- {name} -->?<!-- / -->" for name in names)
     assert re.sub(r"<!--.*?-->", "", pages.filled(text, results)) == "28.0 dB 7 ?"
-    found = pages.filled("<!-- times.table -->?<!-- / -->", results)
+    found = pages.filled("<!-- front.table -->?<!-- / -->", results)
     assert "| 29.0 dB ± 1.4 dB |" in found and "*Commit abc, " in found and "load " in found
     assert pages.filled(found, results) == found
     with pytest.raises(InputError, match="correct the marker"):
-        pages.filled("<!-- times.nothing -->?<!-- / -->", results)
+        pages.filled("<!-- front.nothing -->?<!-- / -->", results)
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -107,13 +108,14 @@ def test_every_table_can_be_made(group: str) -> None:
         group, {"build": {"commit": "abc"}, "rows": [row(**whole), row(source="chair", **whole)]}
     )
     assert made["table"].count("\n") == (2 if group == "methods" else 3) and "50.0 %" in made["budget"]
+    assert made["budget_background_pixels"] == "50.0 %"
     assert ("+1.0 dB: chosen" in made["table"]) == (group == "decisions")
 
 
 def test_rows_and_tables_of_several_builds_are_refused(results: Path) -> None:
     result = {"build": {"commit": "abc"}, "rows": [row(), row(build="abd")]}
     with pytest.raises(InputError, match="several builds"):
-        fits.values("times", result)
+        fits.values("front", result)
     first = pages.values(results / "viewer.json")["about"]
     with pytest.raises(InputError, match="abc and abd; measure all with one"):
         merged([first, first | {"commit": "abd"}])
@@ -149,6 +151,7 @@ def test_printed_json_becomes_a_data_file(tmp_path: Path) -> None:
 def test_markers_name_numbers_of_planned_fits() -> None:
     for group, planned in GROUPS.items():
         names = {f"{fit.source}_{fit.method}_{key}" for fit in planned for key in fits.NUMBERS}
+        names |= {f"budget_{kind}_{key}" for kind in PIXEL_CLASSES for key in ("pixels", "squared_error")}
         assert pages.names_of(group) <= names | {"table", "budget", "relit_least", "relit_most"}
 
 
