@@ -49,7 +49,7 @@ class Part:
 
 TRACING = {"front": 5, "decisions": 20, "photographs": 14}
 """Minutes of path tracing in a group."""
-FITS = []
+FITS: list[Part] = []
 for name, fits in GROUPS.items():  # a fit of two groups is measured once
     new = set(fits).difference(*(GROUPS[part.name] for part in FITS))
     FITS.append(Part(name, round(sum(fit.minutes for fit in new)) + TRACING.get(name, 0), small=""))
