@@ -41,9 +41,7 @@ SOURCES = {
     "figure": Source(
         "red gloss and silver in a kitchen",
         size="180x320",
-        options=(
-            *"--shapes red_parts silver_parts --fov 30 --distance 1.9 2.3 --elevation 8 55".split(),
-        ),
+        options=(*"--shapes red_parts silver_parts --fov 30 --distance 1.9 2.3 --elevation 8 55".split(),),
         **ROOM,
     ),
     "can": Source(
