@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.fitting import refine
@@ -153,6 +154,9 @@ class AdaptiveControl:
         since_reset = options.reset.since(iteration) if options.reset is not None else None
         if since_reset is not None and since_reset < refine.prune_wait(options, method.rates.of("opacity")):
             options = replace(options, prune_opacity=0.0)
+        if self.setup.open_scene:
+            assert region is not None
+            self._clear_free_space(region)
         faint = self._faint() if options.prune_opacity else [refine.NO_ROWS] * len(state.tables)
         for table, few in zip(state.tables, faint, strict=True):
             surfels, is_background = table.surfels, bool(table.prefix)
@@ -174,6 +178,14 @@ class AdaptiveControl:
         state.occluder.vertex_surfels = None
         for table in state.tables:
             table.clear()
+
+    def _clear_free_space(self, region: Region) -> None:
+        """Remove the background's surfels right in front of cameras; one stays in any case."""
+        background = self.state.tables[1]
+        floating = in_free_space(self.setup.data.views, region, background.surfels.raw["position"].numpy())
+        floating &= np.cumsum(floating) < len(floating)
+        if floating.any():
+            background.remove(np.flatnonzero(floating))
 
     def _faint(self) -> list[np.ndarray]:
         """The rows of each table with the least blending weight for the tiles they cost, these first."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset, PointCloud
+from mi_refgs.data.object_region import in_free_space, seen_share
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, LightOptions, Method
@@ -87,8 +88,8 @@ def _within(count: int, region: Region, rng: np.random.Generator) -> np.ndarray:
 
 
 def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, 3) uniform in contracted space outside of the region, where enough views see them;
-    anywhere there if too few are seen."""
+    """Points (count, 3) uniform in contracted space outside of the region, where enough views see them and
+    none has them right before it; anywhere there if too few are seen."""
     nearest = 0.0 if region.planes else 1.0  # the sphere has points below planes
 
     def draw(number: int) -> np.ndarray:
@@ -101,8 +102,9 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
         if len(found) == count:
             break
         points = draw(4 * (count - len(found)))
-        seen = np.mean([view.project(points)[2] for view in data.views], axis=0) >= SEEN_SHARE
-        found = np.concatenate([found, points[seen]])[:count]
+        seen = seen_share(data.views, points) >= SEEN_SHARE
+        free = in_free_space(data.views, region, points)
+        found = np.concatenate([found, points[seen & ~free]])[:count]
     while len(found) < count:
         found = np.concatenate([found, draw(count - len(found))])
     return found

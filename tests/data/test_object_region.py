@@ -12,6 +12,7 @@ from mi_refgs.data.object_region import (
     camera_positions,
     enclosing_ball,
     fitted_region,
+    in_free_space,
     object_region,
     seen_share,
     shown_whole,
@@ -138,3 +139,13 @@ def test_enclosing_ball_is_smallest(rng: np.random.Generator) -> None:
     centre, radius = enclosing_ball(np.concatenate([points, dense]))
     np.testing.assert_allclose(centre, [1, 2, 3], atol=0.05)
     assert radius == pytest.approx(2, rel=0.03)
+
+
+def test_free_space_is_right_in_front_of_a_camera() -> None:
+    """Not behind or beside it, nor farther away than 0.15 of the distance to the object."""
+    views, region = views_around((0, 0, 0)), Region((0, 0, 0), 1)
+    pose, distance = views[0].to_world, np.linalg.norm(views[0].to_world[:3, 3])
+    local = np.array([[0, 0, 0.14], [0, 0, 0.16], [0, 0, -0.1], [0.1, 0, 0.1], [0.03, 0, 0.1]]) * distance
+    points = local @ pose[:3, :3].T + pose[:3, 3]
+    assert in_free_space(views[:1], region, points).tolist() == [True, False, False, False, True]
+    assert in_free_space(views, region, points)[0] and not in_free_space(views[1:2], region, points).any()

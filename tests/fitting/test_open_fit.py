@@ -14,6 +14,7 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
 from mi_refgs.data.images import ImageFile
+from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import object_surface, refine
@@ -254,6 +255,24 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
     AdaptiveControl(trainer.setup, trainer.fit).refine(4)
     for faint, count, rows in zip(found, (80, 60), hidden, strict=True):
         assert np.isin(rows, faint).all() and len(faint) < count / 2
+
+
+def test_space_in_front_of_cameras_is_cleared(data: Dataset, method: Method) -> None:
+    """Densification removes surfels of the background that a view has right before it, not of the object."""
+    trainer = Trainer(method, data)
+    eye = data.views[3].to_world[:3, 3]
+    place = eye + 0.1 * (np.array(REGION.centre) - eye)
+    for table in trainer.fit.tables:
+        raw = table.surfels.to_numpy()
+        raw["position"][:7] = place
+        raw["opacity"][:7] = 1
+        table.replace(Surfels.from_numpy(raw))
+    AdaptiveControl(trainer.setup, trainer.fit)._clear_free_space(REGION)
+    inner, background = (table.surfels.raw["position"].numpy() for table in trainer.fit.tables)
+    assert len(inner) == 80 and not in_free_space(data.views, REGION, background).any()
+    started = initial_parameters(method, data, np.random.default_rng(0), True)
+    assert len(background) == 60 - 7
+    assert not in_free_space(data.views, REGION, started["surroundings/position"].numpy()).any()
 
 
 def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Method) -> None:
