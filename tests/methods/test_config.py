@@ -208,7 +208,7 @@ def test_every_preset_has_the_same_events_in_the_same_order(
     monkeypatch.setattr(Trainer, "_gradient_step", lambda *_: None)
     sequences = {}
     for preset in methods.PRESETS:
-        method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20"])
+        method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20", "light.height=8"])
         trainer = Trainer(method, ball())
         done.clear()
         while trainer.iteration < method.iterations:
