@@ -170,11 +170,13 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
         texels[near, :-1] = parts[..., 0]
         texels[near, 1:] += parts[..., 1]
         texels *= np.sin(θ)[:, None]
-        rows = np.einsum("sn,ksc->nkc", shares, texels.reshape(h - 1, s, h + 1)) @ cosines
-        out[i, :-1] += rows[0]
-        out[i, 1:] += rows[1]
-        out[i] /= out[i, :, 0].sum()  # a constant map stays constant, exactly
-        out[h_out - 1 - i] = out[i, ::-1]
+        rows = shares.T @ texels.reshape(h - 1, s, h + 1)
+        out[i, :-1] += rows[:, 0]
+        out[i, 1:] += rows[:, 1]
+    half = (h_out + 1) // 2
+    out[:half] = (out[:half].reshape(-1, h + 1) @ cosines).reshape(half, h, h + 1)
+    out[:half] /= out[:half, :, :1].sum(axis=1, keepdims=True)  # a constant map stays constant, exactly
+    out[half:] = out[: h_out - half][::-1, ::-1]
     scale = np.full(h + 1, 2.0 / w)
     scale[[0, -1]] = 1.0 / w
     return out * scale
