@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import typing
 from collections import Counter
@@ -22,6 +23,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.build import scaled
 from mi_refgs.methods.method import LOSS_WEIGHTS
 from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import ROOT, refused
 from tests.scenes.highlight import ball
@@ -206,9 +208,10 @@ def test_every_preset_has_the_same_events_in_the_same_order(
         monkeypatch.setattr(refine, name, recorder(name, lambda surfels: surfels))
     monkeypatch.setattr(Trainer, "extract_mesh", lambda self, cameras: done.append("mesh"))
     monkeypatch.setattr(Trainer, "_gradient_step", lambda *_: None)
+    monkeypatch.setattr(Shading, "resolve", staticmethod(functools.cache(Shading.resolve)))
     sequences = {}
     for preset in methods.PRESETS:
-        method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20"])
+        method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20", "light.height=8"])
         trainer = Trainer(method, ball())
         done.clear()
         while trainer.iteration < method.iterations:

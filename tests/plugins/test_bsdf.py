@@ -70,7 +70,7 @@ def mean_weight(of: Any, wi: Any, ctx: Any = None, side: int = 512) -> Any:
 @pytest.mark.parametrize("roughness", [0.03, 0.2, 0.6, 1.0])
 @pytest.mark.parametrize("metallic", [0.0, 0.4, 1.0])
 def test_eval_is_the_formula(rng: np.random.Generator, roughness: float, metallic: float) -> None:
-    count = 200
+    count = 80
     wi = above(rng, count)
     normals = unit(np.array([0, 0, 1]) + roughness**2 * rng.normal(size=(count, 3)))
     wo = 2 * (wi * normals).sum(1, keepdims=True) * normals - wi

@@ -6,6 +6,7 @@ import importlib
 import json
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +32,25 @@ SETTINGS = {
         "mesh.resolution=16",
     ),
 }
+TURN, TEST_VIEWS = 4, 4
+"""Frames of a turntable, and test views, of the small gallery."""
 COMMITTED = ROOT / "docs" / "gallery"
 LIMIT = 5_000_000
 """Bytes of the gallery in the repository."""
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def few() -> Iterator[None]:
+    """Few frames and test views."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(maker, "TURN", TURN)
+        patch.setattr(maker, "TEST_VIEWS", TEST_VIEWS)
+        patch.setattr(maker, "EDIT_VIEWS", (0, TEST_VIEWS // 2))
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(few: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("gallery")
     maker.make_gallery(folder / "out", folder / "work", (SCENE,), **SETTINGS)
     return folder
@@ -46,7 +59,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_gallery_has_its_pictures(made: Path) -> None:
     folder = made / "out" / SCENE
     with Image.open(folder / "turntable.webp") as turntable:
-        assert turntable.n_frames == maker.TURN  # type: ignore[attr-defined]
+        assert turntable.n_frames == TURN  # type: ignore[attr-defined]
         assert turntable.size == (2 * maker.SHOWN * SIZE, maker.SHOWN * SIZE)
     for name in ("first", "decomposition", "relit", "edits"):
         with Image.open(folder / f"{name}.webp") as picture:

@@ -156,24 +156,27 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     θ = (np.arange((h - 1) * s) + 0.5) * (texel / s)
     # A sample lies between the texels d and d + 1: its bilinear weights, then the transform of the texels.
     shares = np.stack([1 - t, t], axis=1)
-    m, d = np.arange(h + 1), np.arange(h)
-    # Over half the circle, the other half is its mirror image: (h, 2, h+1).
-    cosines = np.cos(2 * np.pi / w * m * (d[:, None, None] + np.array([0, 1])[:, None]))
-    cosines = cosines.reshape(2 * h, h + 1)
+    m = np.arange(h + 1)
+    # Over half the circle, the other half is its mirror image: (h+1, h+1).
+    cosines = np.cos(2 * np.pi / w * m * np.arange(h + 1)[:, None])
     cos_φ = np.cos((np.arange(h * s) + 0.5) * (2 * np.pi / (w * s)))
     out = np.zeros((h_out, h, h + 1))
     for i, θ_out in enumerate(row_angles(h_out)[: (h_out + 1) // 2]):
         near = θ <= θ_out + 0.5 * np.pi  # rows beyond hold no light of this hemisphere
         cos_angle = np.outer(np.sin(θ_out) * np.sin(θ[near]), cos_φ)
         cos_angle += (np.cos(θ_out) * np.cos(θ[near]))[:, None]
-        texels = np.zeros((len(θ), 2 * h))
-        texels[near] = (lobe(cos_angle, roughness).reshape(-1, h, s) @ shares).reshape(-1, 2 * h)
+        parts = (lobe(cos_angle, roughness).reshape(-1, s) @ shares).reshape(-1, h, 2)
+        texels = np.zeros((len(θ), h + 1))
+        texels[near, :-1] = parts[..., 0]
+        texels[near, 1:] += parts[..., 1]
         texels *= np.sin(θ)[:, None]
-        rows = np.einsum("sn,ksc->nkc", shares, texels.reshape(h - 1, s, 2 * h)) @ cosines
-        out[i, :-1] += rows[0]
-        out[i, 1:] += rows[1]
-        out[i] /= out[i, :, 0].sum()  # a constant map stays constant, exactly
-        out[h_out - 1 - i] = out[i, ::-1]
+        rows = shares.T @ texels.reshape(h - 1, s, h + 1)
+        out[i, :-1] += rows[:, 0]
+        out[i, 1:] += rows[:, 1]
+    half = (h_out + 1) // 2
+    out[:half] = (out[:half].reshape(-1, h + 1) @ cosines).reshape(half, h, h + 1)
+    out[:half] /= out[:half, :, :1].sum(axis=1, keepdims=True)  # a constant map stays constant, exactly
+    out[half:] = out[: h_out - half][::-1, ::-1]
     scale = np.full(h + 1, 2.0 / w)
     scale[[0, -1]] = 1.0 / w
     return out * scale
