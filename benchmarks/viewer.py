@@ -87,6 +87,14 @@ class Viewer:
             self.process.kill()
 
 
+def browser_path() -> str:
+    """The installed browser; exits if there is none."""
+    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if found is None:
+        raise SystemExit("no chromium is installed; apt-get install chromium")
+    return found
+
+
 def first_picture(page: Any, url: str) -> float:
     """Seconds until the canvas shows something."""
     begin = time.monotonic()
@@ -184,15 +192,12 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     """All of it."""
     from playwright.sync_api import sync_playwright
 
-    browser_path = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if browser_path is None:
-        raise SystemExit("no chromium is installed; apt-get install chromium")
     width, height = (int(x) for x in args.window.split("x"))
     errors: list[str] = []
     with tempfile.TemporaryDirectory() as saved, sync_playwright() as playwright:
         viewer = Viewer(args.run, Path(saved))
         try:
-            browser = playwright.chromium.launch(executable_path=browser_path, args=OPTIONS)
+            browser = playwright.chromium.launch(executable_path=browser_path(), args=OPTIONS)
             page = browser.new_page(viewport={"width": width, "height": height})
             page.add_init_script(COUNTER)
             page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
