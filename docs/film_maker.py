@@ -1,7 +1,8 @@
-"""Film `refgs view RUN` in a headless browser: python docs/film_maker.py --run RUN --output docs/images/viewer.webp
+"""Film `refgs view RUN` in a headless browser. A tool of maintainers.
 
-A tool of maintainers. The camera turns, the display changes to normals and back, the light turns, and a
-material changes; every frame waits for the finished image. Needs the extra `dev`, and chromium.
+`python docs/film_maker.py --run RUN --output docs/images/viewer.webp`: the camera turns, the display changes
+to normals and back, the light turns, and a material changes; every frame waits for the finished image. Needs
+the extra `dev`, and chromium.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.viewer import COUNTER, OPTIONS, Viewer, browser_path, choose, first_picture
 from gallery_maker import write_turntable
+
+from benchmarks.viewer import COUNTER, OPTIONS, Viewer, browser_path, choose, first_picture
 
 WINDOW = {"width": 1000, "height": 640}  # pixels of the page
 STEP_SECONDS = 0.12  # of the film, per frame

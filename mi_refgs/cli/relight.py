@@ -67,7 +67,8 @@ class Relight:
         if relit.warning:
             warn(relit.warning)
         result = relit.result
-        lines = [f"{len(result['pictures'])} images, scene.xml and {SHEET} in {result['output']}"]
+        sheet = f"turntable/{SHEET}" if self.turntable else SHEET
+        lines = [f"{len(result['pictures'])} images, scene.xml and {sheet} in {result['output']}"]
         if result["psnr"] is None:
             lines.append(f"score: none: {result['score_reason']}")
         else:

@@ -86,8 +86,8 @@ def choose_metallic(trainer: Trainer, steps: int) -> str:
     trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("metallic",))
     trainer.fit.seconds = time.perf_counter() - begin
     reason = (
-        f"{metal:.2f} dB as metal, {dielectric:.2f} dB as dielectric; {metals.mean():.0%} of the surfels "
-        "start as metal"
+        f"{metal:.2f} dB as metal, {dielectric:.2f} dB as dielectric, metal needs {METAL_GAIN:g} dB more; "
+        f"{metals.mean():.0%} of the surfels start as metal"
     )
     trainer.fit.decisions.append(asdict(Decision("metal", 0, is_metal, reason)))
     return f"continues as {'metal' if is_metal else 'dielectric'}: {reason}"

@@ -6,7 +6,8 @@ The folder contains
     turntable/t_000.png     or these, of cameras around the object
     scene.xml, surfels.ply, envmap.exr, mesh.ply, model.json    from which `mi.load_file` renders the same
     relight.json            the settings, and the score where the data set has ground truth under this light
-    sheet.png               relit images and the ground truth, or the frames; and the environment map
+    sheet.png               relit images and the ground truth; and the environment map
+    turntable/relight.json, sheet.png    the same of a turntable, with the frames
 """
 
 from __future__ import annotations
@@ -150,8 +151,8 @@ def relight(
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
     radiance = new_light.radiance().numpy()
     sheet = contact_sheet(rows, {"environment map": tonemap(radiance, radiance)})
-    write_png(output.path / SHEET, sheet)
-    write_json(output.path / RESULT, result)
+    write_png(output.path / _beside(kind, SHEET), sheet)
+    write_json(output.path / _beside(kind, RESULT), result)
     warning = ""
     if fitted.shading.diffuse == "sh":
         warning = (
@@ -176,13 +177,19 @@ def _own_folder(run: Run, name: str, light: NewLight) -> OutputFolder:
     return next(o for o in outputs if o.owner in o.owners().values() or not o.path.exists())
 
 
+def _beside(kind: str, file: str) -> str:
+    """Return the path of RESULT or SHEET: a turntable's are with its frames, and replace no scores."""
+    return f"{kind}/{file}" if kind == "turntable" else file
+
+
 def _prepare(output: OutputFolder, kind: str, images: Sequence[str]) -> None:
     """Remove the images of the last call for the same light, and claim the names of the new ones."""
     out = output.path
     if (out / "config.toml").exists() or any(out.glob("transforms*.json")):
         what = "contains a run or a data set, whose files would be replaced"
         raise InputError(f"{out}: output: {what}; choose another -o")
-    names = [*images, *(str(Path(name).with_suffix(".exr")) for name in images), RESULT, SHEET]
+    names = [*images, *(str(Path(name).with_suffix(".exr")) for name in images)]
+    names += [_beside(kind, RESULT), _beside(kind, SHEET)]
     output.require_free([*names, *ARTEFACTS])
     stale = output.owned(f"{kind}/{PREFIX[kind]}_*.*")  # of more views, or another data set
     output.remove(path.relative_to(out).as_posix() for path in stale)

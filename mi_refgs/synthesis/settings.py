@@ -141,8 +141,8 @@ def prepare_folder(
 
 
 def _option(field: str) -> str:
-    """The option of `refgs dataset` that sets a field."""
-    names = {"scene": "SCENE", "scene_sha256": "SCENE", "height": "--size"}
+    """What sets a field: an option of `refgs dataset`, or the scene file."""
+    names = {"scene": "the scene file", "scene_sha256": "the scene file", "height": "--size"}
     names |= {"light_sha256": "--light", "objects": "--shapes", "spp": "--samples"}
     return names.get(field) or f"--{field.replace('_', '-')}"
 

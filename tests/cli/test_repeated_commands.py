@@ -94,7 +94,7 @@ KEPT: dict[str, dict[str, Row]] = {
         "--set": refuses("--set", "loss.ssim=0.4"),
     },
     "dataset": {
-        "scene": refuses("{scene2}", word="SCENE"),
+        "scene": refuses("{scene2}", word="the scene file"),
         "--output": WHERE,
         "--views": refuses("--views", "3"),
         "--test-views": refuses("--test-views", "2"),

@@ -175,11 +175,12 @@ def test_run_without_data_is_relit_around_the_object(
     light, out = known / "dusk.exr", tmp_path / "out"
     command = ["relight", str(run), "--envmap", str(light), "-o", str(out)]
     assert main([*command, "--turntable", str(turntable)]) == 0
-    result = json.loads((out / "relight.json").read_text())
+    folder = out / "turntable" if turntable else out
+    result = json.loads((folder / "relight.json").read_text())
     assert "cameras are around the object" in result["score_reason"] and result["psnr"] is None
     relit = load(run).relight(light)
     cameras = relit.turntable(turntable) if turntable else relit.cameras()
-    assert len(result["pictures"]) == len(cameras) and (out / "sheet.png").is_file()
+    assert len(result["pictures"]) == len(cameras) and (folder / "sheet.png").is_file()
     for name, camera in zip(result["pictures"], cameras, strict=True):
         shown = read_exr_image((out / name).with_suffix(".exr"))
         np.testing.assert_allclose(shown, relit.render(camera), atol=1e-4)
@@ -212,12 +213,14 @@ def test_relight_command(known: Path, tmp_path: Path, capfd: pytest.CaptureFixtu
 def test_relight_warns_of_fitted_diffuse_colour(known: Path, tmp_path: Path) -> None:
     run = write_known_run(known / "data", tmp_path / "run", diffuse="sh")
     relit = relight(run, NewLight(known / "dusk.exr"), turntable=2)
-    assert "--for relighting" in relit.warning and (tmp_path / "run/relight/dusk/sheet.png").is_file()
+    folder = tmp_path / "run/relight/dusk"
+    assert "--for relighting" in relit.warning and (folder / "turntable/sheet.png").is_file()
+    assert not (folder / "sheet.png").exists()  # nor are the scores of test views replaced
     turned = relight(run, NewLight(known / "dusk.exr", rotate=90, exposure=-1), turntable=1).result
     assert Path(turned["output"]) == tmp_path / "run/relight/dusk_r90_e-1"
     # Fewer frames leave none of the old ones behind.
     relight(run, NewLight(known / "dusk.exr"), turntable=1)
-    frames = (tmp_path / "run/relight/dusk/turntable").glob("*.png")
+    frames = (folder / "turntable").glob("t_*.png")
     assert [frame.name for frame in frames] == ["t_000.png"]
 
 

@@ -217,7 +217,7 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
     out = make_dataset(scene, tmp_path / "out", **{**tiny, "views": 2})
     refused(lambda: make_dataset(scene, out, **tiny), "dataset.json: --views:", "overwrite")
     scene.write_text(SCENE.replace("0.7", "0.6"))
-    refused(lambda: make_dataset(scene, out, **{**tiny, "views": 2}), "dataset.json: SCENE:")
+    refused(lambda: make_dataset(scene, out, **{**tiny, "views": 2}), "dataset.json: the scene file:")
     make_dataset(scene, out, **tiny, overwrite=True)
     assert not (out / "train/r_001.png").exists() and len(read_loaded(out, "train").views) == 1
     (out / "dataset.json").write_text("[]")
