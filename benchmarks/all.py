@@ -62,7 +62,6 @@ PARTS = (
     *FITS,
     Part("frames", 2, "mi_refgs profile {run} --json"),
     Part("viewer", 4, "benchmarks.viewer {run} --minutes 2"),
-    Part("capture", 1, "benchmarks.capture {work}/data/tabletop_captured {work}/data/tabletop_colmap --json"),
     Part("kill", 10, "benchmarks.survival kill", "--times 2"),
     Part("soak", 25, "benchmarks.survival soak", "--steps 1000"),
     Part(

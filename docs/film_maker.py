@@ -24,7 +24,7 @@ from gallery_maker import write_turntable
 
 from benchmarks.viewer import COUNTER, OPTIONS, Viewer, browser_path, choose, first_picture
 
-WINDOW = {"width": 1000, "height": 640}  # pixels of the page
+WINDOW: Any = {"width": 1000, "height": 640}  # pixels of the page
 STEP_SECONDS = 0.12  # of the film, per frame
 SETTLED_MS = 1200  # without a new image, after which the last one is finished
 DRAG = 11  # pixels per frame that the mouse drags the camera

@@ -43,11 +43,7 @@ class Workplace:
             if self.data is None or not (self.data / source.folder).is_dir():
                 raise InputError(f"--data: {source.folder}: missing; give the folder that contains it")
             return self.data / source.folder
-        if source.images_of is not None:
-            self.source(source.images_of)
-            refgs("capture", f"{target.with_name(source.images_of)}_colmap/images", "-o", target)
-            return target
-        extra: list[object] = ["--colmap", f"{target}_colmap"] if source.options else []
+        extra: list[object] = []
         if any(fit.source == name for fit in GROUPS["relighting"]):
             extra = ["--relight", *self.maps()]
         views, test_views = (8, 2) if self.small else source.views

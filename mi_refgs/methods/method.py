@@ -361,7 +361,7 @@ class Method:
     cameras: CameraOptions | None = None  # absent: no corrections
     seed: int = 0  # of initial surfels, order of views and random draws
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
-    preview_every: int = 1_000  # iterations
+    preview_every: int = 1_000  # iterations; the last one has a preview, too
     log_every: int = 50  # iterations
     metal_trial: MetalTrial | None = None  # absent: metallic learns from its initial value
     select: Selection | None = None  # absent: no trials

@@ -89,7 +89,8 @@ class Previews(Progress):
 
     def step(self, trainer: Trainer) -> None:
         """Write the first training view and the environment map, where a preview is due."""
-        if trainer.run is None or trainer.iteration % trainer.method.preview_every:
+        due = trainer.iteration in range(0, trainer.method.iterations, trainer.method.preview_every)
+        if trainer.run is None or not (due or trainer.iteration == trainer.method.iterations):
             return
         view = trainer.data.views[0].load()
         rendered = RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
