@@ -27,6 +27,7 @@ SOURCES = {
     "mirror_ring": Source("gold ring around a steel ball, roughness 0.1"),
     "gold_cavities": Source("gold shell, roughness 0.15, around a ball of clay", 64),
     "plastic_hollows": Source("green plastic, roughness 0.22", 64),
+    "studded": Source("matte bricks, open below", 64),
     "glossy_demo": Source("glazed ball on a bronze block", 64, (60, 8), "112"),
     "chair": Source("NeRF-Synthetic, at half its size", folder="chair_400", downscale=2),
     "tabletop": Source(
@@ -47,6 +48,13 @@ SOURCES = {
         options=(*"--shapes ends wall tab --fov 30 --distance 3.2 3.8 --elevation 10 55".split(),),
         **ROOM,
     ),
+    "glass_shelf": Source(
+        "glazed mug on glass",
+        size="180x320",
+        options=(
+            *"--shapes mug_outside mug_inside --max-depth 8 --fov 30 --distance 3.4 4.2".split(),
+            *"--elevation 5 55 --azimuth -160 -20".split(),
+        ),
 }
 
 
@@ -81,7 +89,8 @@ SHINY = ("mirror_ring", "gold_cavities", "plastic_hollows")
 ROOMS = ("tabletop", "figure", "can")
 ABLATIONS = """ref_gaussian gaussians_3d no_interreflection no_material_aware no_pbr no_initial_stage
     no_deferred ref_gaussian_paper base_3dgs_dr base_gaussian_shader base_r3dg base_3dgs base_2dgs""".split()
-DECIDED = [Fit(name, preset="quick", samples=16) for name in ("mirror_ring", "glossy_demo", "chair")]
+DECIDED_SCENES = ("mirror_ring", "glossy_demo", "chair", "studded", "plastic_hollows")
+DECIDED = [Fit(name, preset="quick", samples=16) for name in DECIDED_SCENES]
 TIMED = DECIDED[0]  # the fit of which frames and the viewer are timed
 
 GROUPS: dict[str, list[Fit]] = {
