@@ -55,6 +55,8 @@ SOURCES = {
             *"--shapes mug_outside mug_inside --max-depth 8 --fov 30 --distance 3.4 4.2".split(),
             *"--elevation 5 55 --azimuth -160 -20".split(),
         ),
+        **ROOM,
+    ),
 }
 
 
