@@ -95,7 +95,8 @@ def values(group: str, result: dict[str, Any]) -> dict[str, str]:
     found = {"table": table(["", *(head for head, _, _ in chosen)], body)}
     for row in reversed(rows):
         found |= {f"{row['source']}_{row['method']}_{key}": _cell([row], key) for key in NUMBERS}
-    if relit := [score for row in rows for score in row.get("relit", {}).values()]:
+    scores = [score for row in rows for score in row.get("relit", {}).values()]
+    if relit := [score for score in scores if score is not None]:
         found |= {"relit_least": f"{min(relit):.1f} dB", "relit_most": f"{max(relit):.1f} dB"}
     if fine := rows[0].get("error_budget_samples"):
         budget = rows[0]["error_budget"]
