@@ -98,8 +98,8 @@ EXHIBITS: dict[str, Exhibit] = {
         "A gold shell with six windows, roughness 0.15, around a ball of clay: concave metal.",
         {
             "silver": {"where": "metallic > 0.5", "set": ["albedo=0.95,0.93,0.88"]},
-            "polished": {"where": "metallic > 0.5", "set": ["roughness=0.05"]},
-            "empty": {"where": "metallic < 0.5", "cut": True},
+            "copper": {"where": "metallic > 0.5", "set": ["albedo=0.93,0.48,0.34"]},
+            "brushed": {"where": "metallic > 0.5", "set": ["roughness=0.45"]},
         },
     ),
     "studded": Exhibit(
