@@ -17,6 +17,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from benchmarks.common.build import RESULTS, commit, recorded, write_result
 from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
 from benchmarks.fits.measure import Workplace, group
-from benchmarks.fits.plan import GROUPS, TIMED
+from benchmarks.fits.plan import GROUPS, TIMED, Fit
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 
@@ -49,17 +50,23 @@ class Part:
 
 TRACING = {"front": 5, "decisions": 20, "photographs": 14}
 """Minutes of path tracing in a group."""
-FITS: list[Part] = []
-for name, fits in GROUPS.items():  # a fit of two groups is measured once
-    new = set(fits).difference(*(GROUPS[part.name] for part in FITS))
-    FITS.append(Part(name, round(sum(fit.minutes for fit in new)) + TRACING.get(name, 0), small=""))
+
+
+def _fits() -> Iterator[Part]:
+    done: set[Fit] = set()  # a fit of two groups is measured once
+    for name, fits in GROUPS.items():
+        minutes = sum(fit.minutes for fit in {*fits} - done) + TRACING.get(name, 0)
+        yield Part(name, round(minutes), small="")
+        done |= {*fits}
+
+
 PARTS = (
     Part("splatting", 5, "benchmarks.splatting", "--small"),
     Part("splitsum", 9, "benchmarks.splitsum", "--small"),
     Part("visibility", 4, "benchmarks.visibility --mesh {data}/meshes/bob_tri.obj", "--small"),
     Part("stability", 15, "benchmarks.stability", "--quick --only light"),
     Part("memory", 6, "benchmarks.memory"),
-    *FITS,
+    *_fits(),
     Part("frames", 2, "mi_refgs profile {run} --json"),
     Part("viewer", 4, "benchmarks.viewer {run} --minutes 2"),
     Part("kill", 10, "benchmarks.survival kill", "--times 2"),

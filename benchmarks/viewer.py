@@ -26,6 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -87,12 +88,32 @@ class Viewer:
             self.process.kill()
 
 
-def browser_path() -> str:
-    """The installed browser; exits if there is none."""
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
+def find_browser() -> str | None:
+    """The installed browser."""
+    return next((path for name in BROWSERS if (path := shutil.which(name))), None)
+
+
+@contextlib.contextmanager
+def opened(run: Path, window: str) -> Iterator[tuple[Viewer, Any]]:
+    """`refgs view` of a run, and an empty page, WIDTHxHEIGHT pixels, that counts its images as COUNTER does.
+
+    Exits if no browser is installed.
+    """
+    from playwright.sync_api import sync_playwright
+
+    if (browser_path := find_browser()) is None:
         raise SystemExit("no chromium is installed; apt-get install chromium")
-    return found
+    width, height = (int(x) for x in window.split("x"))
+    with tempfile.TemporaryDirectory() as saved, sync_playwright() as playwright:
+        viewer = Viewer(run, Path(saved))
+        try:
+            browser = playwright.chromium.launch(executable_path=browser_path, args=OPTIONS)
+            page = browser.new_page(viewport={"width": width, "height": height})
+            page.add_init_script(COUNTER)
+            yield viewer, page
+            browser.close()
+        finally:
+            viewer.stop()
 
 
 def first_picture(page: Any, url: str) -> float:
@@ -190,41 +211,30 @@ def click_about(page: Any, viewer: Viewer, seconds: float, seed: int) -> dict[st
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """All of it."""
-    from playwright.sync_api import sync_playwright
-
-    width, height = (int(x) for x in args.window.split("x"))
     errors: list[str] = []
-    with tempfile.TemporaryDirectory() as saved, sync_playwright() as playwright:
-        viewer = Viewer(args.run, Path(saved))
-        try:
-            browser = playwright.chromium.launch(executable_path=browser_path(), args=OPTIONS)
-            page = browser.new_page(viewport={"width": width, "height": height})
-            page.add_init_script(COUNTER)
-            page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-            page.on("pageerror", lambda error: errors.append(str(error)))
-            result: dict[str, Any] = {
-                "run": str(args.run),
-                "window": args.window,
-                "cores": os.cpu_count(),
-                "load_before": os.getloadavg()[0],
-                "ready_s": round(viewer.ready_s, 2),
-                "first_picture_s": round(first_picture(page, viewer.url), 2),
-            }
+    with opened(args.run, args.window) as (viewer, page):
+        page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        result: dict[str, Any] = {
+            "run": str(args.run),
+            "window": args.window,
+            "cores": os.cpu_count(),
+            "load_before": os.getloadavg()[0],
+            "ready_s": round(viewer.ready_s, 2),
+            "first_picture_s": round(first_picture(page, viewer.url), 2),
+        }
+        page.wait_for_timeout(3000)
+        result["orbit"] = orbit(page, viewer, args.seconds)
+        for side in args.moving:
+            choose(page, "Moving", f"{side}²")
             page.wait_for_timeout(3000)
-            result["orbit"] = orbit(page, viewer, args.seconds)
-            for side in args.moving:
-                choose(page, "Moving", f"{side}²")
-                page.wait_for_timeout(3000)
-                orbit(page, viewer, 2)  # the first of this size
-                result[f"orbit_{side}"] = orbit(page, viewer, args.seconds)
-            choose(page, "Moving", "automatic")
-            if args.minutes > 0:
-                result["clicks"] = click_about(page, viewer, 60 * args.minutes, args.seed)
-            result["console_errors"] = errors
-            result["load_after"] = os.getloadavg()[0]
-            browser.close()
-        finally:
-            viewer.stop()
+            orbit(page, viewer, 2)  # the first of this size
+            result[f"orbit_{side}"] = orbit(page, viewer, args.seconds)
+        choose(page, "Moving", "automatic")
+        if args.minutes > 0:
+            result["clicks"] = click_about(page, viewer, 60 * args.minutes, args.seed)
+        result["console_errors"] = errors
+        result["load_after"] = os.getloadavg()[0]
     return result
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from gallery_maker import write_turntable
 
-from benchmarks.viewer import COUNTER, OPTIONS, Viewer, browser_path, choose, first_picture
+from benchmarks.viewer import choose, first_picture, opened
 
-WINDOW: Any = {"width": 1000, "height": 640}  # pixels of the page
+WINDOW = "1000x640"  # pixels of the page
 STEP_SECONDS = 0.12  # of the film, per frame
 SETTLED_MS = 1200  # without a new image, after which the last one is finished
 DRAG = 11  # pixels per frame that the mouse drags the camera
@@ -32,20 +31,11 @@ DRAG = 11  # pixels per frame that the mouse drags the camera
 
 def film(run: Path, output: Path) -> None:
     """Write the film of a run to `output` (WebP)."""
-    from playwright.sync_api import sync_playwright
-
-    with tempfile.TemporaryDirectory() as saved, sync_playwright() as playwright:
-        viewer = Viewer(run, Path(saved))
-        try:
-            browser = playwright.chromium.launch(executable_path=browser_path(), args=OPTIONS)
-            page = browser.new_page(viewport=WINDOW)
-            page.add_init_script(COUNTER)
-            first_picture(page, viewer.url)
-            frames = [np.array(Image.open(io.BytesIO(page.screenshot()))) for _ in scenes(page)]
-        finally:
-            viewer.stop()
-    shown = [frame[..., :3] / 255.0 for frame in frames]
-    write_turntable(output, shown, STEP_SECONDS * len(shown))
+    with opened(run, WINDOW) as (viewer, page):
+        first_picture(page, viewer.url)
+        shots = [Image.open(io.BytesIO(page.screenshot())).convert("RGB") for _ in scenes(page)]
+    frames = [np.array(shot) / 255.0 for shot in shots]
+    write_turntable(output, frames, STEP_SECONDS * len(frames))
 
 
 def scenes(page: Any) -> Iterator[None]:

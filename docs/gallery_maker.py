@@ -156,8 +156,7 @@ def make_gallery(
         say(f"{number + 1} of {len(scenes)}: {name}")
         run, scores = _fitted(name, work / name, settings)
         if scores != found.get(name):  # images of another fit
-            for image in images:
-                (out / name / image).unlink(missing_ok=True)
+            output.remove(f"{name}/{image}" for image in images)
         found[name] = scores
         _write_images(name, run, out / name, settings)
         made = {name: found[name] for name in EXHIBITS if name in found}

@@ -43,9 +43,8 @@ class Workplace:
             if self.data is None or not (self.data / source.folder).is_dir():
                 raise InputError(f"--data: {source.folder}: missing; give the folder that contains it")
             return self.data / source.folder
-        extra: list[object] = []
-        if any(fit.source == name for fit in GROUPS["relighting"]):
-            extra = ["--relight", *self.maps()]
+        is_relit = any(fit.source == name for fit in GROUPS["relighting"])
+        extra = ["--relight", *self.maps()] if is_relit else []
         views, test_views = (8, 2) if self.small else source.views
         numbers = ["--views", views, "--test-views", test_views, "--size", 32 if self.small else source.size]
         numbers += ["--samples", 2 if self.small else source.samples]
@@ -76,7 +75,7 @@ def measured(fit: Fit, place: Workplace) -> Row:
 
 def _fitted(fit: Fit, data: Path, run: Path, place: Workplace) -> Row:
     threads = ("--threads", fit.threads)
-    options = ["--method", fit.method, *threads, "--set", f"seed={fit.seed}", *fit.settings]
+    options = ["--method", fit.method, *threads, "--set", f"seed={fit.seed}"]
     if (downscale := SOURCES[fit.source].downscale) is not None:
         options.append(f"data.downscale={downscale}")
     if not run.exists() and not place.small:  # compiles the kernels

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
 
 MAPS = ("potsdamer_platz_1k", "venice_sunset_1k")  # of Poly Haven, in envmaps/ of --data
 
@@ -20,42 +19,40 @@ class Source:
     options: tuple[str, ...] = ()  # of `refgs dataset`
     folder: str | None = None  # below --data
     downscale: int | None = None  # pixels of a file per pixel of a fit, along a side
+    minutes: float = 4.5  # of a fit at `quick`, on an idle machine
 
 
-ROOM: dict[str, Any] = {"samples": 64, "views": (48, 8), "downscale": 1}
+def _room(about: str, size: str, options: str) -> Source:
+    return Source(about, 64, (48, 8), size, (*options.split(),), downscale=1)
+
+
 SOURCES = {
     "mirror_ring": Source("gold ring around a steel ball, roughness 0.1"),
     "gold_cavities": Source("gold shell, roughness 0.15, around a ball of clay", 64),
     "plastic_hollows": Source("green plastic, roughness 0.22", 64),
     "studded": Source("matte bricks, open below", 64),
-    "glossy_demo": Source("glazed ball on a bronze block", 64, (60, 8), "112"),
+    "glossy_demo": Source("glazed ball on a bronze block", 64, (60, 8), "112", minutes=1.7),
     "chair": Source("NeRF-Synthetic, at half its size", folder="chair_400", downscale=2),
-    "tabletop": Source(
+    "tabletop": _room(
         "copper jug in a room",
-        size="135x240",
-        options=(*"--shapes jug handle knob --fov 42 --distance 2.7 3.4 --elevation 5 65".split(),),
-        **ROOM,
+        "135x240",
+        "--shapes jug handle knob --fov 42 --distance 2.7 3.4 --elevation 5 65",
     ),
-    "figure": Source(
+    "figure": _room(
         "red gloss and silver in a kitchen",
-        size="180x320",
-        options=(*"--shapes red_parts silver_parts --fov 30 --distance 1.9 2.3 --elevation 8 55".split(),),
-        **ROOM,
+        "180x320",
+        "--shapes red_parts silver_parts --fov 30 --distance 1.9 2.3 --elevation 8 55",
     ),
-    "can": Source(
+    "can": _room(
         "printed aluminium on bright tiles",
-        size="320x180",
-        options=(*"--shapes ends wall tab --fov 30 --distance 3.2 3.8 --elevation 10 55".split(),),
-        **ROOM,
+        "320x180",
+        "--shapes ends wall tab --fov 30 --distance 3.2 3.8 --elevation 10 55",
     ),
-    "glass_shelf": Source(
+    "glass_shelf": _room(
         "glazed mug on glass",
-        size="180x320",
-        options=(
-            *"--shapes mug_outside mug_inside --max-depth 8 --fov 30 --distance 3.4 4.2".split(),
-            *"--elevation 5 55 --azimuth -160 -20".split(),
-        ),
-        **ROOM,
+        "180x320",
+        "--shapes mug_outside mug_inside --max-depth 8 --fov 30 --distance 3.4 4.2 --elevation 5 55 "
+        "--azimuth -160 -20",
     ),
 }
 
@@ -67,7 +64,6 @@ class Fit:
     source: str
     method: str = "auto"
     preset: str = "standard"
-    settings: tuple[str, ...] = ()  # KEY=VALUE
     threads: int = 1
     seed: int = 0
     samples: int | None = None  # per pixel, of a second evaluation
@@ -75,13 +71,13 @@ class Fit:
     @property
     def name(self) -> str:
         """Its folder."""
-        parts = (self.source, self.method, self.preset, *self.settings, f"seed{self.seed}", self.threads)
+        parts = (self.source, self.method, self.preset, f"seed{self.seed}", self.threads)
         return re.sub(r"[^\w.]+", "_", "-".join(map(str, parts)))
 
     @property
     def minutes(self) -> float:
         """Expected time with its evaluation, on an idle machine."""
-        length = 9.0 if self.preset == "standard" else 1.7 if self.source == "glossy_demo" else 4.5
+        length = SOURCES[self.source].minutes * (2 if self.preset == "standard" else 1)
         factor = {"relighting": 1.6, "auto": 1.0, "photographs": 2.4}.get(self.method, 0.8)
         return length * factor + (self.samples or 0) / 8
 
@@ -104,5 +100,9 @@ GROUPS: dict[str, list[Fit]] = {
     "images": [fit for own in DECIDED for fit in (own, Fit(own.source, "base_2dgs", "quick"))],
     "relighting": [Fit(name, "relighting", "quick") for name in SHINY],
     "methods": [Fit("glossy_demo", method, "quick") for method in ABLATIONS],
-    "photographs": [Fit(name, method, "quick") for name in ROOMS for method in ("photographs", "base_3dgs")],
+    "photographs": [
+        *(Fit(name, method, "quick") for name in ROOMS for method in ("photographs", "base_3dgs")),
+        Fit("glass_shelf", "photographs", "quick"),
+        Fit("tabletop", "relighting", "quick"),
+    ],
 }

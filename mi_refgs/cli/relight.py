@@ -51,7 +51,7 @@ class Relight:
     def run(self) -> Result:
         """Relight the run."""
         from mi_refgs.reconstruction.new_light import NewLight
-        from mi_refgs.relighting.relight import SHEET, relight
+        from mi_refgs.relighting.relight import relight
         from mi_refgs.runs.run import Run
 
         relit = relight(
@@ -67,8 +67,7 @@ class Relight:
         if relit.warning:
             warn(relit.warning)
         result = relit.result
-        sheet = f"turntable/{SHEET}" if self.turntable else SHEET
-        lines = [f"{len(result['pictures'])} images, scene.xml and {sheet} in {result['output']}"]
+        lines = [f"{len(result['pictures'])} images, scene.xml and {relit.sheet} in {result['output']}"]
         if result["psnr"] is None:
             lines.append(f"score: none: {result['score_reason']}")
         else:

@@ -43,8 +43,8 @@ ABOVE_SHARE = 0.9  # fraction of the cameras that are above a support plane
 REFITS = 5  # rounds of least squares that follow the best draw
 SEEN_SHARE = 0.4  # fraction of the views that show a point of the object; close views leave some parts out
 FREE_SHARE = 0.15
-"""Depth over that of the region's centre, up to which the space in front of a camera is empty. A camera 5°
-above a table, whose image is 42° high, sees the table from 0.18 on."""
+"""Depth over that of the region's centre, up to which the space in front of a camera is empty. The table is
+deeper than 0.18 in the image of a camera that is 5° above it and has a field of view of 42°."""
 LINK = 0.15  # distance of neighbours in a group of sparse points, radii
 FITTED_LINK = 0.08  # the same of points on fitted surfaces
 LINK_COUNT = 5  # points within that distance, itself included, of a point that is no stray one
@@ -203,16 +203,14 @@ def seen_share(views: Sequence[View], points: np.ndarray) -> np.ndarray:
 
 
 def in_free_space(views: Sequence[View], region: Region, points: np.ndarray) -> np.ndarray:
-    """Whether a view shows points (N, 3) in front of the object: (N,) bool.
+    """Mask (N,) of points (N, 3) that lie in an image, at less than FREE_SHARE of the object's depth.
 
-    That is in its image, and nearer than FREE_SHARE of the region's depth. An object that is photographed has
-    nothing close to the camera in front of it; what a fit puts there fits one image and hides others.
+    Nothing is that close to the camera in a photograph of an object; surfels there fit one image and hide the
+    scene in others.
     """
-    found = np.zeros(len(points), bool)
+    centre, found = np.array(region.centre), np.zeros(len(points), bool)
     for view in views:
-        depth = (points - view.to_world[:3, 3]) @ view.to_world[:3, 2]
-        centre = (np.array(region.centre) - view.to_world[:3, 3]) @ view.to_world[:3, 2]
-        found |= view.project(points)[2] & (depth < FREE_SHARE * centre)
+        found |= view.project(points)[2] & (view.depth_of(points) < FREE_SHARE * view.depth_of(centre))
     return found
 
 

@@ -132,7 +132,7 @@ def region_of(views: Sequence[View]) -> Region:
     """
     focus, distance = view_focus(views)
     origins = np.array([view.to_world[:3, 3] for view in views])
-    ahead = [float((focus - view.to_world[:3, 3]) @ view.to_world[:3, 2]) > 0 for view in views]
+    ahead = [float(view.depth_of(focus)) > 0 for view in views]
     half_angle = np.array([np.arctan(min(v.width / v.fx, v.height / v.fy) / 2) for v in views])
     radius = region_radius(distance, half_angle)
     if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):

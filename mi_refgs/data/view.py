@@ -144,6 +144,10 @@ class View:
         colour = np.clip((self.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
         return colour if self.is_linear_radiance else linear_from_srgb(np.clip(colour, 0, 1))
 
+    def depth_of(self, points: np.ndarray) -> np.ndarray:
+        """Depth of world points (..., 3) along the viewing axis, scene units: (...)."""
+        return np.asarray((points - self.to_world[:3, 3]) @ self.to_world[:3, 2])
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Project world points (N, 3): row, column (N,), integer at pixel centres; whether in view (N,)."""
         local = (points - self.to_world[:3, 3]) @ self.to_world[:3, :3]

@@ -88,8 +88,8 @@ def _within(count: int, region: Region, rng: np.random.Generator) -> np.ndarray:
 
 
 def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, 3) uniform in contracted space outside of the region, where enough views see them and
-    none has them right before it; anywhere there if too few are seen."""
+    """Points (count, 3) uniform in contracted space outside of the region, where enough views see them,
+    but not right in front of a camera; anywhere there if too few are seen."""
     nearest = 0.0 if region.planes else 1.0  # the sphere has points below planes
 
     def draw(number: int) -> np.ndarray:
@@ -102,9 +102,9 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
         if len(found) == count:
             break
         points = draw(4 * (count - len(found)))
-        seen = seen_share(data.views, points) >= SEEN_SHARE
-        free = in_free_space(data.views, region, points)
-        found = np.concatenate([found, points[seen & ~free]])[:count]
+        points = points[seen_share(data.views, points) >= SEEN_SHARE]
+        points = points[~in_free_space(data.views, region, points)]
+        found = np.concatenate([found, points])[:count]
     while len(found) < count:
         found = np.concatenate([found, draw(count - len(found))])
     return found

@@ -117,5 +117,4 @@ def _shown(points: np.ndarray, view: View, depth: np.ndarray, alpha: np.ndarray)
         for where, size in ((row, view.height), (column, view.width))
     )
     surface = np.where(alpha > SURFACE, depth, np.inf).reshape(view.height, view.width)
-    distance = (points - view.to_world[:3, 3]) @ view.to_world[:3, 2]
-    return inside & (distance <= BEHIND * surface[tuple(pixel)])
+    return inside & (view.depth_of(points) <= BEHIND * surface[tuple(pixel)])

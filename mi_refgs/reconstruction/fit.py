@@ -89,14 +89,15 @@ class Previews(Progress):
 
     def step(self, trainer: Trainer) -> None:
         """Write the first training view and the environment map, where a preview is due."""
-        due = trainer.iteration in range(0, trainer.method.iterations, trainer.method.preview_every)
-        if trainer.run is None or not (due or trainer.iteration == trainer.method.iterations):
+        iteration, method = trainer.iteration, trainer.method
+        is_due = iteration % method.preview_every == 0 or iteration == method.iterations
+        if trainer.run is None or not is_due:
             return
         view = trainer.data.views[0].load()
         rendered = RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
         light = None if trainer.light is None else light_panels(trainer.light.radiance().numpy())
         image = contact_sheet([panels(rendered, view)], light)
-        write_png(trainer.run.output.own(f"previews/{trainer.iteration:07d}.png"), image)
+        write_png(trainer.run.output.own(f"previews/{iteration:07d}.png"), image)
 
 
 class ProgressBar(Previews):

@@ -55,6 +55,7 @@ class Relit:
     """The content of relight.json, and a warning for the user, if there is one."""
 
     result: dict[str, Any]
+    sheet: str  # path in the folder
     warning: str = ""
 
 
@@ -150,8 +151,8 @@ def relight(
             result["protocols"][protocol] |= relit_scores(measures, ours, truth)
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
     radiance = new_light.radiance().numpy()
-    sheet = contact_sheet(rows, {"environment map": tonemap(radiance, radiance)})
-    write_png(output.path / _beside(kind, SHEET), sheet)
+    sheet = _beside(kind, SHEET)
+    write_png(output.path / sheet, contact_sheet(rows, {"environment map": tonemap(radiance, radiance)}))
     write_json(output.path / _beside(kind, RESULT), result)
     warning = ""
     if fitted.shading.diffuse == "sh":
@@ -160,7 +161,7 @@ def relight(
             "irradiance of the fitted light, with the errors of that light; `refgs train --for relighting` "
             "fits materials"
         )
-    return Relit(result, warning)
+    return Relit(result, sheet, warning)
 
 
 def _output(run: Run, out: Path, light: NewLight) -> OutputFolder:

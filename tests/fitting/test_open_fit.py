@@ -25,7 +25,7 @@ from mi_refgs.fitting.runner import begin, default_method
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
-from mi_refgs.methods.method import LossWeight, Method, Refine, SurroundingsOptions
+from mi_refgs.methods.method import AROUND, LossWeight, Method, Refine, SurroundingsOptions
 from mi_refgs.methods.window import Window
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.run import Run
@@ -258,7 +258,7 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
 
 
 def test_space_in_front_of_cameras_is_cleared(data: Dataset, method: Method) -> None:
-    """Densification removes surfels of the background that a view has right before it, not of the object."""
+    """Densification removes background surfels right in front of a camera, but none of the object."""
     trainer = Trainer(method, data)
     eye = data.views[3].to_world[:3, 3]
     place = eye + 0.1 * (np.array(REGION.centre) - eye)
@@ -270,9 +270,9 @@ def test_space_in_front_of_cameras_is_cleared(data: Dataset, method: Method) -> 
     AdaptiveControl(trainer.setup, trainer.fit)._clear_free_space(REGION)
     inner, background = (table.surfels.raw["position"].numpy() for table in trainer.fit.tables)
     assert len(inner) == 80 and not in_free_space(data.views, REGION, background).any()
-    started = initial_parameters(method, data, np.random.default_rng(0), True)
     assert len(background) == 60 - 7
-    assert not in_free_space(data.views, REGION, started["surroundings/position"].numpy()).any()
+    initial = initial_parameters(method, data, np.random.default_rng(0), True)[f"{AROUND}position"].numpy()
+    assert not in_free_space(data.views, REGION, initial).any()
 
 
 def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Method) -> None:

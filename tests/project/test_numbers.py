@@ -9,6 +9,7 @@ import re
 import tomllib
 from argparse import Namespace
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,14 @@ from benchmarks import all as everything
 from benchmarks import pages
 from benchmarks.common.build import RESULTS, merged, recorded, write_result
 from benchmarks.fits import page as fits
-from benchmarks.fits.plan import GROUPS, RING, SOURCES
+from benchmarks.fits.plan import GROUPS, RING, SOURCES, Fit
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.scores import PIXEL_CLASSES
+from mi_refgs.io.files import read_json
 from tests.helpers import ROOT, run_process
 
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in pages.PAGES}
+FIT_FIELDS = [field.name for field in fields(Fit)]
 STALE: dict[str, Any] = tomllib.loads(pages.STALE.read_text(encoding="utf-8"))
 
 
@@ -137,6 +140,12 @@ def test_fits_exist() -> None:
         assert (ROOT / "variants" / f"{fit.method}.toml").is_file()
     all_fits = {fit for group in GROUPS.values() for fit in group}
     assert len({(fit.name, fit.samples) for fit in all_fits}) == len({fit.name for fit in all_fits})
+
+
+@pytest.mark.parametrize("path", [path for path in sorted(RESULTS.glob("*.json")) if path.stem in GROUPS])
+def test_data_files_have_the_planned_fits(path: Path) -> None:
+    found = [tuple(row[name] for name in FIT_FIELDS) for row in read_json(path)["rows"]]
+    assert found == [tuple(getattr(fit, name) for name in FIT_FIELDS) for fit in GROUPS[path.stem]]
 
 
 def test_printed_json_becomes_a_data_file(tmp_path: Path) -> None:

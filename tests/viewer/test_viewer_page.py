@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.viewer import OPTIONS, find_browser
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.editing.change import apply
 from mi_refgs.editing.options import Change, Selection
@@ -41,8 +42,6 @@ from tests.helpers import ROOT
 from tests.scenes.known import other_sky, with_background
 from tests.scenes.tiny import train_command, write_data, write_method, write_open_data
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WINDOW = {"width": 760, "height": 420}
 """Small: browser and viewer draw on the same processor. The image is as wide as it is high."""
 SMALL = "200²"
@@ -50,7 +49,7 @@ SMALL = "200²"
 PATIENCE = 45.0
 """Seconds that a page may take to show something, on a busy machine."""
 
-browser_path = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+browser_path = find_browser()
 pytestmark = pytest.mark.skipif(
     browser_path is None, reason="no chromium is installed; apt-get install chromium"
 )

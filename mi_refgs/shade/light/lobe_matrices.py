@@ -160,8 +160,8 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     # Over half the circle, the other half is its mirror image: (h+1, h+1).
     cosines = np.cos(2 * np.pi / w * m * np.arange(h + 1)[:, None])
     cos_φ = np.cos((np.arange(h * s) + 0.5) * (2 * np.pi / (w * s)))
-    out = np.zeros((h_out, h, h + 1))
-    for i, θ_out in enumerate(row_angles(h_out)[: (h_out + 1) // 2]):
+    out, half = np.zeros((h_out, h, h + 1)), (h_out + 1) // 2  # the other half is mirrored below
+    for i, θ_out in enumerate(row_angles(h_out)[:half]):
         near = θ <= θ_out + 0.5 * np.pi  # rows beyond hold no light of this hemisphere
         cos_angle = np.outer(np.sin(θ_out) * np.sin(θ[near]), cos_φ)
         cos_angle += (np.cos(θ_out) * np.cos(θ[near]))[:, None]
@@ -173,7 +173,6 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
         rows = shares.T @ texels.reshape(h - 1, s, h + 1)
         out[i, :-1] += rows[:, 0]
         out[i, 1:] += rows[:, 1]
-    half = (h_out + 1) // 2
     out[:half] = (out[:half].reshape(-1, h + 1) @ cosines).reshape(half, h, h + 1)
     out[:half] /= out[:half, :, :1].sum(axis=1, keepdims=True)  # a constant map stays constant, exactly
     out[half:] = out[: h_out - half][::-1, ::-1]
