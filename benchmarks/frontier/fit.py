@@ -19,7 +19,6 @@ import numpy as np
 from benchmarks.common.report import Row
 from benchmarks.common.timing import in_fresh_process, peak_bytes
 from benchmarks.frontier.cells import SCORES, Cell
-from mi_refgs.capture.triangulate import with_points
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
@@ -54,7 +53,7 @@ def fitted(cell: Cell) -> Row:
         raise InputError(f"{path}: one training view; give 2 or more, of which one is a validation view")
     with tempfile.TemporaryDirectory() as folder:
         cpu, wall = time.process_time(), time.perf_counter()
-        trainer = begin(method, training, Run(Path(folder) / "run"), find_points=with_points)
+        trainer = begin(method, training, Run(Path(folder) / "run"))
         trainer.train()
         dr.sync_thread()
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall

@@ -226,20 +226,6 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
-def triangulate(database: Path, folder: Path, output: Path, poses: dict[str, np.ndarray]) -> Any:
-    """Triangulate points of the database's images with known cameras; `poses`: camera from world (3, 4)."""
-    pycolmap = load()
-    model = pycolmap.Reconstruction()
-    with quiet(), closing(pycolmap.Database.open(database)) as opened:
-        for camera in opened.read_all_cameras():
-            model.add_camera_with_trivial_rig(camera)
-        for image in opened.read_all_images():
-            known = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-            model.add_image_with_trivial_frame(known, pycolmap.Rigid3d(poses[image.name]))
-    arguments = (model, database, folder, output, True, options_of_mapping())
-    return _run(lambda token: pycolmap.triangulate_points(*arguments, cancellation_token=token))
-
-
 def pairs_to_match(features: dict[str, np.ndarray]) -> list[tuple[str, str]]:
     """Choose pairs of images by name; `features`: descriptors (N, D) by name."""
     names = sorted(features)

@@ -64,7 +64,6 @@ def fit_and_measure(job: Job) -> None:
     mi.set_variant(job.mitsuba_variant)
     mi.set_log_level(mi.LogLevel.Warn)
 
-    from mi_refgs.capture.triangulate import with_points
     from mi_refgs.evaluation.evaluate import evaluate
     from mi_refgs.fitting.runner import begin, finish
     from mi_refgs.runs.views import read_views
@@ -76,7 +75,7 @@ def fit_and_measure(job: Job) -> None:
     def warn(message: str) -> None:
         print(f"refgs: warning: {message}", file=sys.stderr)
 
-    trainer = begin(method, views, run, find_points=with_points, warn=warn)
+    trainer = begin(method, views, run, warn=warn)
     if trainer.iteration:
         print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
     trainer.train(Curve(job, method, trainer.iteration))

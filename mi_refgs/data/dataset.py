@@ -62,6 +62,22 @@ class PointCloud:
     position: np.ndarray  # (P, 3) float64, world
     colour: np.ndarray | None = None  # (P, 3) linear, 0 … 1
 
+    def followed_by(self, other: PointCloud) -> PointCloud:
+        """These points, then others; with colours only if both have some."""
+        position = np.concatenate([self.position, other.position])
+        if self.colour is None or other.colour is None:
+            return PointCloud(position)
+        return PointCloud(position, np.concatenate([self.colour, other.colour]))
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """Pixels of unknown depth, with their colours."""
+
+    origin: np.ndarray  # (P, 3) float64, world
+    direction: np.ndarray  # (P, 3) float64, world, to depth 1
+    colour: np.ndarray  # (P, 3) linear
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -183,6 +199,7 @@ class Dataset:
     notes: tuple[str, ...] = ()  # as in `Recording`
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """What was subtracted from all positions of the files, scene units; see `FAR`."""
+    unknown: PixelRays | None = None  # pixels whose depth stereo has not found; None: it has not been tried
 
     @property
     def has_alpha(self) -> bool:

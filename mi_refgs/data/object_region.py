@@ -2,15 +2,15 @@
 
 The surfaces that support the object, such as a table or a wall, are planes with all cameras on one side; the
 region ends there. The object is the group of close points above them that most views show. Before a fit there
-are points where the object has texture: the sphere estimated from the cameras grows until it contains that
-group. During a fit there are points everywhere: sphere and more planes enclose the group. World positions in
-scene units.
+are points of stereo, or of structure from motion: the sphere estimated from the cameras grows until it
+contains that group. During a fit there are points everywhere: sphere and more planes enclose the group. World
+positions in scene units.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -21,12 +21,6 @@ from mi_refgs.data.region import CAMERA_SHARE, Plane, Region
 from mi_refgs.data.view import View
 
 PLANE_REACH = 2.0  # distance from the centre, in radii, up to which points determine support planes
-PLANE_WIDTH = 0.01
-"""Half the thickness, in radii, of the points of a plane: on *tabletop* of 98 % of those on the cloth (images
-of 135 × 240 pixels)."""
-FITTED_PLANE_WIDTH = 0.1
-"""The same of points on fitted surfaces, halfway through a fit: the varnished table of `figure` is off by a
-tenth of a radius there. Widths from 0.06 to 0.15 find it, 0.03 does not."""
 PLANE_MARGIN = 0.04
 """Height, in radii, above a plane at which the region begins. Half as much leaves surfels of the table with
 the object, which adds 4 % to its outline in short fits."""
@@ -40,13 +34,12 @@ BELOW_SHARE = 0.5
 """Most points below a support plane over those on it. A face of the object has the object below; below a
 table is what its polish mirrors."""
 ABOVE_SHARE = 0.9  # fraction of the cameras that are above a support plane
+PARALLEL = 0.9  # cosine of two support planes' normals from which the second is what the first has left
 REFITS = 5  # rounds of least squares that follow the best draw
 SEEN_SHARE = 0.4  # fraction of the views that show a point of the object; close views leave some parts out
 FREE_SHARE = 0.15
 """Depth over that of the region's centre, up to which the space in front of a camera is empty. The table is
 deeper than 0.18 in the image of a camera that is 5° above it and has a field of view of 42°."""
-LINK = 0.15  # distance of neighbours in a group of sparse points, radii
-FITTED_LINK = 0.08  # the same of points on fitted surfaces
 LINK_COUNT = 5  # points within that distance, itself included, of a point that is no stray one
 WHOLE = 0.95  # fraction of the group in an image that shows the whole object
 GROUP_POINTS = 50  # points of the group that make it an object: fewer are texture on a part of it
@@ -60,6 +53,25 @@ FITTED_BALL = 1.1  # radius of the region over that of the smallest ball around 
 BOX_MARGIN = 0.2  # distance of that group, in radii, from planes beside it: thin parts may be missing
 BALL_ROUNDS = 500  # rounds of the smallest enclosing ball: the radius is right to 1/√500 … 0.2 % in practice
 
+
+@dataclass(frozen=True)
+class Scatter:
+    """How close to each other points on one surface are, in radii of the region."""
+
+    width: float  # half the thickness of the points of a plane
+    link: float  # distance of neighbours in a group
+    lift: float = 0.0  # height above a plane up to which inaccurate points of the plane may lie
+
+
+SPARSE = Scatter(0.01, 0.15)
+"""Of structure from motion: 98 % of the points on the cloth of *tabletop* (images of 135 × 240 pixels)."""
+DENSE = Scatter(0.02, 0.08, 0.1)
+"""Of stereo: widths of 0.015 and 0.02, links from 0.06 to 0.1 and lifts from 0.05 to 0.15 find the objects of
+the four rooms of `scenes/README.md`."""
+FITTED = Scatter(0.1, 0.08)
+"""Of surfaces halfway through a fit: the varnished table of *figure* is off by a tenth of a radius there.
+Widths from 0.06 to 0.15 find it, 0.03 does not."""
+
 Seen = Callable[[np.ndarray], np.ndarray]
 """Fraction (N,) of the views that show points (N, 3)."""
 
@@ -68,7 +80,7 @@ def support_planes(
     points: np.ndarray,  # (N, 3)
     origins: np.ndarray,  # (V, 3) of the cameras
     region: Region,
-    width: float = PLANE_WIDTH,  # half the thickness of a plane, radii
+    width: float = SPARSE.width,  # half the thickness of a plane, radii
     most: int = PLANE_COUNT,
 ) -> tuple[Plane, ...]:
     """The planes that support an object in a sphere, at most so many.
@@ -97,6 +109,8 @@ def support_planes(
         on, below = np.sum(abs(height) < width, axis=0), np.sum(height < -2 * width, axis=0)
         above = np.mean(origins @ normal.T > offset, axis=0)
         usable = (above >= ABOVE_SHARE) & (below <= BELOW_SHARE * on) & (length[:, 0] > 0)
+        for x, y, z, _ in found:
+            usable &= normal @ (x, y, z) < PARALLEL
         best = int(np.argmax(np.where(usable, on - below, -1)))
         if not usable[best] or on[best] < least:
             break
@@ -114,13 +128,15 @@ def support_planes(
     return tuple(found)
 
 
-def object_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region:
+def object_region(
+    region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen, scatter: Scatter = SPARSE
+) -> Region:
     """The region of an object, from the sphere that the cameras (V, 3) suggest and points (N, 3) on surfaces.
 
     Without enough points it is that sphere.
     """
-    region = replace(region, planes=support_planes(points, origins, region))
-    group = object_points(region, points, seen, LINK)
+    region = replace(region, planes=support_planes(points, origins, region, scatter.width))
+    group = object_points(region, points, seen, scatter)
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) >= WITHIN_SHARE:
         return region
 
@@ -132,9 +148,9 @@ def object_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
     return _with_ball(region, centre, ENCLOSED * radius, origins)
 
 
-def shown_whole(views: Sequence[View], region: Region, points: np.ndarray) -> bool:
-    """Whether an image shows the whole object, as far as sparse points (N, 3) tell."""
-    group = object_points(region, points, lambda chosen: np.ones(len(chosen)), LINK)
+def shown_whole(views: Sequence[View], region: Region, points: np.ndarray, scatter: Scatter = SPARSE) -> bool:
+    """Whether an image shows the whole object, as far as points (N, 3) tell."""
+    group = object_points(region, points, lambda chosen: np.ones(len(chosen)), scatter)
     return len(group) < GROUP_POINTS or any(np.mean(view.project(group)[2]) >= WHOLE for view in views)
 
 
@@ -145,9 +161,9 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
     these points: a table without texture has no sparse points. None if no group of points is the object.
     """
     if not region.planes:
-        plane = support_planes(points, origins, region, FITTED_PLANE_WIDTH, most=1)
+        plane = support_planes(points, origins, region, FITTED.width, most=1)
         region = replace(region, planes=plane)
-    group = object_points(region, points, seen, FITTED_LINK)
+    group = object_points(region, points, seen, FITTED)
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
         return None
     centre, radius = enclosing_ball(group)
@@ -168,16 +184,16 @@ def _with_ball(region: Region, centre: np.ndarray, radius: float, origins: np.nd
     return replace(region, centre=(x, y, z), radius=min(radius, CAMERA_SHARE * nearest))
 
 
-def object_points(region: Region, points: np.ndarray, seen: Seen, link: float) -> np.ndarray:
+def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatter) -> np.ndarray:
     """The group (M, 3) of points (N, 3) above the region's planes that most views show, and that has the most
-    points in its sphere. `link`: distance of neighbours, radii."""
+    points in its sphere."""
     near = np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * region.radius
-    points = points[near & region.above(points)]
+    points = points[near & (region.heights(points) >= scatter.lift * region.radius).all(axis=1)]
     points = np.random.default_rng(0).permutation(points)[: 2 * MOST_POINTS]
     points = points[seen(points) >= SEEN_SHARE]
     if not len(points):
         return points
-    link *= region.radius
+    link = scatter.link * region.radius
     number = KDTree(points).query_ball_point(points, link, return_length=True)
     points = points[number >= LINK_COUNT]
     if not len(points):

@@ -52,6 +52,8 @@ class Group:
     tail: float = 1.0  # factor of the rate of the other columns: SH beyond degree 0
     relative: bool = False  # values above 1 learn at the rate times themselves: lamps grow exponentially
     unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
+    centre: tuple[float, float, float] | None = None
+    """Rows of positions learn at the rate times their distance from here, in units of the tensor."""
 
     def at(self, iteration: int) -> float:
         """Learning rate at this iteration (0-based)."""
@@ -226,6 +228,8 @@ class Adam:
             θ = dr.detach(self.params[name].array)
             if group.relative:
                 η = η * dr.maximum(θ, 1)
+            if group.centre is not None:
+                η = η * _distance(θ, group.centre) / dr.opaque(mi.Float, group.unit)
             updated[name] = (dr.select(good, θ - η * m / (dr.sqrt(v) + EPSILON), θ), shape)
             self._first[name] = dr.select(good, m, self._first[name])
             self._second[name] = dr.select(good, v, self._second[name])
@@ -332,6 +336,13 @@ class Adam:
         tensor = dr.detach(self.params[name])
         dr.enable_grad(tensor)
         self.params[name] = tensor
+
+
+def _distance(positions: Float, centre: tuple[float, float, float]) -> Float:
+    """For each entry (3 N,), the distance of its row from a point."""
+    first = dr.arange(mi.UInt32, dr.width(positions)) // 3 * 3
+    offset = (dr.gather(mi.Float, positions, first + k) - dr.opaque(mi.Float, centre[k]) for k in range(3))
+    return dr.norm(mi.Vector3f(*offset))
 
 
 def _median(values: Float) -> float:

@@ -4,16 +4,27 @@ it."""
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.data.dataset import Dataset, PointCloud
-from mi_refgs.data.object_region import camera_positions, object_region, seen_share, shown_whole
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.object_region import (
+    DENSE,
+    SPARSE,
+    camera_positions,
+    object_region,
+    seen_share,
+    shown_whole,
+)
 from mi_refgs.data.region import REGION_FILE, region_pixels
+from mi_refgs.data.stereo import stereo
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure, poses
@@ -33,8 +44,6 @@ from mi_refgs.runs.views import read_views, with_region
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
 OPEN_PURPOSE = "photographs"  # purpose of the method that is fitted by default to images without alpha
 Tell = Callable[[str], None]  # is called with sentences for the user
-FindPoints = Callable[[Dataset, Path, Tell], PointCloud | None]
-"""Finds points for a fit to start from, and keeps them in the folder: `capture.triangulate.with_points`."""
 Settings = Mapping[str, object] | Sequence[str]
 """Changes of a method: {"loss.ssim": 0.1}, or as on the command line, ["loss.ssim=0.1"]."""
 
@@ -80,13 +89,11 @@ class Progress:
         """Is called after the last step, and when the fit is interrupted or fails."""
 
 
-def fit(
-    data: Path, output: Path, choice: Choice, *, resume: bool, progress: Progress, find_points: FindPoints
-) -> Trainer:
+def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Progress) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
 
     resume: continue if the folder contains a run; its method, preset, settings and size of images stay, and
-    those of the choice have to be the same. find_points: as in `begin`.
+    those of the choice have to be the same.
 
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
     TerminatedError with a message that says how to continue.
@@ -106,7 +113,7 @@ def fit(
     with run.alone():
         if not resumed:  # asked again: another process may have begun a run while the data was read
             run.require_none()
-        return _fit(method, views, run, progress, find_points)
+        return _fit(method, views, run, progress)
 
 
 def _new_method(data: Path, choice: Choice, progress: Progress) -> Method:
@@ -138,12 +145,10 @@ def _resumed_method(run: Run, data: Path, choice: Choice) -> Method:
     return method
 
 
-def _fit(
-    method: Method, views: Dataset, run: Run, progress: Progress, find_points: FindPoints | None
-) -> Trainer:
+def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Trainer:
     """Train to the last iteration and write the artefacts, with the run locked."""
     data, output, resumed = views.path, run.path, run.exists()
-    trainer = begin(method, views, run, progress.say, find_points, progress.warn)
+    trainer = begin(method, views, run, progress.say, progress.warn)
     if resumed:
         _record_data(run, data, progress)  # what cannot be resumed with it has been refused
         progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
@@ -176,14 +181,13 @@ def begin(
     views: Dataset,
     run: Run,
     tell: Tell = lambda _: None,
-    find_points: FindPoints | None = None,
     warn: Tell = lambda _: None,
 ) -> Trainer:
     """Create a trainer that writes into `run`: from its newest checkpoint if the folder contains a run, else
     anew.
 
-    A new fit starts from what `find_points` finds, by default the points of the data set. `tell` is called
-    with what is found and decided, `warn` with steps that failed. From now on the trainer tries the optional
+    A new fit of photographs starts from the points of the data set and those of stereo. `tell` is called with
+    what is found and decided, `warn` with steps that failed. From now on the trainer tries the optional
     components of its method. A resumed run keeps its region of interest. Raises InputError for cameras
     that are all in one place, checkpoints that are all damaged, a scene without a checkpoint, and a folder
     that cannot be written.
@@ -207,9 +211,9 @@ def begin(
                 f"{views.path}: {len(views.views)} views: too few to hold some out, so no component is tried"
             )
             method = replace(method, select=None)
-        if find_points is not None:
-            views = replace(views, points=find_points(views, run.path, tell))
-        views = _around_object(views, tell, warn)
+        views, surfaces = _with_stereo(views, tell)
+        if not resumed:
+            views = _around_object(views, surfaces, tell, warn)
     trainer = Trainer(method, views, run, state, tell=tell, warn=warn)
     if resumed:
         run.rewind(trainer.iteration)
@@ -220,19 +224,41 @@ def begin(
     return trainer
 
 
-def _around_object(views: Dataset, tell: Tell, warn: Tell) -> Dataset:
-    """Adapt an estimated region of interest to the points; raises InputError for one that no view shows."""
+def _with_stereo(views: Dataset, tell: Tell) -> tuple[Dataset, np.ndarray | None]:
+    """The data set with what stereo finds, and points (N, 3) spaced evenly on surfaces; images with alpha
+    have a visual hull instead."""
+    if views.has_alpha or views.region is None:
+        return views, None
+    began = time.perf_counter()
+    found = stereo(views.views, views.region)
+    if found is None:
+        tell(f"{views.path}: stereo: no points; the images have too little texture in common")
+        return views, None
+    points, seconds = found.points, time.perf_counter() - began
+    tell(f"{len(points.position)} points on surfaces, found by stereo in {seconds:.0f} s")
+    joined = points if views.points is None else views.points.followed_by(points)
+    return replace(views, points=joined, unknown=found.unknown), found.spaced
+
+
+def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn: Tell) -> Dataset:
+    """Adapt an estimated region of interest to points: those of stereo, `surfaces`, or else of the data.
+
+    Raises InputError for a region that no view shows.
+    """
     region, points = views.region, views.points
     if region is None or views.has_alpha:
         return views
     if region.estimated and points is not None:
-        seen = partial(seen_share, views.views)
-        found = object_region(region, camera_positions(views.views), points.position, seen)
+        seen, origins = partial(seen_share, views.views), camera_positions(views.views)
+        shown, scatter = points.position, SPARSE
+        if surfaces is not None:
+            shown, scatter = surfaces, DENSE
+        found = object_region(region, origins, shown, seen, scatter)
         if found.planes:
             tell(f"{views.path}: region of interest: it ends above the plane that supports the object")
         if found.radius > region.radius:
             tell(f"{views.path}: region of interest: it has grown to {found.radius:.3g} units")
-        if not shown_whole(views.views, found, points.position):
+        if not shown_whole(views.views, found, shown, scatter):
             warn(f"{views.path}: no image shows the whole object; add some from farther away")
         region = found
     if not any(region_pixels(view, region).any() for view in views.views):

@@ -130,7 +130,8 @@ class FitSetup:
         groups = self._of_table(self.method.surfels.names, extent)
         around = self.method.surroundings
         if self.open_scene and around is not None:
-            table = self._of_table(around.names(self.method.surfels.primitive), around.reach * extent)
+            table = self._of_table(around.names(self.method.surfels.primitive), extent)
+            table["position"] = self._far(table["position"])
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = Group(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None:
@@ -152,6 +153,13 @@ class FitSetup:
         start, final = rates.of("position") * extent, rates.position_final * extent
         groups["position"] = Group(start, final, int(POSITION_STEPS * iterations), unit=extent)
         return groups
+
+    def _far(self, group: Group) -> Group:
+        """The rates of the background's positions: the farther a surface, the less is known of its place."""
+        around, region = self.method.surroundings, self.data.region
+        assert around is not None and region is not None and group.final is not None
+        rate, final = around.reach * group.rate, around.reach * group.final
+        return replace(group, rate=rate, final=final, centre=region.centre)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every parameter but those per view, without the first axis."""

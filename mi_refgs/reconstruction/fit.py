@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.capture.triangulate import with_points
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.fitting import runner
@@ -63,9 +62,7 @@ def fit(
         listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")
     try:
         choice = runner.Choice(str(method) if isinstance(method, Path) else method, preset, settings, minutes)
-        runner.fit(
-            Path(data), Path(output), choice, resume=resume, progress=listener, find_points=with_points
-        )
+        runner.fit(Path(data), Path(output), choice, resume=resume, progress=listener)
     except KeyboardInterrupt:
         if temporary is not None:
             temporary.remove.detach()  # keeps the checkpoints, from which the fit can be resumed

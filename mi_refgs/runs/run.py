@@ -35,7 +35,7 @@ LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
 LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
 RUN_FILES = (
-    *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png", "points.npz"),
+    *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png"),
     *("surfels.ply", "envmap.exr", "near_field.npz", "mesh.ply", "surroundings.ply", "background.exr"),
     *("scene.xml", "model.json"),
     *("exposure.json", CAMERAS, "decisions.json", "edit.json", "preview.png"),

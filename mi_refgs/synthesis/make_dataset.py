@@ -125,7 +125,7 @@ def make_dataset(
     centre, radius = bounding_sphere(shapes)
     cameras = Cameras(given, centre, radius, reach(loaded.shapes(), centre) if about else radius, about)
     x, y, z = (float(c) for c in centre)
-    region = Region((x, y, z), REGION_MARGIN * radius)
+    region = Region((x, y, z), REGION_MARGIN * radius, estimated=True)  # fits look for what supports it
     if about:
         require_clear_view(loaded, cameras, region, scene)
 

@@ -305,14 +305,15 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
     begin(method, read_dataset(folder, "train"), run)
     assert run.region() == REGION
     begin(method, read_dataset(folder, "train"), run, said.append)
-    assert said == [] and views_of_run(run, method, "test").region == REGION
+    assert not any("changed" in text for text in said) and views_of_run(run, method, "test").region == REGION
     for text in ('{"centre": [0, 0, 0.1], "radius": 0.7}', '{"centre": [0, 0, 0], "radius": 0.5}', None):
         file = folder / REGION_FILE
         file.unlink()
         file.symlink_to("nowhere") if text is None else file.write_text(text)
+        said.clear()
         resumed = begin(method, read_dataset(folder, "train"), run, said.append)
         assert resumed.data.region == REGION and views_of_run(run, method, "test").region == REGION
-        assert "region: it has changed" in said.pop() and not said
+        assert "region: it has changed" in said[0]
     (run.path / "dataset.json").write_text(json.dumps({"path": str(folder), "region": {"radius": 1}}))
     with pytest.raises(InputError, match=r"dataset\.json: centre, radius"):
         views_of_run(run, method, "test")

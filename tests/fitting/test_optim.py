@@ -319,6 +319,15 @@ def test_relative_rate_scales_lamps() -> None:
     np.testing.assert_allclose(moved, 0.1 * np.maximum(start, 1), rtol=1e-3)
 
 
+def test_rate_of_positions_grows_with_their_distance() -> None:
+    """Each row of a group with a centre moves by the rate times its distance from there, in its unit."""
+    start = np.array([[1.0, 2, 3], [1, 2, 5], [1 + 30, 2, 3 + 40], [1, 1.5, 3]])
+    params, optimiser = adam(start, Group(0.1, centre=(1.0, 2.0, 3.0), unit=2.0))
+    advance(optimiser, 0, x=-np.ones((4, 3)))
+    moved = params["x"].numpy() - start
+    np.testing.assert_allclose(moved, 0.1 * np.array([0, 1, 25, 0.25])[:, None] * np.ones(3), rtol=1e-3)
+
+
 def test_every_tensor_has_its_bit_however_many_there_are() -> None:
     """The first and the last of 40 tensors are distinguished, also where rows are wide."""
     sizes = {f"t{i}": (4, 2) for i in range(38)} | {"wide": (2, 100), "last": (4, 2)}
