@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates, uniform_filter
 
+from mi_refgs.constants import NORM_FLOOR
 from mi_refgs.data.dataset import PixelRays, PointCloud
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import View, evenly_spread
@@ -110,7 +111,7 @@ def _small(view: View) -> View:
 def _neighbours(views: Sequence[View], centre: np.ndarray) -> list[list[int]]:
     """For each view, those whose angle to it, seen from the centre, is nearest to BASELINE."""
     outward = np.array([view.to_world[:3, 3] for view in views]) - centre
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), NORM_FLOOR)
     away = abs(np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1))) - BASELINE)
     np.fill_diagonal(away, np.inf)
     return [

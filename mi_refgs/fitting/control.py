@@ -36,6 +36,13 @@ REACH = 2.0
 """Standard deviations to which a surfel extends: one that extends through the plane below the object is the
 table's. On *tabletop*, the opacity of the object alone has an intersection over union with the jug's mask of
 0.90 by centres, 0.94 with 1, 0.96 with 2 and 3."""
+FLAT_HEIGHT, FLAT_COSINE = 0.1, 0.9
+"""Height above a plane of the region, in radii, and cosine, up to and from which a surfel is that plane's
+surface: polish is fitted too high. Without them, the object alone has an intersection over union with the
+mask of 0.96, not 0.71, on *can*, and of 0.84, not 0.41, on *figure*."""
+FLAT_SHARE = 0.25
+"""Fraction of the object's surfels that are such ones, above which they stay: the object is thin, and lies on
+the table."""
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 
@@ -52,9 +59,20 @@ def depth_outside(position: np.ndarray, region: Region, reach: np.ndarray | floa
 def reach_of(table: dict[str, np.ndarray], region: Region) -> np.ndarray:
     """Extent (N, P) of surfels along the normals of a region's planes, scene units: REACH deviations."""
     axes, deviations = primitive_of(table).extent(table)
-    normals = np.array(region.planes).reshape(-1, 4)[:, :3]
-    along = np.einsum("nai,pi->npa", axes, normals) * deviations[:, None]
+    along = np.einsum("nai,pi->npa", axes, _normals(region)) * deviations[:, None]
     return np.asarray(REACH * np.linalg.norm(along, axis=-1))
+
+
+def lies_flat(surfels: Surfels, region: Region) -> np.ndarray:
+    """Whether surfels are parallel to a plane and at most FLAT_HEIGHT above it, (N, P)."""
+    cosine = surfels.primitive.normal(surfels).numpy().T @ _normals(region).T
+    height = region.heights(surfels.position().numpy().T)
+    return np.asarray((abs(cosine) > FLAT_COSINE) & (height < FLAT_HEIGHT * region.radius))
+
+
+def _normals(region: Region) -> np.ndarray:
+    """Normals (P, 3) of its planes."""
+    return np.array(region.planes).reshape(-1, 4)[:, :3]
 
 
 def exchanged(
@@ -65,8 +83,11 @@ def exchanged(
     A table may become larger than its method allows, and does not grow then.
     """
     tables = [inner.to_numpy(), outer.to_numpy()]
+    flat = [lies_flat(surfels, region) for surfels in (inner, outer)]
+    height = FLAT_HEIGHT * region.radius if flat[0].any(axis=1).mean() <= FLAT_SHARE else 0.0
     own_depth, other_depth = (
-        depth_outside(table["position"], region, reach_of(table, region)) for table in tables
+        depth_outside(table["position"], region, np.maximum(reach_of(table, region), height * lying))
+        for table, lying in zip(tables, flat, strict=True)
     )
     leaves = [own_depth > MARGIN, other_depth < -MARGIN]
     for gone in leaves:  # one surfel stays

@@ -118,7 +118,7 @@ def _along(
     beyond the region's centre.
 
     They are where points of surfaces are missing, such as walls that few views show, and nowhere near a
-    camera. With median colours of all views instead, images that no view has seen are up to 3 dB worse.
+    camera. With median colours of all views instead, held-out views of the kitchen around *figure* lose 3 dB.
     """
     points, colours = np.empty((0, 3)), np.empty((0, 3))
     while len(points) < count:

@@ -240,7 +240,7 @@ class ExposureOptions:
 
     gains: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
     after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
-    worth: float = 0.5  # dB gained on pixels of the training views that the gains were not fitted to
+    worth: float = 1.0  # dB gained on pixels of the training views that the gains were not fitted to
     rate: float = 3e-3  # learning rate of log gains, per step; a tenth of it at the end
 
 

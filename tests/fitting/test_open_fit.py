@@ -18,7 +18,7 @@ from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import object_surface, refine
-from mi_refgs.fitting.control import AdaptiveControl, depth_outside, exchanged
+from mi_refgs.fitting.control import FLAT_HEIGHT, AdaptiveControl, depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.runner import begin, default_method
@@ -179,6 +179,32 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     own, _ = (edit.surfels.to_numpy()["position"] for edit in exchanged(wide, outer, method, region, rng))
     np.testing.assert_allclose(own[:1], [[0, 0, 0.2]], atol=1e-6)
     assert not np.any(own[:, 0] < -0.1)
+
+
+def test_flat_surfels_right_above_a_plane_are_its_surface(method: Method) -> None:
+    """Unless most of the object is flat; upright ones there are the object's."""
+    region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1),))
+    upright, flat = [0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)], [1.0, 0, 0, 0]
+
+    def left(places: list[list[float]], turns: list[list[float]]) -> int:
+        names = method.surfels.names
+        raw = {n: np.zeros((len(places), method.surfels.columns(n))) for n in names}
+        raw |= {"position": np.array(places), "rotation": np.array(turns)}
+        raw["scale"] = np.full((len(places), 2), np.log(1e-4))
+        inner = Surfels.from_numpy(raw)
+        around = SurroundingsOptions(degree=0).names("surfel")
+        below = {n: raw[n][:1, :3] for n in around if n == "radiance_sh"} | {
+            "position": np.array([[0, 0, -0.5]])
+        }
+        outer = Surfels.from_numpy({n: raw[n][:1] for n in around} | below)
+        return exchanged(inner, outer, method, region, np.random.default_rng(0))[0].surfels.count
+
+    height = 0.1 + 0.5 * FLAT_HEIGHT * region.radius
+    body = [[0, 0, 0.4]] * 8
+    assert left([*body, [0, 0, height]], [upright] * 8 + [flat]) == 8
+    assert left([*body, [0, 0, height]], [upright] * 9) == 9
+    assert left([*body, [0, 0, height + FLAT_HEIGHT * region.radius]], [upright] * 8 + [flat]) == 9
+    assert left([[0, 0, height]] * 4, [flat] * 4) == 4
 
 
 def test_points_start_on_their_side_of_planes(data: Dataset, method: Method) -> None:
