@@ -112,7 +112,7 @@ def _summary(found: list[Row]) -> list[str]:
 
 
 def _gains(tradeoffs: list[Row]) -> str:
-    head = ["case", "time of", "setting", "relMSE, mirror ray alone", "with harmonics", "with the setting"]
+    head = ["case", "time of", "setting", "relMSE, mirror ray alone", "with SH", "with the setting"]
     rows = [
         [
             _case(row),
@@ -173,7 +173,8 @@ def _budgets(budgets: list[Row]) -> str:
     tables = []
     for name in dict.fromkeys(row["indirect"] for row in budgets):
         cases = [(f"{row['scene']}, r = {row['roughness']:g}", row) for row in where(budgets, indirect=name)]
-        tables.append(f"**{name[0].upper()}{name[1:]}**\n\n{budget_table('case', cases)}")
+        title = "Spherical harmonics" if name == PAPER else name[0].upper() + name[1:]
+        tables.append(f"**{title}**\n\n{budget_table('case', cases)}")
     return "\n\n".join(tables)
 
 

@@ -64,12 +64,12 @@ class Scatter:
 
 
 SPARSE = Scatter(0.01, 0.15)
-"""Of structure from motion: 98 % of the points on the cloth of *tabletop* (images of 135 × 240 pixels)."""
+"""Points of structure from motion: 98 % of those on the cloth of *tabletop* (images of 135 × 240)."""
 DENSE = Scatter(0.02, 0.08, 0.1)
-"""Of stereo: widths of 0.015 and 0.02, links from 0.06 to 0.1 and lifts from 0.05 to 0.15 find the objects of
-the four rooms of `scenes/README.md`."""
+"""Points of stereo: widths of 0.015 and 0.02, links from 0.06 to 0.1 and lifts from 0.05 to 0.15 find the
+objects of the four rooms of `scenes/README.md`."""
 FITTED = Scatter(0.1, 0.08)
-"""Of surfaces halfway through a fit: the varnished table of *figure* is off by a tenth of a radius there.
+"""Points on surfaces halfway through a fit: the varnished table of *figure* is off by a tenth of a radius.
 Widths from 0.06 to 0.15 find it, 0.03 does not."""
 
 Seen = Callable[[np.ndarray], np.ndarray]

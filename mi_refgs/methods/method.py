@@ -92,9 +92,7 @@ class SurroundingsOptions:
     opacity: float = 0.1  # initial, of object and background: a cloud of 0.3 closes before the object forms
     size: float = 0.1  # largest initial size, in distances from the region's centre
     prune_extent: float = 0.5  # distances from the region's centre; larger surfels are removed
-    reach: float = 1.0
-    """Factor of the learning rates of positions, which are proportional to the distance from the region's
-    centre: 1 at the scene's extent."""
+    reach: float = 1.0  # factor of the positions' learning rates, which grow with distance from the region
     height: int = 32  # texels of the environment; width is twice that
     rate: float = 0.01  # Adam learning rate of the environment's texels
 
