@@ -182,11 +182,11 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
 
 
 def test_flat_surfels_right_above_a_plane_are_its_surface(method: Method) -> None:
-    """Unless most of the object is flat; upright ones there are the object's."""
+    """Once the fit does not grow, unless much of the object is flat; upright ones there are the object's."""
     region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1),))
     upright, flat = [0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)], [1.0, 0, 0, 0]
 
-    def left(places: list[list[float]], turns: list[list[float]]) -> int:
+    def left(places: list[list[float]], turns: list[list[float]], settled: bool = True) -> int:
         names = method.surfels.names
         raw = {n: np.zeros((len(places), method.surfels.columns(n))) for n in names}
         raw |= {"position": np.array(places), "rotation": np.array(turns)}
@@ -197,11 +197,13 @@ def test_flat_surfels_right_above_a_plane_are_its_surface(method: Method) -> Non
             "position": np.array([[0, 0, -0.5]])
         }
         outer = Surfels.from_numpy({n: raw[n][:1] for n in around} | below)
-        return exchanged(inner, outer, method, region, np.random.default_rng(0))[0].surfels.count
+        rng = np.random.default_rng(0)
+        return exchanged(inner, outer, method, region, rng, settled)[0].surfels.count
 
     height = 0.1 + 0.5 * FLAT_HEIGHT * region.radius
     body = [[0, 0, 0.4]] * 8
     assert left([*body, [0, 0, height]], [upright] * 8 + [flat]) == 8
+    assert left([*body, [0, 0, height]], [upright] * 8 + [flat], settled=False) == 9
     assert left([*body, [0, 0, height]], [upright] * 9) == 9
     assert left([*body, [0, 0, height + FLAT_HEIGHT * region.radius]], [upright] * 8 + [flat]) == 9
     assert left([[0, 0, height]] * 4, [flat] * 4) == 4
