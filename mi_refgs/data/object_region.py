@@ -188,7 +188,7 @@ def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatt
     """The group (M, 3) of points (N, 3) above the region's planes that most views show, and that has the most
     points in its sphere."""
     near = np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * region.radius
-    points = points[near & (region.heights(points) >= scatter.lift * region.radius).all(axis=1)]
+    points = points[near & region.above(points, scatter.lift * region.radius)]
     points = np.random.default_rng(0).permutation(points)[: 2 * MOST_POINTS]
     points = points[seen(points) >= SEEN_SHARE]
     if not len(points):

@@ -94,9 +94,9 @@ class Region:
         planes = np.array(self.planes).reshape(-1, 4)
         return np.asarray(points @ planes[:, :3].T - planes[:, 3])
 
-    def above(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (N, 3) are above all planes: (N,) bool."""
-        return np.asarray((self.heights(points) >= 0).all(axis=-1))
+    def above(self, points: np.ndarray, height: float = 0.0) -> np.ndarray:
+        """Whether points (N, 3) are above all planes by this height, scene units: (N,) bool."""
+        return np.asarray((self.heights(points) >= height).all(axis=-1))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Whether points (N, 3) are inside: (N,) bool."""

@@ -27,13 +27,13 @@ ALIKE = 2  # of these, the most similar count: others may not see a surface
 BASELINE = 12.0  # preferred angle between two views from the region's centre, degrees
 DEPTHS = 64  # depths that are compared, evenly spaced in 1/z
 NEAREST = 0.35  # the first of them, in distances of the cameras from the region's centre
-FARTHEST = 20.0  # the last one, in radii of the region beyond its centre: where random points end, too
+FARTHEST = 20.0  # the last one, in radii of the region beyond its centre; random points end there, too
 PATCH = 5  # side of a compared patch, pixels
 CONTRAST = 0.0045
 """Standard deviation of the display-encoded values of a patch, 0 … 1, below which it has no texture: that of
 about one grey level of 256."""
 SIMILAR = 0.75  # correlation from which a depth counts
-SIMILAR_THERE = 0.5  # the same of a view that confirms it
+SIMILAR_CONFIRMING = 0.5  # the same of a view that confirms the depth
 VOXEL = 0.03  # side of the voxels that are left with one point, in contracted space
 VOXEL_POINTS = 3  # fewest points in a voxel on a surface; stray ones are alone
 LEAST = 50  # points that are left: fewer are chance
@@ -80,7 +80,11 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     # The pixels whose depth others confirm, and the rest.
     position, on, off = [], [], []
     for one in swept:
-        view, ray, colour = one.view, _rays(one.view), one.view.colour(np.zeros(3))
+        view, ray, colour = (
+            one.view,
+            one.view.rays(*np.indices(one.nearness.shape)),
+            one.view.colour(np.zeros(3)),
+        )
         points = view.to_world[:3, 3] + ray / one.nearness[..., None]
         known = _confirmed(one, points, [swept[j] for j in one.near], tolerance)
         position.append(points[known])
@@ -125,7 +129,7 @@ def _sweep(
     """Best 1/z of each pixel, refined between two depths of the sweep, and the similarity of the patches."""
     mean = uniform_filter(grey, PATCH)
     variance = uniform_filter(grey * grey, PATCH) - mean * mean
-    ray = _rays(view)
+    ray = view.rays(*np.indices(grey.shape))
     volumes = np.empty((len(others), len(nearness), *grey.shape), np.float32)
     for volume, (other, image) in zip(volumes, others, strict=True):
         # A point at depth z is (along + nearness · offset) z in the other camera's frame.
@@ -172,13 +176,6 @@ def _confirmed(one: _Swept, points: np.ndarray, others: Sequence[_Swept], tolera
         at = tuple(np.where(inside, place, 0).round().astype(int) for place in (row, column))
         nearness = 1 / np.where(inside, other.view.depth_of(candidates), np.inf)
         same = abs(other.nearness[at] - nearness) < tolerance
-        agreed += inside & same & (other.similarity[at] >= SIMILAR_THERE)
+        agreed += inside & same & (other.similarity[at] >= SIMILAR_CONFIRMING)
     known[known] = agreed >= AGREED
     return known
-
-
-def _rays(view: View) -> np.ndarray:
-    """World vectors (H, W, 3) from the camera to the points at depth 1 of the pixels."""
-    row, column = np.mgrid[: view.height, : view.width]
-    x, y = (view.cx - 0.5 - column) / view.fx, (view.cy - 0.5 - row) / view.fy
-    return np.stack([x, y, np.ones_like(x)], axis=-1) @ view.to_world[:3, :3].T

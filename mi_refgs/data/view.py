@@ -148,6 +148,11 @@ class View:
         """Depth of world points (..., 3) along the viewing axis, scene units: (...)."""
         return np.asarray((points - self.to_world[:3, 3]) @ self.to_world[:3, 2])
 
+    def rays(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """World vectors (..., 3) from the camera to the points at depth 1 of pixels; integers are centres."""
+        x, y = (self.cx - 0.5 - column) / self.fx, (self.cy - 0.5 - row) / self.fy
+        return np.asarray(np.stack([x, y, np.ones_like(x)], axis=-1) @ self.to_world[:3, :3].T)
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Project world points (N, 3): row, column (N,), integer at pixel centres; whether in view (N,)."""
         local = (points - self.to_world[:3, 3]) @ self.to_world[:3, :3]

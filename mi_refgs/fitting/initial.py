@@ -13,6 +13,7 @@ from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset, PixelRays, PointCloud
 from mi_refgs.data.object_region import in_free_space, seen_share
 from mi_refgs.data.region import Region
+from mi_refgs.data.stereo import FARTHEST
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, LightOptions, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -23,9 +24,8 @@ from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import TensorXf
 
-FARTHEST_RADII = 20.0
-"""Distance of the farthest random points, radii of the region: beyond it the background map is as good."""
-FARTHEST = 2 - 1 / FARTHEST_RADII  # the same in contracted space
+FARTHEST_CONTRACTED = 2 - 1 / FARTHEST
+"""Contracted distance of the farthest random points: beyond it the background map is as good."""
 SEEN_SHARE = 0.1
 """Fraction of the views that must see a random point: fewer views cannot determine its position."""
 DRAWS = 64  # rounds of rejection sampling; cameras on one side of a scene accept about a tenth per round
@@ -94,7 +94,7 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
     nearest = 0.0 if region.planes else 1.0  # the sphere has points below planes
 
     def draw(number: int) -> np.ndarray:
-        length = np.cbrt(rng.uniform(nearest, FARTHEST**3, (number, 1)))
+        length = np.cbrt(rng.uniform(nearest, FARTHEST_CONTRACTED**3, (number, 1)))
         points = region.expand(init.random_normals(number, rng) * length)
         return points[~region.contains(points)] if region.planes else points
 
@@ -124,7 +124,7 @@ def _along(
     while len(points) < count:
         some = rng.integers(len(pixels.origin), size=2 * count)
         nearest = np.linalg.norm(pixels.origin[some] - np.array(region.centre), axis=1)
-        z = 1 / rng.uniform(1 / (nearest + FARTHEST_RADII * region.radius), 1 / nearest)
+        z = 1 / rng.uniform(1 / (nearest + FARTHEST * region.radius), 1 / nearest)
         drawn = pixels.origin[some] + pixels.direction[some] * z[:, None]
         outside = ~region.contains(drawn)
         points = np.concatenate([points, drawn[outside]])[:count]

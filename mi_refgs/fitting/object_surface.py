@@ -50,7 +50,4 @@ def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.
     beside = np.stack([around[r : r + view.height, c : c + view.width] for r, c in shifts])
     level = np.count_nonzero(abs(beside - z) < LEVEL * radius, axis=0) >= LEVEL_COUNT
     row, column = np.nonzero((opaque > SURFACE) & level)
-    local = np.stack(
-        [(view.cx - 0.5 - column) / view.fx, (view.cy - 0.5 - row) / view.fy, np.ones(len(row))], 1
-    )
-    return np.asarray((local * z[row, column, None]) @ view.to_world[:3, :3].T + view.to_world[:3, 3])
+    return np.asarray(view.to_world[:3, 3] + view.rays(row, column) * z[row, column, None])

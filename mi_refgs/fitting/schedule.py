@@ -156,9 +156,9 @@ class FitSetup:
 
     def _far(self, group: Group) -> Group:
         """The rates of the background's positions: the farther a surface, the less is known of its place."""
-        around, region = self.method.surroundings, self.data.region
-        assert around is not None and region is not None and group.final is not None
-        rate, final = around.reach * group.rate, around.reach * group.final
+        background, region = self.method.surroundings, self.data.region
+        assert background is not None and region is not None and group.final is not None
+        rate, final = background.reach * group.rate, background.reach * group.final
         return replace(group, rate=rate, final=final, centre=region.centre)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:

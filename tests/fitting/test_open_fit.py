@@ -192,11 +192,11 @@ def test_flat_surfels_right_above_a_plane_are_its_surface(method: Method) -> Non
         raw |= {"position": np.array(places), "rotation": np.array(turns)}
         raw["scale"] = np.full((len(places), 2), np.log(1e-4))
         inner = Surfels.from_numpy(raw)
-        around = SurroundingsOptions(degree=0).names("surfel")
-        below = {n: raw[n][:1, :3] for n in around if n == "radiance_sh"} | {
+        background = SurroundingsOptions(degree=0).names("surfel")
+        below = {n: raw[n][:1, :3] for n in background if n == "radiance_sh"} | {
             "position": np.array([[0, 0, -0.5]])
         }
-        outer = Surfels.from_numpy({n: raw[n][:1] for n in around} | below)
+        outer = Surfels.from_numpy({n: raw[n][:1] for n in background} | below)
         rng = np.random.default_rng(0)
         return exchanged(inner, outer, method, region, rng, settled)[0].surfels.count
 
