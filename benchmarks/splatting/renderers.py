@@ -39,7 +39,7 @@ class Ours:
         heard = _Arguments()
         with listening(heard):
             trainer.step()
-        surfels, camera = heard.arguments["project"]
+        (surfels,), camera = heard.arguments["project"]
         columns = dr.detach(heard.arguments["splat forward"][1])
         shape = (len(columns) + 2, camera.width * camera.height)
         weights = np.random.default_rng(0).normal(size=shape)

@@ -118,7 +118,7 @@ def _scene(case: Case, light: reference.Light | None) -> reference.Scene:
     c = case.camera
     pixels = np.arange(c.width * c.height)
     raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
-    order = sorted_rows(raw, c, pixels)
+    order = sorted_rows([raw], c, pixels)
     return reference.Scene(raw, c, pixels, order, case.at, case.reflectance, case.diffuse, light)
 
 

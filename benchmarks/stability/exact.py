@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.stability.cases import Array, Case
-from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference.light import Light, dense_filter, filtered
 from mi_refgs.reference.occlusion import mirror_visibility
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
-from mi_refgs.splat import Camera, list_by_tile, project
+from mi_refgs.splat import Camera, list_by_tile, project, surfel_count
 from mi_refgs.surfels.table import Surfels
 
 
@@ -48,12 +47,15 @@ def light_gradient(raw: Array, light: Light, δflat: Array) -> Array:
     return δradiance.reshape(raw.shape) / (1 + np.exp(-np.asarray(raw, np.float64)))
 
 
-def product_order(case: Case, pixels: Array) -> Array:
-    """The product's order (N, P) of surfels at pixels; those that the tile does not list come last."""
-    count = len(case.raw["position"])
+def product_order(case: Case, pixels: Array, around: dict[str, Array] | None = None) -> Array:
+    """The product's order (N, P) of surfels at pixels; those that the tile does not list come last.
+
+    `around`: raw channels of surroundings, whose rows follow those of the case.
+    """
     camera = fast_camera(case)
-    surfels = Surfels({name: upload_tensor(x) for name, x in case.raw.items()})
-    lists = list_by_tile(project(surfels, camera), camera)
+    tables = [Surfels.from_numpy(raw) for raw in (case.raw, around) if raw is not None]
+    count = surfel_count(tables)
+    lists = list_by_tile(project(tables, camera), camera)
     listed, begin, end = (
         np.array(x).astype(int) for x in (lists.surfel_from_pair, lists.pair_begin, lists.pair_end)
     )

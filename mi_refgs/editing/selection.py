@@ -18,7 +18,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.splat import Camera, splat
+from mi_refgs.splat import Camera, splat, surfel_count
 from mi_refgs.splat.weights import blended_weights
 from mi_refgs.types import Float
 
@@ -84,11 +84,11 @@ def shown_weights(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> tupl
     _require_size("--mask", mask, camera)
     own, background = scene.surfels.detach(), scene.surroundings
     others = None if background is None else background.surfels.detach()
-    table = own if others is None else own.followed_by(others)
+    tables = [own] if others is None else [own, others]
     with dr.suspend_grad():
         depth, _ = render_depth(own, camera, others)
     maps = [upload(mask.astype(np.float32)), mi.Float(1), depth]
-    inside, every, far = (weight[: own.count] for weight in blended_weights(table, camera, maps))
+    inside, every, far = (weight[: own.count] for weight in blended_weights(tables, camera, maps))
     centre = np.array(camera.to_camera(own.position()).z, np.float64)
     pixel_depth = far / np.maximum(every, np.finfo(np.float64).tiny)
     behind = centre - pixel_depth > BEHIND_SIZES * SurfelValues(scene)["size"]
@@ -98,14 +98,14 @@ def shown_weights(scene: TrainedScene, camera: Camera, mask: np.ndarray) -> tupl
 def selected_alpha(scene: TrainedScene, chosen: np.ndarray, camera: Camera) -> Float:
     """Opacity (H·W,) of the chosen surfels (N,) bool in a view; all other surfels occlude them."""
     own, background = scene.surfels.detach(), scene.surroundings
-    table = own if background is None else own.followed_by(background.surfels.detach())
-    feature = upload(np.pad(chosen.astype(np.float32), (0, table.count - own.count)))
+    tables = [own] if background is None else [own, background.surfels.detach()]
+    feature = upload(np.pad(chosen.astype(np.float32), (0, surfel_count(tables) - own.count)))
 
     def blended(part: Camera) -> Float:
-        return splat(table, [feature], part).features[0]
+        return splat(tables, [feature], part).features[0]
 
     with dr.suspend_grad():
-        return in_passes(blended, camera, surfels=table.count)
+        return in_passes(blended, camera, surfels=surfel_count(tables))
 
 
 def read_painted(path: Path, camera: Camera) -> np.ndarray:

@@ -24,6 +24,7 @@ from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import LIGHT, Method
+from mi_refgs.splat import surfel_count
 from mi_refgs.splat.weights import blended_weights, listed_tiles
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
@@ -36,13 +37,6 @@ REACH = 2.0
 """Standard deviations to which a surfel extends: one that extends through the plane below the object is the
 table's. On *tabletop*, the opacity of the object alone has an intersection over union with the jug's mask of
 0.90 by centres, 0.94 with 1, 0.96 with 2 and 3."""
-FLAT_HEIGHT, FLAT_COSINE = 0.1, 0.9
-"""A surfel belongs to a plane of the region if it is at most this many radii above it, and parallel to it by
-this cosine. The object alone then has an intersection over union with the mask of 0.96 on *can*, 0.93 without
-(160 × 90, 1,000 iterations). It does not help on *figure*, whose varnish the object's reflections explain."""
-FLAT_SHARE = 0.25
-"""Fraction of the object's surfels that are such ones, above which they stay: the object is thin, and lies on
-the table."""
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 
@@ -59,45 +53,22 @@ def depth_outside(position: np.ndarray, region: Region, reach: np.ndarray | floa
 def reach_of(table: dict[str, np.ndarray], region: Region) -> np.ndarray:
     """Extent (N, P) of surfels along the normals of a region's planes, scene units: REACH deviations."""
     axes, deviations = primitive_of(table).extent(table)
-    along = np.einsum("nai,pi->npa", axes, _normals(region)) * deviations[:, None]
+    normals = np.array(region.planes).reshape(-1, 4)[:, :3]
+    along = np.einsum("nai,pi->npa", axes, normals) * deviations[:, None]
     return np.asarray(REACH * np.linalg.norm(along, axis=-1))
 
 
-def lies_flat(surfels: Surfels, region: Region) -> np.ndarray:
-    """Whether surfels are parallel to a plane and at most FLAT_HEIGHT above it, (N, P)."""
-    cosine = surfels.primitive.normal(surfels).numpy().T @ _normals(region).T
-    height = region.heights(surfels.position().numpy().T)
-    return np.asarray((abs(cosine) > FLAT_COSINE) & (height < FLAT_HEIGHT * region.radius))
-
-
-def _normals(region: Region) -> np.ndarray:
-    """Normals (P, 3) of its planes."""
-    return np.array(region.planes).reshape(-1, 4)[:, :3]
-
-
 def exchanged(
-    inner: Surfels,
-    outer: Surfels,
-    method: Method,
-    region: Region,
-    rng: np.random.Generator,
-    settled: bool = False,
+    inner: Surfels, outer: Surfels, method: Method, region: Region, rng: np.random.Generator
 ) -> list[TableEdit]:
     """Both tables after surfels beyond the border have changed tables.
 
-    In a `settled` fit, which does not grow any more, those that lie flat on a plane go to the background;
-    before, others would grow above them. A table may become larger than its method allows, and does not grow
-    then.
+    One of another primitive keeps its axes and sizes, as far as it has them. A table may become larger than
+    its method allows, and does not grow then.
     """
     tables = [inner.to_numpy(), outer.to_numpy()]
-    reach = [reach_of(table, region) for table in tables]
-    if settled:
-        flat = [lies_flat(surfels, region) for surfels in (inner, outer)]
-        if flat[0].any(axis=1).mean() <= FLAT_SHARE:
-            for extent, lying in zip(reach, flat, strict=True):
-                np.maximum(extent, FLAT_HEIGHT * region.radius, out=extent, where=lying)
     own_depth, other_depth = (
-        depth_outside(table["position"], region, extent) for table, extent in zip(tables, reach, strict=True)
+        depth_outside(table["position"], region, reach_of(table, region)) for table in tables
     )
     leaves = [own_depth > MARGIN, other_depth < -MARGIN]
     for gone in leaves:  # one surfel stays
@@ -106,7 +77,11 @@ def exchanged(
     for own, other, gone, comes in zip(tables, tables[::-1], leaves, leaves[::-1], strict=True):
         stays = np.flatnonzero(~gone)
         widths = {name: values.shape[1] for name, values in own.items()}
-        moved = converted({name: values[comes] for name, values in other.items()}, widths, method, rng)
+        arrives = {name: values[comes] for name, values in other.items()}
+        before, after = primitive_of(other), primitive_of(own)
+        if before is not after:
+            arrives |= after.like(*before.extent(arrives))
+        moved = converted(arrives, widths, method, rng)
         table = {name: np.concatenate([values[stays], moved[name]]) for name, values in own.items()}
         parent = np.concatenate([stays, np.zeros(comes.sum(), int)]).astype(np.uint32)
         edits.append(TableEdit(Surfels.from_numpy(table), parent, np.arange(len(parent)) >= len(stays)))
@@ -220,10 +195,10 @@ class AdaptiveControl:
 
     def _faint(self) -> list[np.ndarray]:
         """The rows of each table with the least blending weight for the tiles they cost, these first."""
-        every, own = self.state.geometry(), self.state.surfels.count
+        every, own = self.state.detached(), self.state.surfels.count
         views = self.setup.data.views
         cameras = (views[i].camera() for i in evenly_spread(len(views), WEIGHED_VIEWS))
-        weight, cost = np.zeros(every.count), np.zeros(every.count)
+        weight, cost = np.zeros(surfel_count(every)), np.zeros(surfel_count(every))
         for camera in cameras:
             small = camera.resized(min(WEIGHED_SIZE, max(camera.width, camera.height)))
             weight += blended_weights(every, small)[0]
@@ -235,9 +210,7 @@ class AdaptiveControl:
     def exchange(self, region: Region, iteration: int) -> None:
         """Let the surfels beyond the border of a region change tables."""
         inner, outer = (table.surfels for table in self.state.tables)
-        densify, rng = self.options.densify, self.setup.rng(iteration, "densify")
-        settled = densify is None or iteration > densify.until
-        edits = exchanged(inner, outer, self.setup.method, region, rng, settled)
+        edits = exchanged(inner, outer, self.setup.method, region, self.setup.rng(iteration, "densify"))
         for table, edit in zip(self.state.tables, edits, strict=True):
             table.apply(edit)
         self.state.occluder.vertex_surfels = None

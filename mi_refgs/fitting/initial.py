@@ -205,7 +205,7 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
         init.random_normals(len(points), rng),
         colours[order],
         rng=rng,
-        primitive=method.surfels.primitive,
+        primitive=options.primitive,
         attributes=["radiance_sh"],
         degree={"radiance_sh": options.degree},
         largest=options.size * distance,

@@ -70,15 +70,19 @@ def alpha_loss(alpha: Float, target: Float) -> Float:
 # ---------------- geometry losses ----------------
 
 
-def normal_consistency(normal: Vector3f, depth_normal: Vector3f, valid: Bool, alpha: Float) -> Float:
-    """Mean over all pixels of A (A - N · n_d), with A detached and only where n_d is valid.
+def normal_consistency(
+    normal: Vector3f, depth_normal: Vector3f, valid: Bool, alpha: Float, share: Float | None = None
+) -> Float:
+    """Mean over all pixels of A (a - N · n_d), with A detached and only where n_d is valid.
 
-    This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A: its gradient is that of 1 - N · (n_d
-    stopgrad(A)), but empty pixels count zero. normal: N premultiplied; depth_normal: unit
-    (render.depth_normals). Gradients flow to both.
+    This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A. normal: N, premultiplied; depth_normal: n_d,
+    unit (render.depth_normals); gradients flow to both. `share` is a, the opacity of the surfels that have
+    normals, with gradients: a background in their place is as good. By default all have normals, a is A
+    detached, and the gradient is that of 1 - N · (n_d stopgrad(A)), as in the code of 2DGS.
     """
     weight = dr.select(valid, dr.detach(alpha), 0.0)
-    return _mean(weight * (weight - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
+    covered = weight if share is None else share
+    return _mean(weight * (covered - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
 
 
 def smoothness(

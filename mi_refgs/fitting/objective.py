@@ -89,7 +89,8 @@ register = LOSSES.register
 def _normal(inputs: LossInputs) -> Float:
     frame = inputs.frame
     depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, inputs.target.camera)
-    return losses.normal_consistency(frame.normal, depth_normal, valid, frame.normal_alpha)
+    share = None if frame.background is None else frame.object_alpha
+    return losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha, share)
 
 
 def _smooth(inputs: LossInputs) -> Float:

@@ -130,7 +130,7 @@ class FitSetup:
         groups = self._of_table(self.method.surfels.names, extent)
         around = self.method.surroundings
         if self.open_scene and around is not None:
-            table = self._of_table(around.names(self.method.surfels.primitive), extent)
+            table = self._of_table(around.names, extent)
             table["position"] = self._far(table["position"])
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = Group(around.rate, around.rate * rates.decay, iterations)
@@ -166,8 +166,8 @@ class FitSetup:
         surfels, around = self.method.surfels, self.method.surroundings
         found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
         if self.open_scene and around is not None:
-            harmonics = replace(surfels, degree={"radiance_sh": around.degree})
-            found |= {AROUND + name: (harmonics.columns(name),) for name in around.names(surfels.primitive)}
+            harmonics = replace(surfels, primitive=around.primitive, degree={"radiance_sh": around.degree})
+            found |= {AROUND + name: (harmonics.columns(name),) for name in around.names}
             found[BACKGROUND] = (2 * around.height, 3)
         return found if self.method.light is None else found | {LIGHT: (2 * self.method.light.height, 3)}
 

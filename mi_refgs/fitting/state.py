@@ -144,9 +144,10 @@ class FitState:
     @staticmethod
     def _assembled(setup: FitSetup, params: dict[str, TensorXf]) -> FitState:
         optimiser, method = Adam(params, setup.groups(params)), setup.method
-        tables = [ParameterTable(params, optimiser, "", method.surfels.most)]
+        limits = {"": method.surfels.most}
         if setup.open_scene and method.surroundings is not None:
-            tables.append(ParameterTable(params, optimiser, AROUND, method.surroundings.max_count))
+            limits[""], limits[AROUND] = method.surroundings.limits(limits[""])
+        tables = [ParameterTable(params, optimiser, prefix, most) for prefix, most in limits.items()]
         return FitState(params, optimiser, tables)
 
     @property
@@ -154,10 +155,9 @@ class FitState:
         """The object, attached to the leaves that the optimiser owns."""
         return self.tables[0].surfels
 
-    def geometry(self) -> Surfels:
-        """Detached geometry of all surfels: the object's, then the background's."""
-        own, *others = (table.surfels.detach() for table in self.tables)
-        return own.followed_by(others[0]) if others else own
+    def detached(self) -> list[Surfels]:
+        """The surfels of all tables, detached: the object's, then the background's."""
+        return [table.surfels.detach() for table in self.tables]
 
     @property
     def surroundings(self) -> Surroundings | None:

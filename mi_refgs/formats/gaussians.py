@@ -31,7 +31,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_basis
-from mi_refgs.splat import Camera, splat
+from mi_refgs.splat import Camera, Tables, splat, surfel_count
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
@@ -62,22 +62,23 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
         raise InputError(f"--degree: {degree} is out of range; give 0 to {MAX_SH_DEGREE}")
     if object_only:
         trained = replace(trained, surroundings=None)
-    around, table = trained.surroundings, trained.surfels.detach()
-    if around is not None and around.surfels.count:
-        table = table.followed_by(around.surfels)
-    if not table.count:
+    around, tables = trained.surroundings, [trained.surfels.detach()]
+    if around is not None:
+        tables.append(around.surfels.detach())
+    tables = [table for table in tables if table.count]
+    if not tables:
         raise InputError("surfels: there are none; nothing can be exported")
 
     # Training cameras, spread evenly over all of them, of at most PIXELS.
     chosen = [shot.camera for shot in shots if shot.split == "train"] or [shot.camera for shot in shots]
     cameras = [_limited(chosen[i]) for i in evenly_spread(len(chosen), VIEWS)]
 
-    # Geometry: surfels get a thin third axis.
-    raw = {name: table.to_numpy()[name] for name in table.primitive.widths}
-    if raw["scale"].shape[1] == 2:
-        raw["position"] = _inset(table, cameras)
-        thin = raw["scale"].min(axis=1, keepdims=True) + np.float32(np.log(THIN))
-        raw["scale"] = np.concatenate([raw["scale"], thin], axis=1)
+    # Geometry: surfels get a thin third axis, and move inwards.
+    parts = [_geometry(table) for table in tables]
+    raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    flat = np.repeat([_is_flat(table) for table in tables], [table.count for table in tables])
+    if flat.any():
+        raw["position"] = np.where(flat[:, None], _inset(tables, cameras), raw["position"])
 
     # Colours: those of an imported file are encoded already.
     if trained.shading.model.encoded and around is None:
@@ -96,17 +97,32 @@ def _limited(camera: Camera) -> Camera:
     return camera if factor <= 1 else camera.resized(size)
 
 
-def _inset(table: Surfels, cameras: Sequence[Camera]) -> np.ndarray:
+def _is_flat(table: Surfels) -> bool:
+    """Whether the table is of surfels."""
+    return table.raw["scale"].shape[1] == 2
+
+
+def _geometry(table: Surfels) -> dict[str, np.ndarray]:
+    """Return raw geometry with three standard deviations."""
+    raw = {name: table.to_numpy()[name] for name in table.primitive.widths}
+    if _is_flat(table):
+        thin = raw["scale"].min(axis=1, keepdims=True) + np.float32(np.log(THIN))
+        raw["scale"] = np.concatenate([raw["scale"], thin], axis=1)
+    return raw
+
+
+def _inset(tables: Sequence[Surfels], cameras: Sequence[Camera]) -> np.ndarray:
     """Return positions (N, 3) float32 moved by INSET pixels away from the side that the cameras see."""
-    position, normal = table.position(), table.primitive.normal(table)
-    side, pixels, total = np.zeros(table.count), np.zeros(table.count), np.zeros(table.count)
+    position = np.concatenate([table.position().numpy().T for table in tables])
+    normal = np.concatenate([table.primitive.normal(table).numpy().T for table in tables])
+    place = mi.Point3f(*(upload(column) for column in np.ascontiguousarray(position.T)))
+    side, pixels, total = (np.zeros(len(position)) for _ in range(3))
     for camera in cameras:
-        weight = _BlendedView.of(table, [], camera).weighted_sums([])[-1]
-        cosine = dr.dot(normal, dr.normalize(camera.towards(position))).numpy()
+        weight = _BlendedView.of(tables, [], camera).weighted_sums([])[-1]
+        cosine = np.sum(normal * dr.normalize(camera.towards(place)).numpy().T, axis=1)
         side -= weight * np.sign(cosine)
-        pixels += weight * np.maximum(camera.to_camera(position).z.numpy(), 0) / camera.focal
+        pixels += weight * np.maximum(camera.to_camera(place).z.numpy(), 0) / camera.focal
         total += weight
-    normal, position = normal.numpy().T, position.numpy().T
     outward = np.sign(side)[:, None] * normal
     distance = INSET * pixels / np.maximum(total, 1e-12)
     seen = total > SEEN
@@ -127,10 +143,10 @@ class _BlendedView:
     alpha: Float  # (H*W,)
 
     @staticmethod
-    def of(table: Surfels, colours: Sequence[np.ndarray], camera: Camera) -> _BlendedView:
-        inputs = [*(upload(plane) for plane in colours), dr.opaque(mi.Float, 0, table.count)]
+    def of(tables: Tables, colours: Sequence[np.ndarray], camera: Camera) -> _BlendedView:
+        inputs = [*(upload(plane) for plane in colours), dr.opaque(mi.Float, 0, surfel_count(tables))]
         dr.enable_grad(inputs)
-        blended = splat(table, inputs, camera)
+        blended = splat(tables, inputs, camera)
         return _BlendedView(inputs, list(blended.features), dr.detach(blended.alpha))
 
     def weighted_sums(self, images: Sequence[Float]) -> list[np.ndarray]:

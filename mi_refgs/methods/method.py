@@ -81,12 +81,14 @@ class SurfelOptions:
 
 @dataclass(frozen=True)
 class SurroundingsOptions:
-    """The scene outside the region of interest, for images without alpha: background Gaussians of the
-    object's primitive with radiance_sh only, and a lat-long environment behind everything.
+    """The scene outside the region of interest, for images without alpha: background Gaussians with
+    radiance_sh only, and a lat-long environment behind everything.
     """
 
+    primitive: str = "gaussian"  # what is splatted: needs no normals, and a surfel is a flat Gaussian
     count: int = 20_000  # initial surfels
-    max_count: int = 40_000  # densification stops here
+    max_count: int = 40_000  # densification stops where both together have as many as both may
+    share: float = 0.75  # fraction of these that may be the background's: it has most of the pixels
     degree: int = 2  # of radiance_sh
     scattered: float = 0.5  # fraction of the initial surfels anywhere; the others at sparse points
     opacity: float = 0.1  # initial, of object and background: a cloud of 0.3 closes before the object forms
@@ -96,9 +98,16 @@ class SurroundingsOptions:
     height: int = 32  # texels of the environment; width is twice that
     rate: float = 0.01  # Adam learning rate of the environment's texels
 
-    def names(self, primitive: str) -> tuple[str, ...]:
-        """All attributes of background Gaussians of a primitive."""
-        return (*PRIMITIVES.find(primitive, "primitive").widths, "radiance_sh")
+    def limits(self, most: int) -> tuple[int, int]:
+        """Largest numbers of surfels of an object that alone may have `most`, and of its background."""
+        together = most + self.max_count
+        background = round(self.share * together)
+        return together - background, background
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All attributes of background Gaussians."""
+        return (*PRIMITIVES.find(self.primitive, "primitive").widths, "radiance_sh")
 
 
 @dataclass(frozen=True)

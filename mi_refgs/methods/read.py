@@ -160,6 +160,7 @@ def load_resolved(path: Path) -> Method:
     """Read the resolved `config.toml` of a run, unscaled.
 
     A run has the losses in its file and no others; a file of 0.1, with numbers as weights, may lack some.
+    Without a primitive of its own, the background has that of the object, and shares no limit with it.
     """
     parsed = _parsed(path)
     for key in REMOVED:
@@ -168,7 +169,12 @@ def load_resolved(path: Path) -> Method:
     losses = parsed.get("loss")
     complete = isinstance(losses, dict) and all(isinstance(loss, dict) for loss in losses.values())
     table = _modernised(parsed, str(path))
-    return build(Method, table, str(path)) if complete else _built(table, str(path))
+    method = build(Method, table, str(path)) if complete else _built(table, str(path))
+    around = method.surroundings
+    if around is not None and "primitive" not in table["surroundings"]:
+        share = around.max_count / (method.surfels.most + around.max_count)
+        around = replace(around, primitive=method.surfels.primitive, share=share)
+    return replace(method, surroundings=around)
 
 
 def _built(table: dict[str, Any], where: str) -> Method:
@@ -431,10 +437,11 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
 def _require_consistent(method: Method, where: str) -> None:
     """Raise InputError for unknown names, values out of range, and stages without what they need."""
     surfels, light, relocate = method.surfels, method.light, method.refine.relocate
-    try:
-        attributes = {*surfels.names}
-    except InputError as error:
-        raise InputError(f"{where}: surfels.{error}") from error
+    for name, table in (("surroundings", method.surroundings), ("surfels", surfels)):
+        try:
+            attributes = {*table.names} if table is not None else set()
+        except InputError as error:
+            raise InputError(f"{where}: {name}.{error}") from error
     _require_known_names(method, attributes, where)
 
     # Numbers: (key, value, whether it is allowed, what is).
@@ -476,6 +483,7 @@ def _require_consistent(method: Method, where: str) -> None:
             (f"surroundings.{key}", getattr(around, key), allowed, wanted)
             for key, allowed, wanted in (
                 ("count", around.count >= 1, "1 or more"),
+                ("share", 0 < around.share < 1, "a number between 0 and 1"),
                 ("degree", 0 <= around.degree <= MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
                 ("scattered", 0 <= around.scattered <= 1, "a fraction from 0 to 1"),
                 ("opacity", 0 < around.opacity < 1, "a number between 0 and 1"),

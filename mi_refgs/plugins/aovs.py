@@ -100,7 +100,7 @@ def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Float], Flo
         value = frame.maps[kind]
         return [*value] if len(ATTRIBUTES[kind].aov) > 1 else [value], frame.object_alpha
     if kind == "normal":
-        return [*frame.normal], frame.normal_alpha
+        return [*frame.normal], frame.object_alpha
     if kind == "depth":
         return [ray_distance(frame.depth, camera) if frame.distance is None else frame.distance], frame.alpha
     if kind == "alpha":

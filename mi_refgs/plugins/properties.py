@@ -26,6 +26,7 @@ from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply
+from mi_refgs.surfels.primitives import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f
 
@@ -111,8 +112,8 @@ class BackgroundProperties:
         behind = read_background(props)
         colour, light = (None, behind) if isinstance(behind, EnvironmentLight) else (behind, None)
         raw = _attributes(props, "surroundings", AROUND)
-        names = (*surfels.primitive.widths, "radiance_sh")
-        around = Surfels({n: raw[n] for n in names if n in raw}) if raw else None
+        names = {"radiance_sh", *(n for primitive in PRIMITIVES.values() for n in primitive.widths)}
+        around = Surfels({n: tensor for n, tensor in raw.items() if n in names}) if raw else None
         return BackgroundProperties(around, colour, light)
 
     def require_fit(self, surfels: Surfels) -> None:

@@ -18,9 +18,10 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import Camera, Footprints, TileLists, list_by_tile, project
+from mi_refgs.splat import Camera, Footprints, TileLists, list_by_tile, project, surfel_count
 from mi_refgs.splat.lanes import advance
 from mi_refgs.surfels.attributes import sigmoid
+from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import UInt32
 
 
@@ -226,20 +227,19 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
 
 def count_work(trainer: Trainer) -> Work:
     """Count the mean work of up to VIEWS training views, the background's included."""
-    surfels = trainer.fit.geometry()
+    tables = trainer.fit.detached()
     chosen = evenly_spread(len(trainer.targets), VIEWS)
     counts: list[Counts] = []
     pixels = []
     for index in chosen:
         camera = trainer.targets[index].camera
         with dr.suspend_grad():
-            footprints = project(surfels, camera)
+            footprints = project(tables, camera)
             counts.append(count(footprints, list_by_tile(footprints, camera), camera))
         pixels.append(counts[-1].pixels_of_surfel.numpy())
     largest = np.max(pixels, axis=0)
     seen = largest > 0
-    raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
-    sizes = np.sort(np.maximum(surfels.primitive.extent(raw)[1], np.finfo(np.float32).tiny), axis=1)
+    opacity, aspect = (np.concatenate(found) for found in zip(*map(_opacity_and_aspect, tables), strict=True))
 
     def of_seen(values: np.ndarray, summary: Callable[[np.ndarray], Any] = np.mean) -> float:
         return float(summary(values[seen])) if seen.any() else 0.0
@@ -247,11 +247,18 @@ def count_work(trainer: Trainer) -> Work:
     means = ("pixels", "tile_pixels", "covered", "pairs", "evaluated", "contributing")
     return Work(
         views=len(chosen),
-        surfels=surfels.count,
+        surfels=surfel_count(tables),
         **{name: float(np.mean([getattr(found, name) for found in counts])) for name in means},
         unseen_share=float(1 - seen.mean()),
         single_share=of_seen(largest == 1),
-        faint_share=of_seen(sigmoid(raw["opacity"][:, 0]) < FAINT),
-        aspect=of_seen(sizes[:, -1] / sizes[:, -2], np.median),
+        faint_share=of_seen(opacity < FAINT),
+        aspect=of_seen(aspect, np.median),
         footprint=float(np.sum(pixels) / max(np.count_nonzero(pixels), 1)),
     )
+
+
+def _opacity_and_aspect(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
+    """Opacity (N,), and the longest deviation over the second."""
+    raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
+    sizes = np.sort(np.maximum(surfels.primitive.extent(raw)[1], np.finfo(np.float32).tiny), axis=1)
+    return sigmoid(raw["opacity"][:, 0]), sizes[:, -1] / sizes[:, -2]

@@ -16,7 +16,7 @@ import numpy as np
 
 from mi_refgs import constants as c
 from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
-from mi_refgs.reference.footprint import GEOMETRY, Rules
+from mi_refgs.reference.footprint import Rules
 from mi_refgs.reference.light import Light, radiance_of
 from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points, harmonics, positive, unit
 from mi_refgs.reference.splat import STEP, Blend, primitive_of
@@ -63,7 +63,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     raw = {name: np.asarray(x, np.float64) for name, x in scene.raw.items()}
     camera = scene.camera
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    blend = Blend.of(raw, camera, scene.order, x, y, scene.rules)
+    blend = Blend.of([raw], camera, scene.order, x, y, scene.rules)
     features_of = Features(scene, raw)
     taps: list[tuple[Array, Array, Array]] = []
     features = features_of(features_of.columns, taps).real
@@ -279,8 +279,7 @@ def render_open(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
     other = {name: np.asarray(values, np.float64) for name, values in open_scene.around.items()}
     count = len(own["position"])
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    both = {name: np.concatenate([own[name], other[name]]) for name in GEOMETRY}
-    blend = Blend.of(both, camera, scene.order, x, y, scene.rules)
+    blend = Blend.of([own, other], camera, scene.order, x, y, scene.rules)
 
     features = Features(scene, own)
     values = features(features.columns, []).real
@@ -294,19 +293,10 @@ def render_open(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
     seen = alpha > c.COVERAGE_FLOOR
     resolve.depth = np.where(seen, depth / np.where(seen, alpha, 1), 0)
     maps = resolve.named(resolve(sums, []).real)
-    maps["object_alpha"], maps["object_normal"] = share[:, None], maps["normal"]
+    maps["object_alpha"] = share[:, None]
     maps["alpha"] = alpha[:, None]
     maps["depth"] = resolve.depth[:, None]
     maps["radiance"] = maps["radiance"] + blend.weight[count:].T @ colour
-    if scene.at == "surfel":  # one slot for the normals of both
-        maps["normal"] = maps["normal"] + blend.weight[count:].T @ _facing(other, direction)
     texels = np.log1p(np.exp(np.asarray(open_scene.background, np.float64)))
     maps["background"] = radiance_of(texels, resolve.ray)
     return maps, blend.band(1e-4)
-
-
-def _facing(raw: dict[str, Array], direction: Array) -> Array:
-    """Normals (M, 3), turned towards the camera."""
-    normal = np.choose(primitive_of(raw).normal(raw)[:, None], rotation_axes(raw["rotation"]))
-    away = np.sum(normal * direction, axis=1, keepdims=True) > c.FACING_TOLERANCE
-    return np.where(away, -normal, normal)

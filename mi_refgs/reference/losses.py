@@ -86,9 +86,12 @@ def normals_from_depth(
     return normals, valid
 
 
-def normal_consistency(normal: Array, depth_normal: Array, valid: Array, weight: Array) -> float:
-    """Mean over all pixels of A (A - N · n_d) where n_d is valid; `weight` is the constant A."""
-    return float(np.mean(np.where(valid, weight * (weight - np.sum(normal * depth_normal, axis=-1)), 0)))
+def normal_consistency(
+    normal: Array, depth_normal: Array, valid: Array, weight: Array, share: Array | None = None
+) -> float:
+    """Mean over all pixels of A (a - N · n_d) where n_d is valid; `weight` is the constant A, a the share."""
+    covered = weight if share is None else share
+    return float(np.mean(np.where(valid, weight * (covered - np.sum(normal * depth_normal, axis=-1)), 0)))
 
 
 def smoothness(maps: Array, image: Array, edge: float = 1.0) -> float:

@@ -6,7 +6,9 @@ h f'(x). Derivatives of compositing follow from its sums. Letters: N primitives,
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,9 +39,9 @@ class Maps:
 
 @dataclass(frozen=True)
 class Blend:
-    """Footprints (N, P) blended front to back."""
+    """Footprints (N, P) of all tables, blended front to back."""
 
-    raw: dict[str, Array]
+    tables: Sequence[dict[str, Array]]  # raw channels
     camera: PinholeCamera
     rules: Rules
     order: Array  # (N, P): rows from front to back at each pixel
@@ -57,12 +59,18 @@ class Blend:
 
     @staticmethod
     def of(
-        raw: dict[str, Array], camera: PinholeCamera, order: Array, x: Array, y: Array, rules: Rules
+        tables: Sequence[dict[str, Array]],
+        camera: PinholeCamera,
+        order: Array,
+        x: Array,
+        y: Array,
+        rules: Rules,
     ) -> Blend:
-        """Blend raw channels at pixel centres x, y."""
-        primitive = primitive_of(raw)
-        culled = primitive.culled(raw, camera, rules)
-        sample = primitive.footprint(raw, camera, rules, x, y)
+        """Blend tables of raw channels at pixel centres x, y."""
+        culled = np.concatenate([primitive_of(raw).culled(raw, camera, rules) for raw in tables])
+        samples = [primitive_of(raw).footprint(raw, camera, rules, x, y) for raw in tables]
+        fields = ([getattr(sample, field.name) for sample in samples] for field in dataclasses.fields(Sample))
+        sample = Sample(*(np.concatenate(parts) for parts in fields))
         alpha, z = sample.alpha.real, sample.z.real
         hit = (alpha >= rules.alpha_min) & (z > camera.near) & ~culled[:, None]
         alpha, z = np.where(hit, alpha, 0), np.where(hit, z, 0)
@@ -74,7 +82,7 @@ class Blend:
         shown = hit & alive
         weight = np.where(shown, before * alpha, 0)
         return Blend(
-            raw, camera, rules, order, x, y, sample, culled, alpha, z, before, after, alive, shown, weight
+            tables, camera, rules, order, x, y, sample, culled, alpha, z, before, after, alive, shown, weight
         )
 
     def sums(self, features: Array) -> Array:
@@ -97,17 +105,18 @@ class Blend:
         return found
 
     def adjoint(self, features: Array, δsums: Array) -> tuple[dict[str, Array], Array]:
-        """Derivatives of Σ δsums · sums by the geometry's raw channels, and by features (N, K)."""
+        """Derivatives of Σ δsums · sums by raw channels of the one table, and by features (N, K)."""
+        (raw,) = self.tables
         value = features @ δsums[:, :-2].T + self.z * δsums[:, -2] + δsums[:, -1]
         part = np.take_along_axis(self.weight * value, self.order, 0)
         behind = _unsort(np.cumsum(part[::-1], axis=0)[::-1] - part, self.order)
         δalpha = np.where(self.shown, self.before * value - behind / (1 - self.alpha), 0)
         δz = np.where(self.shown, self.weight * δsums[:, -2], 0)
-        primitive, gradients = primitive_of(self.raw), {}
+        primitive, gradients = primitive_of(raw), {}
         for name in GEOMETRY:
-            gradients[name] = np.zeros_like(self.raw[name])
-            for d in range(self.raw[name].shape[1]):
-                moved = self.raw | {name: self.raw[name].astype(complex)}
+            gradients[name] = np.zeros_like(raw[name])
+            for d in range(raw[name].shape[1]):
+                moved = raw | {name: raw[name].astype(complex)}
                 moved[name][:, d] += 1j * STEP
                 there = primitive.footprint(moved, self.camera, self.rules, self.x, self.y)
                 slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
@@ -133,16 +142,17 @@ def differentiate(
 
 
 def sorted_rows(
-    raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: tuple[int, int] = (0, 0)
+    tables: Sequence[dict[str, Array]], camera: PinholeCamera, pixels: Array, corner: tuple[int, int] = (0, 0)
 ) -> Array:
-    """Rows (N, P) from front to back at pixels (raster indices); `corner` as in `sort_key`."""
-    return np.argsort(primitive_of(raw).sort_key(raw, camera, pixels, corner), axis=0, kind="stable")
+    """Rows (N, P) of all tables from front to back at pixels (raster indices); `corner` as in `sort_key`."""
+    keys = [primitive_of(raw).sort_key(raw, camera, pixels, corner) for raw in tables]
+    return np.argsort(np.concatenate(keys), axis=0, kind="stable")
 
 
 def _whole_image(raw: dict[str, Array], camera: PinholeCamera) -> Blend:
     pixels = np.arange(camera.width * camera.height)
     x, y = pixels % camera.width + 0.5, pixels // camera.width + 0.5
-    return Blend.of(raw, camera, sorted_rows(raw, camera, pixels), x, y, Rules())
+    return Blend.of([raw], camera, sorted_rows([raw], camera, pixels), x, y, Rules())
 
 
 def _unsort(values: Array, order: Array) -> Array:

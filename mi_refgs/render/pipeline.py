@@ -80,12 +80,12 @@ RADIANCE = Request()
 class Frame:
     """One rendered view: arrays of H·W linear values in raster order.
 
-        field      of object and surroundings       weight                   where nothing is seen
-        radiance   both                             times alpha              0
-        depth      both                             divided by alpha         0
-        normal     forward: both; deferred: object  times normal_alpha       0
-        terms      object                           times object_alpha       0
-        maps       object                           divided by object_alpha  0
+        field      of object and surroundings  weight                   where nothing is seen
+        radiance   both                        times alpha              0
+        depth      both                        divided by alpha         0
+        normal     object                      times object_alpha       0
+        terms      object                      times object_alpha       0
+        maps       object                      divided by object_alpha  0
 
     Without derivatives, AOVs that were not requested are None or absent. With derivatives, those that the
     radiance was computed from are there as well.
@@ -99,7 +99,6 @@ class Frame:
     maps: dict[str, Any] = field(default_factory=dict)  # by name: materials such as albedo, visibility
     background: Color3f = None  # linear, seen through 1 - alpha; None without surroundings
     object_alpha: Float = None  # opacity of the object, `alpha` itself without surroundings
-    normal_alpha: Float = None  # `alpha` in forward, `object_alpha` in deferred shading
     distance: Float = None  # mean along the ray from the near plane, of several samples per pixel
     attribution: Float = None  # blend of `Request.attribution`, zeros
 
@@ -137,9 +136,7 @@ def render_depth(
     surfels: Surfels, camera: Camera, surroundings: Surfels | None = None
 ) -> tuple[Float, Float]:
     """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with their surroundings."""
-    if surroundings is not None:
-        surfels = surfels.followed_by(surroundings)
-    blended = splat(surfels, [], camera)
+    blended = splat(surfels if surroundings is None else (surfels, surroundings), [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 
 
@@ -166,8 +163,8 @@ class _View:
     camera: Camera
     points: ShadingPoints  # the object's surfels, with the model's attributes
     presence: dict[str, Any]  # the slot of the object's opacity, where alpha is not that
-    others: dict[str, Any]  # radiance and normals of the surroundings' surfels; empty without any
-    geometry: Surfels  # of the object, then of the surroundings
+    others: dict[str, Any]  # radiance of the surroundings' surfels; empty without any
+    geometry: list[Surfels]  # of the object, then of the surroundings
     background: Color3f  # pixel by pixel; None without surroundings
 
     @staticmethod
@@ -176,13 +173,13 @@ class _View:
         seen = _seen(surfels, camera, request.sh_degree)
         attributes = {**scene.shading.model.values(surfels, seen, scene.shading)}
         normal = attributes.pop("normal", seen.normal)  # the model's own, or the surfels'
-        presence, others, geometry, background = {}, {}, surfels, None
+        presence, others, geometry, background = {}, {}, [surfels], None
         if surroundings is not None:
             beside = _seen(surroundings.surfels, camera, request.sh_degree)
             radiance = beside.harmonic_colour(surroundings.surfels.value("radiance_sh"))
             presence = {OBJECT: dr.full(mi.Float, 1, surfels.count)}
-            others = {"radiance": radiance, "normal": beside.normal}
-            geometry, background = surfels.followed_by(surroundings.surfels), surroundings.behind(camera)
+            others = {"radiance": radiance}
+            geometry, background = [surfels, surroundings.surfels], surroundings.behind(camera)
         points = ShadingPoints(normal, -seen.direction, attributes)
         return _View(scene, request, camera, points, presence, others, geometry, background)
 
@@ -194,8 +191,8 @@ class _View:
     def blend(self, slots: dict[str, Any], others: dict[str, Any]) -> GBuffer:
         """Blend slots of the object's surfels together with those of the surroundings, in one sort."""
         if self.others:
-            own = self.scene.surfels.count
-            slots = joined_slots(slots, others, (own, self.geometry.count - own))
+            own, beside = (table.count for table in self.geometry)
+            slots = joined_slots(slots, others, (own, beside))
         values = features(slots)
         if self.request.forward_only:
             depth, draft = "depth" in self.asked or self.scene.near is not None, self.request.draft
@@ -238,9 +235,9 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
     slots = {"radiance": terms.total()} | ({"normal": points.normal} if "normal" in asked else {})
     materials = scene.surfels.values(asked)
     slots |= asked_terms | materials
-    if asked - {"normal"}:  # terms and maps are those of the object: they need its opacity
+    if asked - {"depth"}:  # normals, terms and maps are those of the object: they need its opacity
         slots |= view.presence
-    buffer = view.blend(slots, {name: value for name, value in view.others.items() if name in slots})
+    buffer = view.blend(slots, view.others)
 
     # Frame.
     blended = buffer.slots
@@ -254,7 +251,6 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
         maps={name: buffer.divided(name) for name in materials},
         background=view.background,
         object_alpha=blended.get(OBJECT, None if view.others else buffer.alpha),
-        normal_alpha=buffer.alpha,
         attribution=buffer.attribution,
     )
     return frame, buffer
@@ -307,7 +303,6 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
         maps=maps,
         background=view.background,
         object_alpha=alpha,
-        normal_alpha=alpha,
         attribution=buffer.attribution,
     )
     return frame, buffer

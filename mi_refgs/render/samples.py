@@ -51,12 +51,8 @@ def supersampled(
     def mean(value: Any) -> Any:
         return mapped(lambda plane: box_mean(plane, camera, factor), value)
 
-    # Two of the three opacities, or all, may be one array.
-    alphas: dict[int, Any] = {}
-    for value in (fine.alpha, fine.object_alpha, fine.normal_alpha):
-        if id(value) not in alphas:
-            alphas[id(value)] = mean(value)
-    alpha, object_alpha = alphas[id(fine.alpha)], alphas[id(fine.object_alpha)]
+    alpha = mean(fine.alpha)
+    object_alpha = alpha if fine.object_alpha is fine.alpha else mean(fine.object_alpha)
     inverse = inverse_alpha(alpha)
 
     def by_alpha(value: Float) -> Float:
@@ -78,7 +74,6 @@ def supersampled(
         },
         background=None if fine.background is None else mean_behind(mean, fine.background, fine.alpha),
         object_alpha=object_alpha,
-        normal_alpha=alphas[id(fine.normal_alpha)],
         distance=distance,
         attribution=None if fine.attribution is None else mean(fine.attribution),
     )

@@ -12,13 +12,14 @@ from mi_refgs.errors import InputError
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import read_ply
+from mi_refgs.surfels.primitives import evaluating_both
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Surfels of the object's primitive with geometry and radiance_sh only, and a distant background.
+    """Surfels or Gaussians with geometry and radiance_sh only, and a distant background.
 
     The background is looked up in the direction of each pixel's ray; without one it is black.
     """
@@ -36,10 +37,7 @@ class Surroundings:
         """Raise InputError unless these fit an object's surfels."""
         if not self.surfels.has("radiance_sh"):
             raise InputError("surroundings: radiance_sh: the surfels have no such attribute; add it")
-        if self.surfels.primitive is not surfels.primitive:
-            raise InputError(
-                "surroundings: scale: not the primitive of the object; give both as many columns"
-            )
+        evaluating_both(surfels.primitive, self.surfels.primitive)
 
     def behind(self, camera: Camera) -> Color3f:
         """Radiance of the background per pixel of a camera, in raster order, under AD."""

@@ -126,8 +126,8 @@ def check(state: Mapping[str, np.ndarray]) -> None:
         geometry = table.primitive.widths
         light_of(params)
         around = surroundings_of(params)
-        if around is not None and around.surfels.primitive is not table.primitive:
-            raise InputError(f"{AROUND}: not the primitive of the object")
+        if around is not None:
+            around.check(table)
     except InputError as error:
         raise DamagedError(str(error)) from error
     scalars = ["iteration", "seconds", "held_until"]

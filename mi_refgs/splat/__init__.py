@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
+
 from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.composite import Composited, composite, composite_compact
@@ -14,28 +17,50 @@ __all__ = [
     "Camera",
     "Composited",
     "Footprints",
+    "Tables",
     "TileLists",
     "composite",
     "list_by_tile",
     "project",
     "splat",
     "splat_compact",
+    "surfel_count",
+    "tables_of",
 ]
 
 
+Tables = Surfels | Sequence[Surfels]
+"""One table of surfels, or several that are splatted in one sort, such as an object and its surroundings."""
+
+
+def tables_of(surfels: Tables) -> list[Surfels]:
+    """The tables."""
+    return [surfels] if isinstance(surfels, Surfels) else list(surfels)
+
+
+def surfel_count(surfels: Tables) -> int:
+    """Number of surfels in all tables."""
+    return sum(table.count for table in tables_of(surfels))
+
+
 @phase("project")
-def project(surfels: Surfels, camera: Camera) -> Footprints:
-    """Footprints of surfels in a camera."""
-    return surfels.primitive.project(surfels, camera)
+def project(surfels: Tables, camera: Camera) -> Footprints:
+    """Footprints of surfels in a camera, one table after the other.
+
+    Raises InputError for tables of primitives that are not splatted together.
+    """
+    tables = tables_of(surfels)
+    tables = [table for table in tables if table.count] or tables[:1]
+    return reduce(Footprints.followed_by, (table.primitive.project(table, camera) for table in tables))
 
 
 def splat(
-    surfels: Surfels,
+    surfels: Tables,
     features: list[Float],  # K × (N,)
     camera: Camera,
 ) -> Composited:
     """Splat features of surfels to maps of H·W pixels in raster order; derivatives as in `composite`."""
-    if surfels.count == 0:
+    if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera)
     footprints = project(surfels, camera)
     lists = list_by_tile(footprints, camera, features)
@@ -43,9 +68,9 @@ def splat(
 
 
 def splat_compact(
-    surfels: Surfels, features: list[Float], camera: Camera, *, depth: bool, draft: bool = False
+    surfels: Tables, features: list[Float], camera: Camera, *, depth: bool, draft: bool = False
 ) -> Composited:
     """Splat features of surfels as `composite_compact` does: only pixels near surfels, no derivatives."""
-    if surfels.count == 0:
+    if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera, depth)
     return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth, draft)

@@ -8,30 +8,29 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.splat import list_by_tile, project, splat
+from mi_refgs.splat import Tables, list_by_tile, project, splat, surfel_count, tables_of
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 
 def blended_weights(
-    surfels: Surfels, camera: Camera, maps: Sequence[Float | float] = (1.0,)
+    surfels: Tables, camera: Camera, maps: Sequence[Float | float] = (1.0,)
 ) -> list[np.ndarray]:
     """Sums Σ w m (N,) float64 of the blending weights of N surfels, for each map m (H·W,) of an image.
 
     A map of 1 gives weights in pixels. They are the gradient of Σ m Σ w f with respect to a feature f.
     """
-    features = [dr.opaque(mi.Float, 0, surfels.count) for _ in maps]
+    features = [dr.opaque(mi.Float, 0, surfel_count(surfels)) for _ in maps]
     dr.enable_grad(features)
-    blended = splat(surfels.detach(), features, camera).features
+    blended = splat([table.detach() for table in tables_of(surfels)], features, camera).features
     total = dr.sum(sum(m * image for m, image in zip(maps, blended, strict=True)))
     if dr.grad_enabled(total):  # unless the view shows nothing
         dr.backward(total)
     return [np.array(dr.grad(feature), dtype=np.float64) for feature in features]
 
 
-def listed_tiles(surfels: Surfels, camera: Camera) -> np.ndarray:
+def listed_tiles(surfels: Tables, camera: Camera) -> np.ndarray:
     """Tiles (N,) of an image in whose lists each of N surfels is: what it costs, wherever it is hidden."""
     with dr.suspend_grad():
         lists = list_by_tile(project(surfels, camera), camera)
-    return np.bincount(np.array(lists.surfel_from_pair), minlength=surfels.count)
+    return np.bincount(np.array(lists.surfel_from_pair), minlength=surfel_count(surfels))

@@ -22,7 +22,7 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
-from mi_refgs.kernels.rows import columns_of, joined
+from mi_refgs.kernels.rows import columns_of
 from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
 from mi_refgs.surfels.primitives import Primitive, primitive_of, require_known_primitive
 from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, Vector3f
@@ -247,22 +247,6 @@ class Surfels:
     def detach(self) -> Surfels:
         """The same values, detached from the AD graph."""
         return Surfels({name: dr.detach(tensor) for name, tensor in self.raw.items()}, self.screened)
-
-    def followed_by(self, other: Surfels) -> Surfels:
-        """Geometry of these surfels, then of `other`'s, under AD, both of one primitive.
-
-        Surfels of a `screened` table that are not `usable` are transparent.
-        """
-
-        def values(surfels: Surfels, name: str) -> Float:
-            found = surfels.raw[name].array
-            hides = surfels.screened and name == "opacity"
-            return dr.select(surfels.usable(), found, -LOGIT_LIMIT) if hides else found
-
-        shapes = {name: (self.count + other.count, width) for name, width in self.primitive.widths.items()}
-        arrays = joined(*([values(surfels, name) for name in shapes] for surfels in (self, other)))
-        tensors = (mi.TensorXf(*pair) for pair in zip(arrays, shapes.values(), strict=True))
-        return Surfels(dict(zip(shapes, tensors, strict=True)))
 
     def never_empty(self) -> Surfels:
         """These surfels, or one that covers no pixel where there are none: Dr.Jit refuses empty arrays."""

@@ -37,7 +37,7 @@ def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
     planes = [upload(radiance[..., c].astype(np.float32)) for c in range(3)]
     opacity = upload(alpha.astype(np.float32))
     frame = Frame(alpha=opacity, depth=upload(flat), normal=normal, radiance=mi.Color3f(*planes))
-    return dataclasses.replace(frame, object_alpha=opacity, normal_alpha=opacity)
+    return dataclasses.replace(frame, object_alpha=opacity)
 
 
 @pytest.fixture

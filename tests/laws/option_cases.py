@@ -57,7 +57,7 @@ DIMENSIONS: dict[str, list[Any]] = {
     "map": ["8 rows", "12 rows", "9 x 14", "constant"],
     "rotated": [False, True],
     "background": ["none", "constant", "map"],
-    "surroundings": [False, True],
+    "surroundings": ["", *PRIMITIVES],
     "colour": ["rgb", "luminance", "xyz"],
     "alpha": [False, True],
     "component_format": ["float32", "float16", "uint32"],

@@ -70,8 +70,7 @@ class Oracle:
 
         first = {name: np.asarray(x, np.float64) for name, x in first.items()}
         own, around = self._tables(first)
-        both = {n: np.concatenate([own[n], around[n]]) for n in GEOMETRY}
-        self.order = sorted_rows(both, self.camera, self.pixels, self.corner)
+        self.order = sorted_rows([own, around], self.camera, self.pixels, self.corner)
         chosen = shading(case)
         self.options = Options(
             dominant=chosen.dominant, multiscatter=chosen.multiscatter, directions=chosen.directions

@@ -106,8 +106,8 @@ def values(case: Case, seed: int = 1) -> Values:
             AROUND + "opacity": rng.uniform(-1, 1, (OTHERS, 1)),
             AROUND + "radiance_sh": 0.2 * rng.normal(size=(OTHERS, 12)),
         }
-    if case["primitive"] == "gaussian":  # flat ones, whose shortest axis is known
-        for name in [name for name in found if name.endswith("scale")]:
+    for name, primitive in (("scale", case["primitive"]), (AROUND + "scale", case["surroundings"])):
+        if primitive == "gaussian":  # flat ones, whose shortest axis is known
             thin = np.log(rng.uniform(0.06, 0.12, (len(found[name]), 1)))
             found[name] = np.concatenate([found[name], thin], axis=1)
     if case["background"] == "map":

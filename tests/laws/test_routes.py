@@ -113,9 +113,8 @@ def trained(shading: Shading, primitive: str, around: str, meshed: bool, bare: b
     raw["tint"] = rng.normal(size=raw["albedo"].shape).astype(np.float32)
     raw["normal_offset"] = 0.1 * rng.normal(size=raw["albedo"].shape).astype(np.float32)
     others = far_channels()
-    if primitive == "gaussian":
-        for table in (raw, others):
-            table["scale"] = np.concatenate([table["scale"], table["scale"][:, :1] - 1], axis=1)
+    for table in (raw,) * (primitive == "gaussian") + (others,):  # surroundings are Gaussians, as in a fit
+        table["scale"] = np.concatenate([table["scale"], table["scale"][:, :1] - 1], axis=1)
     if bare:
         raw = {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
     map_behind = background_light() if around == "surroundings and a map" else None

@@ -319,8 +319,9 @@ def test_wrong_extends_are_named(text: str, words: list[str], tmp_path: Path) ->
 def test_an_unknown_primitive_is_refused() -> None:
     chosen = methods.load("ref_gaussian", "quick", ["surfels.primitive='gaussian'"])
     assert chosen.surfels.columns("scale") == 3
-    with pytest.raises(InputError, match=r"surfels\.primitive: 'ball' is unknown; use surfel or gaussian"):
-        methods.load("ref_gaussian", "quick", ["surfels.primitive='ball'"])
+    for table in ("surfels", "surroundings"):
+        with pytest.raises(InputError, match=rf"{table}\.primitive: 'ball' is unknown; use surfel or gauss"):
+            methods.load("ref_gaussian", "quick", [f"{table}.primitive='ball'"])
 
 
 def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.errors import InputError
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
@@ -68,11 +67,8 @@ def test_values_that_cannot_be_used_are_told_of_and_left_out() -> None:
 def test_refusals(tmp_path: Path) -> None:
     raw = far_channels()
     write_ply(tmp_path / "bare.ply", Surfels.from_numpy({n: x for n, x in raw.items() if n != "radiance_sh"}))
-    solid = raw | {"scale": np.repeat(raw["scale"][:, :1], 3, axis=1)}
-    write_ply(tmp_path / "solid.ply", Surfels.from_numpy(solid))
     for words, changes in (
         ("surroundings: radiance_sh", {"surroundings": str(tmp_path / "bare.ply")}),
-        ("surroundings: scale: not the primitive", {"surroundings": str(tmp_path / "solid.ply")}),
         ("none.ply", {"surroundings": str(tmp_path / "none.ply")}),
         ("none.exr", {"background": str(tmp_path / "none.exr")}),
         ("shape (5, 8, 3)", {"background": mi.TensorXf(np.ones((5, 8, 3), np.float32))}),
@@ -108,12 +104,3 @@ def test_object_only_needs_surfels(tmp_path: Path) -> None:
     (tmp_path / "plain.xml").write_text('<scene version="3.0.0"><sensor type="perspective"/></scene>')
     command = ["render", tmp_path / "plain.xml", "-o", tmp_path / "x.exr", "--object"]
     refused(command, "--object: the scene has no `refgs`")
-
-
-def test_surroundings_of_another_primitive_in_a_run(tmp_path: Path) -> None:
-    export(fitted(), tmp_path, camera())
-    raw = far_channels()
-    solid = Surfels.from_numpy(raw | {"scale": np.repeat(raw["scale"][:, :1], 3, 1)})
-    write_ply(tmp_path / AROUND_FILE, solid)
-    with pytest.raises(InputError, match="surroundings: scale"):
-        TrainedScene.read(tmp_path)

@@ -92,25 +92,29 @@ def test_steps_between_surfaces_have_no_normal(rng: np.random.Generator) -> None
     assert edge[:, :2].all() and not edge[:, -5:].any()  # small steps are slopes, large ones are not
 
 
-def test_normal_consistency_through_the_depth(rng: np.random.Generator) -> None:
-    """Value and gradients to N, D and A of the whole chain; two holes in the alpha switch their
-    neighbourhoods off."""
+@pytest.mark.parametrize("has_background", [False, True])
+def test_normal_consistency_through_the_depth(rng: np.random.Generator, has_background: bool) -> None:
+    """Value and gradients to N, D, A, and the object's share of it, of the whole chain; two holes in the
+    alpha switch their neighbourhoods off."""
     alpha = 0.4 + 0.6 * rng.random((HEIGHT, WIDTH, 1))
     alpha[5, 5], alpha[9, 3:6] = 0, 0
     depth = alpha * (3 + 0.3 * rng.random((HEIGHT, WIDTH, 1)))
-    packed = np.concatenate([rng.normal(size=(HEIGHT, WIDTH, 3)), depth, alpha], axis=-1)
+    normal, own = rng.normal(size=(HEIGHT, WIDTH, 3)), alpha * rng.random((HEIGHT, WIDTH, 1))
+    packed = np.concatenate([normal, depth, alpha, own], axis=-1)
     weight = alpha[..., 0].astype(np.float32).astype(np.float64)
 
     def loss(x: list[Any]) -> Any:
         z = expected_depth(x[3], x[4])
         depth_normal, valid = normals_from_depth(z, x[4], camera())
-        return losses.normal_consistency(mi.Vector3f(*x[:3]), depth_normal, valid, x[4])
+        share = x[5] if has_background else None
+        return losses.normal_consistency(mi.Vector3f(*x[:3]), depth_normal, valid, x[4], share)
 
     def define(x: np.ndarray) -> float:
         seen = x[..., 4] >= 1 / 255
         z = np.where(seen, x[..., 3] / np.where(seen, x[..., 4], 1), 0)
         depth_normal, valid = reference.normals_from_depth(z, x[..., 4], *INTRINSICS, ROTATION)
-        return reference.normal_consistency(x[..., :3], depth_normal, valid, weight)
+        share = x[..., 5] if has_background else None
+        return reference.normal_consistency(x[..., :3], depth_normal, valid, weight, share)
 
     at = packed.astype(np.float32).astype(np.float64)
     leaves = planes(at)
@@ -120,7 +124,7 @@ def test_normal_consistency_through_the_depth(rng: np.random.Generator) -> None:
     dr.backward(value)
     found = stack(leaves)
     direction = rng.normal(size=at.shape) * (at != 0)
-    for channels in (slice(0, 3), slice(3, 4), slice(4, 5)):
+    for channels in (slice(0, 3), slice(3, 4), slice(4, 5), *[slice(5, 6)] * has_background):
         part = np.zeros(at.shape)
         part[..., channels] = direction[..., channels]
         slope = (define(at + STEP * part) - define(at - STEP * part)) / (2 * STEP)

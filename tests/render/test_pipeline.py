@@ -59,7 +59,7 @@ def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
     view, camera = oracle.PinholeCamera(*lens), Camera.from_pose(*lens)
     frame = render(SurfelScene(Surfels.from_numpy(raw), Shading(at=at, diffuse=diffuse), light), camera)
     pixels = np.arange(WIDTH * HEIGHT)
-    order = oracle.sorted_rows(raw, view, pixels)
+    order = oracle.sorted_rows([raw], view, pixels)
     exact = image.Scene(raw, view, pixels, order, at, "split_sum", diffuse, exact_light(light))
     expected = image.render(exact)
     alpha = expected.maps["alpha"][:, 0]

@@ -204,8 +204,8 @@ OTHER_OPTIONS: dict[str, Any] = {
 """A value for each option that is not its default."""
 
 
-def scattered_discs(seed: int = 4, count: int = 30) -> dict[str, np.ndarray]:
-    """Discs behind, beside and before the object of the plain case."""
+def scattered_discs(seed: int = 4, count: int = 30, primitive: str = "surfel") -> dict[str, np.ndarray]:
+    """Discs, or Gaussians, behind, beside and before the object of the plain case."""
     rng = np.random.default_rng(seed)
     direction = unit(rng.normal(size=(count, 3)))
     raw = {
@@ -215,4 +215,6 @@ def scattered_discs(seed: int = 4, count: int = 30) -> dict[str, np.ndarray]:
         "opacity": rng.uniform(-1, 1, (count, 1)),
         "radiance_sh": 0.2 * rng.normal(size=(count, 12)),
     }
+    if primitive == "gaussian":
+        raw["scale"] = np.concatenate([raw["scale"], np.log(rng.uniform(0.06, 0.5, (count, 1)))], axis=1)
     return {name: values.astype(np.float32) for name, values in raw.items()}

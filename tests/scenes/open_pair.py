@@ -25,10 +25,10 @@ from tests.scenes.integrator import scattered_discs
 
 FAR, NEAR = 0.0, 0.25  # 1 / distance of what the light shows
 CASES = [
-    ("pixel", "sh", FAR),
-    ("surfel", "irradiance", FAR),
-    ("pixel", "irradiance", NEAR),
-    ("surfel", "sh", NEAR),
+    ("pixel", "sh", FAR, "gaussian"),
+    ("surfel", "irradiance", FAR, "surfel"),
+    ("pixel", "irradiance", NEAR, "surfel"),
+    ("surfel", "sh", NEAR, "gaussian"),
 ]
 CENTRE = np.array([0.2, -0.1, 0.3])  # the point from which the light shows it
 MAPS = ["radiance", "alpha", "depth", "normal", "object_alpha", "albedo", "metallic", "roughness"]
@@ -42,6 +42,11 @@ class Pair:
     at: str
     diffuse: str
     nearness: float = FAR
+    primitive: str = "gaussian"  # of the surroundings
+
+    @cached_property
+    def around(self) -> dict[str, np.ndarray]:
+        return scattered_discs(primitive=self.primitive)
 
     @cached_property
     def case(self) -> Any:
@@ -53,17 +58,14 @@ class Pair:
         """Every parameter (float32) by name, as in a fit."""
         rng = np.random.default_rng(9)
         found = {name: np.asarray(x, np.float32) for name, x in self.case.raw.items()}
-        found |= {f"surroundings/{name}": x for name, x in scattered_discs().items()}
+        found |= {f"surroundings/{name}": x for name, x in self.around.items()}
         background = rng.normal(size=(8, 16, 3)).astype(np.float32)
         return found | {"light": np.asarray(self.case.light, np.float32), "background": background}
 
     @cached_property
     def order(self) -> np.ndarray:
-        others = {n: x for n, x in scattered_discs().items() if n != "radiance_sh"}
-        raw = {n: np.concatenate([self.case.raw[n], x]) for n, x in others.items()}
         pixels = np.arange(self.case.camera.width * self.case.camera.height)
-        colour = np.zeros((len(raw["scale"]), 3))
-        return exact.product_order(replace(self.case, raw=raw | {"radiance_sh": colour}), pixels)
+        return exact.product_order(self.case, pixels, self.around)
 
     def truth(
         self, values: dict[str, np.ndarray], pose: np.ndarray | None = None
@@ -75,12 +77,12 @@ class Pair:
         pixels = np.arange(case.camera.width * case.camera.height)
         light = replace(exact.light_of(values["light"]), centre=CENTRE, nearness=self.nearness)
         scene = exact.scene_of(case, pixels, self.order, light)
-        others = {name: values[f"surroundings/{name}"] for name in scattered_discs()}
+        others = {name: values[f"surroundings/{name}"] for name in self.around}
         return oracle.render_open(oracle.OpenScene(scene, others, values["background"]))
 
     def frame(self, params: dict[str, Any], eye: Camera | None = None) -> Frame:
         surfels = Surfels({name: params[name] for name in self.case.raw})
-        others = Surfels({name: params[f"surroundings/{name}"] for name in scattered_discs()})
+        others = Surfels({name: params[f"surroundings/{name}"] for name in self.around})
         behind = Surroundings(others, EnvironmentLight(params["background"]))
         light = EnvironmentLight(params["light"]).prefilter()
         shading = Shading(self.at, "split_sum", self.diffuse)  # type: ignore[arg-type]

@@ -158,7 +158,7 @@ def test_tile_lists_are_in_the_oracles_order(seed: int, tile: tuple[int, int]) -
     camera = scene.fast_camera()
     lists = list_by_tile(project(scene.surfels(), camera), camera)
     pixels = np.arange(camera.width * camera.height)
-    order = oracle.sorted_rows(scene.raw, scene.camera, pixels).reshape(-1, camera.height, camera.width)
+    order = oracle.sorted_rows([scene.raw], scene.camera, pixels).reshape(-1, camera.height, camera.width)
     surfel, compared = lists.surfel_from_pair.numpy(), 0
     for i, (begin, end) in enumerate(zip(lists.pair_begin.numpy(), lists.pair_end.numpy(), strict=True)):
         y, x = (k * size for k, size in zip(divmod(i, camera.tiles[0]), camera.tile[::-1], strict=True))

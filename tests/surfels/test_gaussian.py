@@ -166,7 +166,7 @@ def test_rendered_3dgs_file_matches_the_oracle(tmp_path: Path) -> None:
     frame = render(drawn, scene.fast_camera(), Request(("normal",)))
     double = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
     pixels = np.arange(camera.width * camera.height)
-    order = oracle.sorted_rows(double, camera, pixels)
+    order = oracle.sorted_rows([double], camera, pixels)
     truth = image.render(image.Scene(double, camera, pixels, order, "surfel", "radiance"))
     assert truth.band.mean() < 0.05 and truth.maps["alpha"].max() > 0.9
     found = {"radiance": frame.radiance, "normal": frame.normal, "alpha": [frame.alpha]}

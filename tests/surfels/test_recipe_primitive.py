@@ -22,6 +22,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import refine
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods import Refine
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels import attributes, primitives
 from mi_refgs.surfels.attributes import Attribute
@@ -157,6 +158,19 @@ def test_attributes_decide_the_primitive() -> None:
     assert balls().primitive.name == "ball" and set(balls().raw) == {"position", "radius", "opacity"}
     with pytest.raises(InputError, match="primitive: 'ball': the name is empty or in use"):
         primitives.register(Ball())
+
+
+def test_balls_are_not_splatted_together_with_gaussians() -> None:
+    """Neither primitive evaluates the rows of the other; it says what to change."""
+    rng = np.random.default_rng(0)
+    gaussians = from_points(
+        rng.normal(size=(5, 3)), rng=rng, primitive="gaussian", attributes=["radiance_sh"]
+    )
+    with pytest.raises(InputError, match=r"'gaussian' is not splatted together with 'ball'.*the same primit"):
+        Surroundings(gaussians).check(balls())
+    with pytest.raises(InputError, match="'gaussian' is not splatted together with 'ball'"):
+        splat([balls(), gaussians], [], camera())
+    Surroundings(gaussians).check(gaussians)
 
 
 def test_balls_are_splatted_and_differentiated() -> None:

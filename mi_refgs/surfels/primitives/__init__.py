@@ -6,6 +6,7 @@ from mi_refgs.surfels.primitives.primitive import Adjoint as Adjoint
 from mi_refgs.surfels.primitives.primitive import Footprints as Footprints
 from mi_refgs.surfels.primitives.primitive import FootprintSample as FootprintSample
 from mi_refgs.surfels.primitives.primitive import Primitive as Primitive
+from mi_refgs.surfels.primitives.primitive import evaluating_both as evaluating_both
 from mi_refgs.surfels.primitives.primitive import nearest_primitive as nearest_primitive
 from mi_refgs.surfels.primitives.primitive import primitive_of as primitive_of
 from mi_refgs.surfels.primitives.primitive import register as register

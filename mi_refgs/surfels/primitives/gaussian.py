@@ -35,6 +35,7 @@ from mi_refgs.surfels.primitives.primitive import (
     dot2,
     rectangle,
     rotation_axes,
+    sorted_frame,
 )
 from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
@@ -60,6 +61,7 @@ class Gaussian(Primitive):
     widths = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1}  # noqa: RUF012
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
     sizes = ("scale",)
+    evaluated_as = ("surfel",)
 
     def project(self, surfels: Any, camera: Any) -> Footprints:
         """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
@@ -100,6 +102,15 @@ class Gaussian(Primitive):
             half = dr.sqrt(cutoff_radius_squared(opacity) * mi.Vector2f(xx, yy))
             half = half * dr.abs(focal) * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
             return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
+
+    def rows_of(self, primitive: Primitive, columns: list[Float]) -> list[Float]:
+        """Rows of a surfel without perspective: c = 0, so w = 1 and u, v are linear in δ.
+
+        Its low-pass never decides: λ makes ρ at most |δ|²/λ, below that of the surfel's filter.
+        """
+        a_x, a_y, b, *others = columns
+        none = dr.zeros(mi.Float, dr.width(b))
+        return [a_x, a_y, none, b, none, none, *others]
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> GaussianSample:
         """Evaluate ρ as the sum of two squares; culling has put the centre beyond the near plane."""
@@ -155,6 +166,11 @@ class Gaussian(Primitive):
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
         """A ball with the neighbours' distance as standard deviation; third axis: the normal. [3DGS, §5.1]"""
         return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 3, axis=1)}
+
+    def like(self, axes: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
+        """With the same axes; a flat one is thin."""
+        rotation, s = sorted_frame(axes, deviations)
+        return {"rotation": rotation, "scale": np.log(s)}
 
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The three axes, and the standard deviations along them."""

@@ -14,9 +14,11 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.rows import joined
 from mi_refgs.registry import Registry
 from mi_refgs.types import Bool, Float, Int32, Point2f, Vector2f, Vector3f
 
@@ -29,6 +31,22 @@ class Footprints:
     first: tuple[Int32, Int32]  # (N,): first covered pixel column and row
     last: tuple[Int32, Int32]  # (N,): last covered column and row, below `first` if there is none
     primitive: Primitive
+
+    def followed_by(self, other: Footprints) -> Footprints:
+        """These footprints, then others, under AD; raises InputError as `evaluating_both` does."""
+        primitive = evaluating_both(self.primitive, other.primitive)
+        columns = joined(self.as_rows_of(primitive), other.as_rows_of(primitive))
+        (left, top), (right, bottom) = (
+            tuple(dr.concat([a, b]) for a, b in zip(mine, theirs, strict=True))
+            for mine, theirs in ((self.first, other.first), (self.last, other.last))
+        )
+        return Footprints(columns, (left, top), (right, bottom), primitive)
+
+    def as_rows_of(self, primitive: Primitive) -> list[Float]:
+        """The columns, as another primitive evaluates them."""
+        return (
+            self.columns if primitive is self.primitive else self.primitive.rows_of(primitive, self.columns)
+        )
 
 
 class FootprintSample(Protocol):
@@ -68,6 +86,7 @@ class Primitive(ABC):
     widths: Mapping[str, int]  # attributes that it requires, and their columns; with position and opacity
     columns: int  # of a row
     sizes: tuple[str, ...]  # attributes that are logarithms of standard deviations
+    evaluated_as: tuple[str, ...] = ()  # names of other primitives whose rows express its footprints
 
     # ---------------- footprints, under AD ----------------
 
@@ -93,6 +112,10 @@ class Primitive(ABC):
     @abstractmethod
     def normal(self, surfels: Any) -> Vector3f:
         """Unit normals in the world, not yet turned towards a camera."""
+
+    def rows_of(self, primitive: Primitive, columns: list[Float]) -> list[Float]:
+        """Columns of footprints as rows of one of the primitives in `evaluated_as`, under AD."""
+        raise NotImplementedError(f"{self.name}: no rows of {primitive.name}")
 
     # ---------------- tile lists, without derivatives ----------------
 
@@ -120,6 +143,11 @@ class Primitive(ABC):
 
         Densification splits a primitive along the longest of them.
         """
+
+    def like(self, axes: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
+        """What `start` returns, for the `extent` of another primitive, A = 2 or 3: as large, round."""
+        rotation, s = sorted_frame(axes, deviations)
+        return self.start(np.sqrt(s[:, 0] * s[:, 1]), rotation)
 
     def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
         """Multiply the standard deviations of some primitives by a factor, in place."""
@@ -188,6 +216,17 @@ def require_known_primitive(raw: Mapping[str, Any]) -> None:
     primitive_of(raw)
 
 
+def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
+    """The one of two primitives that evaluates the rows of both; raises InputError if neither does."""
+    for one, other in ((first, second), (second, first)):
+        if one is other or one.name in other.evaluated_as:
+            return one
+    raise InputError(
+        f"surroundings: scale: '{second.name}' is not splatted together with '{first.name}'; "
+        "give both the same primitive, or surfel and gaussian (surroundings.primitive of a method)"
+    )
+
+
 # ---------------- what all primitives share ----------------
 
 
@@ -228,3 +267,22 @@ def rotation_axes(rotation: np.ndarray) -> np.ndarray:
     second = [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)]
     third = [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)]
     return np.stack([np.stack(axis, axis=1) for axis in (first, second, third)], axis=1)
+
+
+THICKNESS = 0.1
+"""Third standard deviation of a flat primitive as a Gaussian, over the smaller of its two."""
+
+
+def sorted_frame(axes: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quaternions (N, 4) of axes in the order of their deviations, longest first, and all three (N, 3).
+
+    axes: (N, A, 3), A = 2 or 3, as `Primitive.extent` returns them; the third of two is THICKNESS long.
+    """
+    order = np.argsort(-deviations, axis=1, kind="stable")
+    axes = np.take_along_axis(axes, order[:, :, None], axis=1)
+    s = np.take_along_axis(deviations, order, axis=1)
+    if s.shape[1] == 2:
+        s = np.concatenate([s, THICKNESS * s[:, 1:]], axis=1)
+    first, second = axes[:, 0], axes[:, 1]
+    frame = np.stack([first, second, np.cross(first, second)], axis=2).reshape(-1, 3, 3)
+    return Rotation.from_matrix(frame).as_quat().reshape(-1, 4), s

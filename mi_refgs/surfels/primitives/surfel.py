@@ -45,6 +45,7 @@ from mi_refgs.surfels.primitives.primitive import (
     dot2,
     rectangle,
     rotation_axes,
+    sorted_frame,
 )
 from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
@@ -212,6 +213,11 @@ class Surfel(Primitive):
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
         """A disc in the tangent plane, with the neighbours' distance as standard deviation."""
         return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 2, axis=1)}
+
+    def like(self, axes: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
+        """In the plane of the two longest axes."""
+        rotation, s = sorted_frame(axes, deviations)
+        return {"rotation": rotation, "scale": np.log(s[:, :2])}
 
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The two tangents, and the standard deviations along them."""
