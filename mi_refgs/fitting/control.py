@@ -79,7 +79,7 @@ def exchanged(
         widths = {name: values.shape[1] for name, values in own.items()}
         arrives = {name: values[comes] for name, values in other.items()}
         before, after = primitive_of(other), primitive_of(own)
-        if before is not after:
+        if before is not after and comes.any():
             arrives |= after.like(*before.extent(arrives))
         moved = converted(arrives, widths, method, rng)
         table = {name: np.concatenate([values[stays], moved[name]]) for name, values in own.items()}
