@@ -42,6 +42,12 @@ SHAPE = ("normals=normal_mae_deg", "light, correlation=env_correlation", "surfac
 MATERIALS = ("albedo=albedo_psnr", "metallic error=metallic_mae", "roughness error=roughness_mae")
 TIME = ("surfels=surfels", "training=train_minutes")
 TRIALS = ("SH alone=colour_alone", "twice the surfels=surfels_2x", "four times=surfels_4x")
+
+
+def _rooms(_: list[Row]) -> list[Column]:
+    return _columns("PSNR=psnr", "region=psnr_region", *SHAPE[:2], *MATERIALS, TIME[1])
+
+
 TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]]]] = {
     "front": (_fit, lambda rows: _columns("PSNR=psnr", *SHAPE[:2], *TIME)),
     "images": (
@@ -68,10 +74,8 @@ TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]
             for column in _columns(f"`{name}`=psnr", SHAPE[0], source=name)
         ],
     ),
-    "photographs": (
-        _fit,
-        lambda rows: _columns("PSNR=psnr", "region=psnr_region", *SHAPE[:2], *MATERIALS, TIME[1]),
-    ),
+    "photographs": (_fit, _rooms),
+    "photographs_relighting": (_fit, _rooms),
 }
 """Group → title of a row (those of one title share a line), and columns."""
 

@@ -78,7 +78,8 @@ class Fit:
     def minutes(self) -> float:
         """Expected time with its evaluation, on an idle machine."""
         length = SOURCES[self.source].minutes * (2 if self.preset == "standard" else 1)
-        factor = {"relighting": 1.6, "auto": 1.0, "photographs": 2.4}.get(self.method, 0.8)
+        factors = {"relighting": 1.6, "auto": 1.0, "photographs": 2.4, "photographs_relighting": 2.4}
+        factor = factors.get(self.method, 0.8)
         return length * factor + (self.samples or 0) / 8
 
 
@@ -103,6 +104,6 @@ GROUPS: dict[str, list[Fit]] = {
     "photographs": [
         *(Fit(name, method, "quick") for name in ROOMS for method in ("photographs", "base_3dgs")),
         Fit("glass_shelf", "photographs", "quick"),
-        Fit("tabletop", "relighting", "quick"),
     ],
+    "photographs_relighting": [Fit(name, "photographs_relighting", "quick") for name in ROOMS],
 }

@@ -52,21 +52,22 @@ class Train:
 
     def run(self) -> Result:
         """Fit, from the start or from the newest checkpoint."""
-        from mi_refgs import methods
         from mi_refgs.fitting.plan import minutes
+        from mi_refgs.fitting.runner import method_for
         from mi_refgs.fitting.select import table
         from mi_refgs.reconstruction.fit import ProgressBar, fit
 
         if self.purpose is not None and self.method is not None:
             raise InputError(f"--for: {self.purpose}: --method {self.method} is given; give one of the two")
-        method = self.method if self.purpose is None else methods.for_purpose(self.purpose)
         progress = ProgressBar()
         if self.watch:
             from mi_refgs.viewer.training import TrainingViewer
 
             progress = TrainingViewer(HOST, self.port)
 
-        begin = time.monotonic()
+        begin, method = time.monotonic(), self.method
+        if self.purpose is not None:
+            method = method_for(self.data, self.purpose, self.preset, joined(self.set), progress.say)
         fit(
             self.data,
             method,

@@ -42,7 +42,6 @@ from mi_refgs.runs.trained_scene import MODEL
 from mi_refgs.runs.views import read_views, with_region
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
-OPEN_PURPOSE = "photographs"  # purpose of the method that is fitted by default to images without alpha
 Tell = Callable[[str], None]  # is called with sentences for the user
 Settings = Mapping[str, object] | Sequence[str]
 """Changes of a method: {"loss.ssim": 0.1}, or as on the command line, ["loss.ssim=0.1"]."""
@@ -121,7 +120,7 @@ def _new_method(data: Path, choice: Choice, progress: Progress) -> Method:
     if isinstance(choice.method, Method):
         wanted = choice.method
     else:
-        name = choice.method or default_method(data, choice.preset, choice.settings, progress.say)
+        name = choice.method or method_for(data, None, choice.preset, choice.settings, progress.say)
         wanted = load_method(name, choice.preset, choice.settings)
     require_losses(wanted)
     if choice.minutes is not None and wanted.data.downscale is not None:
@@ -300,18 +299,29 @@ def load_method(method: str | None, preset: str | None, settings: Settings = ())
     return methods.load(path, preset or DEFAULT_PRESET, methods.assignments(settings))
 
 
-def default_method(
-    data: Path, preset: str | None = None, settings: Settings = (), say: Tell = lambda _: None
+def method_for(
+    data: Path,
+    purpose: str | None,
+    preset: str | None = None,
+    settings: Settings = (),
+    say: Tell = lambda _: None,
 ) -> str | None:
-    """The method for images without alpha, if the data set has such; None for DEFAULT_METHOD."""
+    """The method for a purpose and a data set: for images without alpha, `about.without_alpha` of the method.
+
+    No purpose is that of DEFAULT_METHOD, for which None is returned. Raises InputError for an unknown purpose
+    and for bad data.
+    """
+    name = None if purpose is None else methods.for_purpose(purpose)
     # Settings of anything else may be those of the other method.
     of_data = [text for text in methods.assignments(settings) if text.startswith("data.")]
-    views = read_views(load_method(None, preset, of_data), data, "train", truth=False, decode=False)
+    method = load_method(name, preset, of_data)
+    if not (other := method.about.without_alpha):
+        return name
+    views = read_views(method, data, "train", truth=False, decode=False)
     if views.has_alpha or views.region is None:
-        return None
-    method = methods.for_purpose(OPEN_PURPOSE)
-    say(f"{data}: images without alpha: --method {method} fits their background too")
-    return method
+        return name
+    say(f"{data}: images without alpha: --method {other} fits their background too")
+    return other
 
 
 def _require_same(run: Run, made: Method, choice: Choice) -> None:

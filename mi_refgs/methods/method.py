@@ -36,6 +36,7 @@ class About:
     paper: str = ""  # authors, title, venue, address
     deviations: tuple[str, ...] = ()  # from the original, a sentence each
     purpose: str = ""  # one word, in one file only, by which `refgs train --for` finds it
+    without_alpha: str = ""  # method that is fitted in its place to images without alpha
     paper_row: str = ""  # its row in the paper's tables
 
 

@@ -327,8 +327,8 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
     if not isinstance(dropped, list) or not all(isinstance(key, str) for key in dropped):
         raise InputError(f"{path}: drop: expected a list of keys, such as ['mesh', 'loss.alpha']; correct it")
     parent = _extended(_find(base, f"{path}: extends", path.parent), [*above, path.resolve()])
-    if "about" in table:  # another file's deviations and purpose are not this one's
-        for key in ("deviations", "purpose"):
+    if "about" in table:  # these are another file's
+        for key in ("deviations", "purpose", "without_alpha"):
             parent.get("about", {}).pop(key, None)
     for key in dropped:
         _drop(parent, key, path)

@@ -21,7 +21,7 @@ from mi_refgs.fitting import object_surface, refine
 from mi_refgs.fitting.control import AdaptiveControl, depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
-from mi_refgs.fitting.runner import begin, default_method
+from mi_refgs.fitting.runner import begin, method_for
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
@@ -440,13 +440,30 @@ def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> N
     assert "surroundings/opacity" in said[0]
 
 
-def test_method_for_photographs_is_default_without_alpha(
-    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("purpose", "without", "alpha"),
+    [
+        (None, "photographs", None),
+        ("relighting", "photographs_relighting", "relighting"),
+        ("photographs", "photographs", "photographs"),
+    ],
+)
+def test_images_without_alpha_have_a_method_of_their_own(
+    data: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    purpose: str | None,
+    without: str,
+    alpha: str | None,
 ) -> None:
-    """It is chosen without decoding one of them."""
+    """It is chosen without decoding one of them, and fits a background."""
     said: list[str] = []
     monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("an image was decoded"))
-    assert default_method(data.path, say=said.append) == "photographs"
-    assert "without alpha" in said.pop()
+    assert method_for(data.path, purpose, say=said.append) == without
+    assert bool(said) == (without != purpose)
     monkeypatch.undo()
-    assert default_method(write_data(tmp_path, views=3, truth=False), say=said.append) is None and not said
+    objects = write_data(tmp_path, views=3, truth=False)
+    assert method_for(objects, purpose, say=pytest.fail) == alpha
+    chosen = methods.load(without)
+    assert chosen.surroundings is not None and chosen.light is not None
+    assert chosen.light.photographed is not None
