@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
@@ -17,6 +18,7 @@ from mi_refgs.evaluation.metrics import environment
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.types import Array
 
@@ -26,7 +28,7 @@ CELL_MIN = 128
 """Pixels: smaller images are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
 MARGIN = 4  # pixels between images
 TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 16
-"""Heights of titles in pixels: the largest at which all of a line fit, up to TITLE_MAX or, of large images,
+"""Heights of titles in pixels: the largest at which all of a sheet fit, up to TITLE_MAX or, of large images,
 their width over TITLE_PART."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
@@ -124,12 +126,31 @@ def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
 def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Tone-map a fitted environment map (h, w, 3), linear, and the ground truth at one exposure, by title.
 
-    The fitted one is first scaled per channel to the ground truth by least squares.
+    The fitted one is first scaled per channel to the ground truth by least squares. Both are turned upright.
     """
     if truth is None:
-        return {"fitted environment": tonemap(light, light)}
+        return {"fitted environment": light_image(light)}
     fitted = light * np.array(environment(light, truth)["env_scale"])
-    return {"fitted environment": tonemap(fitted, truth), "ground-truth environment": tonemap(truth, truth)}
+    return {
+        "fitted environment": light_image(fitted, truth),
+        "ground-truth environment": light_image(truth),
+    }
+
+
+def light_image(radiance: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
+    """Tone-map a map (h, 2h, 3) at the exposure of `reference`, or of itself, with +z at the top."""
+    return upright(tonemap(radiance, radiance if reference is None else reference))
+
+
+def upright(image: np.ndarray) -> np.ndarray:
+    """Turn a map (h, 2h, 3) whose top is +y, as in files, so that it is +z, which is up in scenes."""
+    height = len(image)
+    x, z, y = np.moveaxis(map_directions(height) * [1, 1, -1], -1, 0)  # world directions of the new texels
+    row = np.arccos(np.clip(y, -1, 1)) / np.pi * (height - 1)
+    column = np.arctan2(x, -z) % (2 * np.pi) / (2 * np.pi) * 2 * height - 0.5
+    wrapped = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap")
+    planes = [map_coordinates(wrapped[..., i], (row, column + 1), order=1, mode="nearest") for i in range(3)]
+    return np.stack(planes, axis=-1)
 
 
 def tonemap(radiance: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -153,29 +174,40 @@ def contact_sheet(
     titles = list(dict.fromkeys(title for row in rows for title in row))
     factor = -(-CELL_MIN // min(next(iter(rows[0].values())).shape[:2]))
     enlarged = [{t: row[t].repeat(factor, 0).repeat(factor, 1) for t in titles if t in row} for row in rows]
-    lines = [_line(row) for row in enlarged]
+    size = _title_size(enlarged)
+    lines = [_line(row, size) for row in enlarged]
     if footer:
         width = max(line.shape[1] for line in lines)
         part = (width - MARGIN * (len(footer) - 1)) // max(len(footer), 2)
-        lines.append(_line({title: _resized(image, part) for title, image in footer.items()}))
+        lines.append(_line({title: _resized(image, part) for title, image in footer.items()}, size))
     width = max(line.shape[1] for line in lines)
     return np.concatenate([_padded(line, MARGIN, width - line.shape[1]) for line in lines])
 
 
-def _line(cells: dict[str, np.ndarray]) -> np.ndarray:
-    """Place titled images side by side."""
+def _title_size(rows: Sequence[dict[str, np.ndarray]]) -> int:
+    """The height of all titles of a sheet, at which those of its rows fit."""
+    from PIL import ImageFont
+
+    widths = [(title, image.shape[1]) for row in rows for title, image in row.items()]
+    most = max(TITLE_MAX, min(width for _, width in widths) // TITLE_PART)
+    for size in range(most, TITLE_MIN, -1):
+        font = ImageFont.load_default(size)
+        if all(font.getlength(title) < width - 2 for title, width in widths):
+            return size
+    return TITLE_MIN
+
+
+def _line(cells: dict[str, np.ndarray], size: int) -> np.ndarray:
+    """Place images with titles of a size side by side."""
     from PIL import Image, ImageDraw, ImageFont
 
-    most = max(TITLE_MAX, min(image.shape[1] for image in cells.values()) // TITLE_PART)
-    fonts = {size: ImageFont.load_default(size) for size in range(most, TITLE_MIN - 1, -1)}
-    fits = (s for s, f in fonts.items() if all(f.getlength(t) < cells[t].shape[1] - 2 for t in cells))
-    size = next(fits, TITLE_MIN)
+    font = ImageFont.load_default(size)
     title_height = round(1.2 * size) + 2
     height = max(image.shape[0] for image in cells.values())
     columns = []
     for text, image in cells.items():
         label = Image.new("RGB", (image.shape[1], title_height), "white")
-        ImageDraw.Draw(label).text((2, 0), text, fill="black", font=fonts[size])
+        ImageDraw.Draw(label).text((2, 0), text, fill="black", font=font)
         title = np.asarray(label, dtype=np.float32) / 255
         columns.append(_padded(np.concatenate([title, image]), height - image.shape[0], MARGIN))
     return np.concatenate(columns, axis=1)[:, :-MARGIN]

@@ -23,7 +23,7 @@ import numpy as np
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import contact_sheet, displayed_over, image_array, tonemap
+from mi_refgs.evaluation.images import contact_sheet, displayed_over, image_array, light_image
 from mi_refgs.evaluation.protocols import captions, measures_of, relit_scores
 from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import write_exr
@@ -152,7 +152,7 @@ def relight(
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
     radiance = new_light.radiance().numpy()
     sheet = _beside(kind, SHEET)
-    write_png(output.path / sheet, contact_sheet(rows, {"environment map": tonemap(radiance, radiance)}))
+    write_png(output.path / sheet, contact_sheet(rows, {"environment map": light_image(radiance)}))
     write_json(output.path / _beside(kind, RESULT), result)
     warning = ""
     if fitted.shading.diffuse == "sh":

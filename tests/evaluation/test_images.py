@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mi_refgs.evaluation import images
+from mi_refgs.shade.light.lobe_matrices import map_directions
 
 
 def test_light_panels_have_one_exposure(rng: np.random.Generator) -> None:
@@ -13,6 +15,25 @@ def test_light_panels_have_one_exposure(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(shown["fitted environment"], shown["ground-truth environment"], atol=1e-6)
     dark = images.light_panels(np.zeros((8, 16, 3)))
     assert np.all(dark["fitted environment"] == 0)
+
+
+@pytest.mark.parametrize(
+    ("world", "row", "column"),
+    [
+        ((0, 0, 1), 0, None),
+        ((0, 0, -1), -1, None),
+        ((0, 1, 0), 31, 0),
+        ((1, 0, 0), 31, 15),
+        ((0, -1, 0), 31, 31),
+    ],
+)
+def test_maps_are_drawn_with_z_at_the_top(world: tuple[int, int, int], row: int, column: int | None) -> None:
+    """A lobe around a direction is brightest where a map with +z at the top shows it."""
+    lobe = np.repeat(np.clip(map_directions(64) @ np.array(world, float), 0, 1)[..., None], 3, axis=-1)
+    drawn = images.upright(lobe)
+    assert drawn.shape == (64, 128, 3)
+    bright = drawn[row] if column is None else drawn[row : row + 2, 2 * column : 2 * column + 2]
+    assert bright.min() > 0.99 and drawn[row if column is None else 0].max() < 1 + 1e-6
 
 
 def test_contact_sheet_accepts_rows_of_different_length() -> None:
