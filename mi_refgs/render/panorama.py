@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import drjit as dr
@@ -14,9 +14,15 @@ from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
 
 MARGIN = 2  # pixels of a cube face beyond its edges, so that interpolation never leaves an image
 SURFACE = 0.5  # opacity from which a pixel shows a surface
+LARGEST = 0.2
+"""Standard deviation over distance from the centre. A Gaussian is splatted by the derivative of the
+projection at its own centre: a larger one covers whole faces of the cube with its colour. Fits to rooms have
+few, 0.1 % of all.
+"""
 
 
 @dataclass(frozen=True)
@@ -36,10 +42,11 @@ class Panorama:
 def panorama(surroundings: Surroundings, centre: np.ndarray, height: int, near: float) -> Panorama:
     """Render surroundings from a `centre` (3,), without what is nearer than `near`, by six cameras.
 
-    `height`: rows h of the maps.
+    `height`: rows h of the maps. Gaussians that are too large for their distance (LARGEST) are left out.
     """
     shading, nothing = Shading(reflectance="radiance", at="surfel"), nothing_around(surroundings.surfels)
-    scene = SurfelScene(nothing, shading, surroundings=surroundings)
+    around = replace(surroundings, surfels=_small_from(centre, surroundings.surfels))
+    scene = SurfelScene(nothing, shading, surroundings=around)
     directions = map_directions(height)
     radiance, nearness = np.zeros((height, 2 * height, 3)), np.zeros((height, 2 * height))
     size = height + 2 * MARGIN
@@ -64,3 +71,14 @@ def panorama(surroundings: Surroundings, centre: np.ndarray, height: int, near: 
         depth = np.where(alpha > SURFACE, frame.depth.numpy(), np.inf).reshape(size, size)[at]
         nearness[own] = along[own] / depth
     return Panorama(np.asarray(centre, np.float64), radiance, nearness)
+
+
+def _small_from(centre: np.ndarray, surfels: Surfels) -> Surfels:
+    """The surfels without those whose projection from a centre is wrong."""
+    if not surfels.primitive.first_order:
+        return surfels
+    raw = surfels.to_numpy()
+    _, deviations = surfels.primitive.extent(raw)
+    distance = np.linalg.norm(raw["position"] - centre, axis=-1)
+    small = deviations.max(axis=-1) < LARGEST * distance
+    return Surfels.from_numpy({name: values[small] for name, values in raw.items()})

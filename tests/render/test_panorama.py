@@ -1,4 +1,4 @@
-"""The background in all directions from one point: orientation, distances, what is nearer than `near`."""
+"""The background in all directions from one point: orientation, distances, what is near or large."""
 
 from __future__ import annotations
 
@@ -51,3 +51,25 @@ def test_surfels_have_their_radiance_and_distance(axis: int, sign: int) -> None:
     np.testing.assert_allclose(seen.nearness[central], expected, rtol=0.03)
     np.testing.assert_allclose(seen.radiance[central], np.broadcast_to(colour, (central.sum(), 3)), atol=0.02)
     assert not seen.nearness[directions @ towards < -0.1].any()
+
+
+def test_large_gaussians_nearby_do_not_cover_all_directions() -> None:
+    """Beside one of half its distance's size, small ones all around keep their colours."""
+    directions = map_directions(12)[1:-1].reshape(-1, 3)
+    rng, colour = np.random.default_rng(0), np.array([0.2, 0.5, 0.8])
+    beside = directions[[40]]
+    colours = np.concatenate([np.broadcast_to(colour, directions.shape), [[1.0, 0.0, 0.0]]])
+    made = init.from_points(
+        CENTRE + np.concatenate([4 * directions, 0.5 * beside]),
+        -np.concatenate([directions, beside]),
+        colours,
+        rng=rng,
+        attributes=["radiance_sh"],
+        opacity=0.99,
+        primitive="gaussian",
+    )
+    raw = made.to_numpy()
+    raw["scale"][:] = np.log(0.7)
+    raw["scale"][-1] = np.log(0.25)
+    seen = panorama(Surroundings(Surfels.from_numpy(raw)), CENTRE, HEIGHT, 0.1)
+    np.testing.assert_allclose(seen.radiance, np.broadcast_to(colour, seen.radiance.shape), atol=0.03)

@@ -62,6 +62,7 @@ class Gaussian(Primitive):
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
     sizes = ("scale",)
     evaluated_as = ("surfel",)
+    first_order = True
 
     def project(self, surfels: Any, camera: Any) -> Footprints:
         """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.

@@ -87,6 +87,9 @@ class Primitive(ABC):
     columns: int  # of a row
     sizes: tuple[str, ...]  # attributes that are logarithms of standard deviations
     evaluated_as: tuple[str, ...] = ()  # names of other primitives whose rows express its footprints
+    first_order: bool = (
+        False  # projected by the derivative of the projection at its centre, not in perspective
+    )
 
     # ---------------- footprints, under AD ----------------
 
