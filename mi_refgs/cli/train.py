@@ -65,15 +65,15 @@ class Train:
 
             progress = TrainingViewer(HOST, self.port)
 
-        begin, method = time.monotonic(), self.method
+        begin, method, settings = time.monotonic(), self.method, joined(self.set)
         if self.purpose is not None:
-            method = method_for(self.data, self.purpose, self.preset, joined(self.set), progress.say)
+            method = method_for(self.data, self.purpose, self.preset, settings, progress.say)
         fit(
             self.data,
             method,
             preset=self.preset,
             minutes=self.minutes,
-            settings=joined(self.set),
+            settings=settings,
             output=self.output,
             resume=self.resume,
             progress=progress,

@@ -166,8 +166,8 @@ class FitSetup:
         surfels, around = self.method.surfels, self.method.surroundings
         found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
         if self.open_scene and around is not None:
-            harmonics = replace(surfels, primitive=around.primitive, degree={"radiance_sh": around.degree})
-            found |= {AROUND + name: (harmonics.columns(name),) for name in around.names}
+            background = replace(surfels, primitive=around.primitive, degree={"radiance_sh": around.degree})
+            found |= {AROUND + name: (background.columns(name),) for name in around.names}
             found[BACKGROUND] = (2 * around.height, 3)
         return found if self.method.light is None else found | {LIGHT: (2 * self.method.light.height, 3)}
 

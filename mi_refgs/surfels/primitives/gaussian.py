@@ -54,6 +54,16 @@ class GaussianSample:
     v: Float  # b δ_y
 
 
+def _as_surfel(columns: list[Float]) -> list[Float]:
+    """Rows of a surfel without perspective: c = 0, so w = 1 and u, v are linear in δ.
+
+    Its low-pass never decides: λ makes ρ at most |δ|²/λ, below that of the surfel's filter.
+    """
+    a_x, a_y, b, *others = columns
+    none = dr.zeros(mi.Float, dr.width(b))
+    return [a_x, a_y, none, b, none, none, *others]
+
+
 class Gaussian(Primitive):
     """A 3D Gaussian with three standard deviations along the axes of a rotation. [3DGS, §4]"""
 
@@ -61,7 +71,7 @@ class Gaussian(Primitive):
     widths = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1}  # noqa: RUF012
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
     sizes = ("scale",)
-    evaluated_as = ("surfel",)
+    rows_as = {"surfel": _as_surfel}  # noqa: RUF012
     first_order = True
 
     def project(self, surfels: Any, camera: Any) -> Footprints:
@@ -103,15 +113,6 @@ class Gaussian(Primitive):
             half = dr.sqrt(cutoff_radius_squared(opacity) * mi.Vector2f(xx, yy))
             half = half * dr.abs(focal) * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
             return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
-
-    def rows_of(self, primitive: Primitive, columns: list[Float]) -> list[Float]:
-        """Rows of a surfel without perspective: c = 0, so w = 1 and u, v are linear in δ.
-
-        Its low-pass never decides: λ makes ρ at most |δ|²/λ, below that of the surfel's filter.
-        """
-        a_x, a_y, b, *others = columns
-        none = dr.zeros(mi.Float, dr.width(b))
-        return [a_x, a_y, none, b, none, none, *others]
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> GaussianSample:
         """Evaluate ρ as the sum of two squares; culling has put the centre beyond the near plane."""

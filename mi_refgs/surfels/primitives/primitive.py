@@ -7,8 +7,9 @@ The attributes of a surfel model and their widths decide its primitive: surfels 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import drjit as dr
@@ -44,9 +45,8 @@ class Footprints:
 
     def as_rows_of(self, primitive: Primitive) -> list[Float]:
         """The columns, as another primitive evaluates them."""
-        return (
-            self.columns if primitive is self.primitive else self.primitive.rows_of(primitive, self.columns)
-        )
+        own = self.primitive
+        return self.columns if primitive is own else own.rows_as[primitive.name](self.columns)
 
 
 class FootprintSample(Protocol):
@@ -86,10 +86,9 @@ class Primitive(ABC):
     widths: Mapping[str, int]  # attributes that it requires, and their columns; with position and opacity
     columns: int  # of a row
     sizes: tuple[str, ...]  # attributes that are logarithms of standard deviations
-    evaluated_as: tuple[str, ...] = ()  # names of other primitives whose rows express its footprints
-    first_order: bool = (
-        False  # projected by the derivative of the projection at its centre, not in perspective
-    )
+    # By the name of another primitive whose rows express its footprints: its columns as such rows, under AD.
+    rows_as: Mapping[str, Callable[[list[Float]], list[Float]]] = MappingProxyType({})
+    first_order: bool = False  # splatted by the derivative of the projection at its centre
 
     # ---------------- footprints, under AD ----------------
 
@@ -115,10 +114,6 @@ class Primitive(ABC):
     @abstractmethod
     def normal(self, surfels: Any) -> Vector3f:
         """Unit normals in the world, not yet turned towards a camera."""
-
-    def rows_of(self, primitive: Primitive, columns: list[Float]) -> list[Float]:
-        """Columns of footprints as rows of one of the primitives in `evaluated_as`, under AD."""
-        raise NotImplementedError(f"{self.name}: no rows of {primitive.name}")
 
     # ---------------- tile lists, without derivatives ----------------
 
@@ -222,7 +217,7 @@ def require_known_primitive(raw: Mapping[str, Any]) -> None:
 def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
     """The one of two primitives that evaluates the rows of both; raises InputError if neither does."""
     for one, other in ((first, second), (second, first)):
-        if one is other or one.name in other.evaluated_as:
+        if one is other or one.name in other.rows_as:
             return one
     raise InputError(
         f"surroundings: scale: '{second.name}' is not splatted together with '{first.name}'; "
