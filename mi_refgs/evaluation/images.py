@@ -57,7 +57,7 @@ class RenderedView:
     """A rendered view as NumPy arrays."""
 
     image: np.ndarray  # (H, W, 3) display-encoded, over the data's background
-    alpha: np.ndarray  # (H, W)
+    alpha: np.ndarray  # (H, W) of the object, which has the normals and maps
     normal: np.ndarray  # (H, W, 3) unit, or 0 where there is no surface
     maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), linear
 
@@ -69,7 +69,7 @@ class RenderedView:
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         return RenderedView(
             image_array(displayed(frame, data.background, data.is_linear_radiance), *size),
-            image_array(frame.alpha, *size),
+            image_array(frame.object_alpha, *size),
             np.where(length > 1e-6, normal / np.maximum(length, 1e-6), 0),
             RenderedView.maps_of(frame, *size),
         )

@@ -19,15 +19,19 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.compare import page
 from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.images import Pixels
+from mi_refgs.data.view import View
 from mi_refgs.evaluation import images, metrics
 from mi_refgs.evaluation.evaluate import evaluate, render_names
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import read_png
+from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.ply import write_ply
+from tests.scenes.open_pair import CASES, Pair
 from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
 KEYS = (
@@ -148,6 +152,22 @@ def test_panels_show_every_map(trainer: Trainer, views: Dataset) -> None:
         assert picture.shape == (SIZE, SIZE, 3), title
         assert 0 <= picture.min() and picture.max() <= 1, title
     assert np.all(panels["ground-truth normals"][0, 0] == 1)  # the corner shows no ball, hence white
+
+
+def test_panels_of_open_scene_show_maps_of_object_only() -> None:
+    """Where only the background is seen, normals and materials are white, however opaque it is."""
+    pair = Pair(*CASES[0])
+    eye, frame = pair.case.camera, pair.frame({name: upload_tensor(x) for name, x in pair.values.items()})
+    black = np.zeros((eye.height, eye.width, 3), np.float32)
+    view = View("a", eye.width, eye.height, 9, 9, 4, 4, np.eye(4), Pixels(black, None))
+    data = Dataset(Path(), "test", (view,), np.ones(3, np.float32), False, None)
+    panels = images.panels(images.RenderedView.of(frame, data, view), view)
+    own, whole = (images.image_array(x, eye.height, eye.width) for x in (frame.object_alpha, frame.alpha))
+    background = whole > own + 0.2
+    assert background.any()
+    for title in ("normals", "albedo", "metallic", "roughness"):
+        assert np.all(panels[title][background] > 1 - own[background, None] - 1e-5), title
+        assert panels[title].min() < 0.9, title
 
 
 def test_render_names_are_unique() -> None:
