@@ -24,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs import __version__
+from mi_refgs.data import stereo
 from mi_refgs.data.dataset import Dataset, fitting_downscale
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.poses import poses_around
@@ -50,12 +51,15 @@ PIXELS_PER_SURFEL = 16
 """Pixels of an image per surfel, at the largest number of surfels, above which images are downscaled: they
 show more than the surfels can."""
 SAFETY = 0.8  # fraction of the time limit that the estimate may reach: data sets differ by as much
-GROWTH, OPEN_GROWTH = 1.0, 0.6
+GROWTH, OPEN_GROWTH = 1.0, 0.75
 """Mean time of a step relative to the synthetic data set, with alpha and without: the number of surfels
 grows, but opaque ones hide others, and without alpha surfels start far larger than they end."""
 CAPACITY_TIME = 1.45
 """Relative time per step with twice the surfels: 1.43 for `base_2dgs` on *chair*, 200², 20,000 to 40,000."""
-START = 10.0  # seconds for the visual hull, previews, checkpoints and artefacts
+START, OPEN_START = 10.0, 20.0
+"""Seconds for the visual hull, previews, checkpoints and artefacts; besides, without alpha, for the decisions
+on gains and camera corrections."""
+STEREO = 0.6  # seconds per view that stereo compares
 DECODING = 1.5e-8  # seconds per pixel of a file, once per image: JPEG 8e-9, PNG 2e-8
 WORTH = 1e7  # iterations × pixels from which a fit takes minutes, and an estimate is worth its time
 
@@ -283,6 +287,8 @@ def estimate(
     steps *= (GROWTH if has_alpha else OPEN_GROWTH) * CAPACITY_TIME ** math.log2(capacity)
     fused = views + (meshes - 1) * min(views, FUSED_VIEWS) if meshes else 0
     seconds = START + files + steps + meshes * speed.mesh + fused * speed.mesh_view
+    if not has_alpha:
+        seconds += OPEN_START + STEREO * min(views, stereo.VIEWS)
     return Estimate(seconds, bytes_of(method, views, (width, height)), width, height)
 
 

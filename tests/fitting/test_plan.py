@@ -69,7 +69,12 @@ def test_estimate_is_sum_of_stages(method: Method) -> None:
     more = plan.estimate(around, SPEED, 7, (20, 20), 1).bytes - whole.bytes
     assert more == pytest.approx(50 * memory.PER_SURFEL)
     scene = plan.estimate(method, SPEED, 7, (20, 20), 1, has_alpha=False)
-    assert whole.seconds - scene.seconds == pytest.approx((plan.GROWTH - plan.OPEN_GROWTH) * at_400)
+    before = plan.OPEN_START + 7 * plan.STEREO
+    assert scene.seconds - before == pytest.approx(whole.seconds - (plan.GROWTH - plan.OPEN_GROWTH) * at_400)
+    assert (
+        plan.estimate(method, SPEED, 99, (1, 1), 1, has_alpha=False).seconds
+        < plan.estimate(method, SPEED, 99, (1, 1), 1).seconds + plan.OPEN_START + 65 * plan.STEREO
+    )  # stereo compares 64 views at most
     twice = plan.estimate(dataclasses.replace(method, metal_trial=MetalTrial(11)), SPEED, 7, (20, 20), 1)
     assert twice.seconds - whole.seconds == pytest.approx(8 * 5 + 3 * 10)
     tiny = plan.estimate(method, SPEED, 7, (1, 1), 1)
