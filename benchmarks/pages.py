@@ -25,7 +25,7 @@ from benchmarks.common.view import ROOT
 from benchmarks.fits import page as fits
 from benchmarks.fits.plan import GROUPS
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import is_file, read_json
+from mi_refgs.io.files import is_file
 
 PAGES = ("README.md", "docs/accuracy.md", "docs/speed.md", "docs/photographs_in_detail.md")
 TEMPLATES = tuple(sorted(path.parent.name for path in (ROOT / "benchmarks").glob("*/page.md")))
@@ -41,7 +41,7 @@ MEASURED = re.compile(rf"\d[\d.,]*\s?{UNIT}|^\|[^\n]*[ (,]{UNIT}[^\n]*(?=\n\|[-:
 @lru_cache
 def values(path: Path) -> dict[str, Any]:
     """Return the tables and numbers of a data file by name; raises InputError for rows of several builds."""
-    result, name = read_json(path), path.stem
+    result, name = build.read_result(path), path.stem
     if name in GROUPS:
         return values_of(result, lambda content: fits.values(name, content)) | {"about": result["build"]}
     found: Any = lambda content: dict(_numbers(content["result"]))  # noqa: E731

@@ -18,7 +18,7 @@ import drjit as dr  # isort: skip
 
 from benchmarks.common.view import ROOT
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import make_folder, write_bytes
+from mi_refgs.io.files import make_folder, read_json, write_bytes
 from mi_refgs.kernels import device
 
 RESULTS = ROOT / "benchmarks" / "results"  # data files of the pages
@@ -83,11 +83,28 @@ def text_of(build: dict[str, Any]) -> str:
 
 
 def write_result(path: Path, result: dict[str, Any]) -> dict[str, Any]:
-    """Write a data file, a line per row; returns its content. Raises InputError if it cannot be written."""
+    """Write a data file, a line per row; returns its content. Raises InputError if it cannot be written.
+
+    Rows of the same keys are lists of values, whose keys are in `columns`.
+    """
     text = json.dumps(result, allow_nan=False)
     whole = json.loads(text, parse_float=lambda x: float(f"{float(x):.{DIGITS}g}"))
-    lines = [f"{json.dumps(key)}: {json.dumps(value)}" for key, value in whole.items()]
-    lines = [line.replace("}, {", "},\n{") for line in lines]
+    written = dict(whole)
+    if rows := written.pop("rows", []):
+        columns = list(rows[0])
+        if all(list(row) == columns for row in rows):
+            written["columns"], rows = columns, [list(row.values()) for row in rows]
+    lines = [f"{json.dumps(key)}: {json.dumps(value)}" for key, value in written.items()]
+    if "rows" in whole:
+        lines.append('"rows": [' + ",\n".join(map(json.dumps, rows)) + "]")
     make_folder(path.parent)
     write_bytes(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
     return dict(whole)
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """Return what `write_result` was given. Raises InputError as `read_json` does."""
+    result: dict[str, Any] = read_json(path)
+    if columns := result.pop("columns", None):
+        result["rows"] = [dict(zip(columns, row, strict=True)) for row in result["rows"]]
+    return result

@@ -14,10 +14,10 @@ import mi_refgs  # noqa: F401  (chooses the LLVM before Dr.Jit loads)
 
 import mitsuba as mi  # isort: skip
 
-from benchmarks.common.build import RESULTS, recorded, text_of, write_result
+from benchmarks.common.build import RESULTS, read_result, recorded, text_of, write_result
 from benchmarks.common.view import ROOT
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import read_json, write_bytes
+from mi_refgs.io.files import write_bytes
 
 Row = dict[str, Any]
 
@@ -125,7 +125,7 @@ def write_reports(
     """
     folder, data = (options.output,) * 2 if options.output else (ROOT / "docs", RESULTS)
     try:
-        result = read_json(options.json) if options.json else recorded(measure)
+        result = read_result(options.json) if options.json else recorded(measure)
         result = write_result(data / f"{name}.json", result)
         plot(result, folder / "images")
         write_text(folder / f"{name}.md", page_text(name, values_of(result, page)))

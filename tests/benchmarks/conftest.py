@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks import pages
+from benchmarks.common.build import read_result
 from tests.helpers import run_process
 
 
@@ -28,4 +28,4 @@ def result(request: pytest.FixtureRequest, folder: Path) -> Any:
     """Its JSON, which has every name that the pages' markers want of it."""
     path = folder / f"{request.module.BENCHMARK}.json"
     assert pages.names_of(path.stem) <= pages.values(path).keys()
-    return json.loads(path.read_text())
+    return read_result(path)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.common.build import recorded
+from benchmarks.common.build import read_result, recorded
 from benchmarks.common.report import Row
 from benchmarks.frontier import __main__ as frontier
 from benchmarks.frontier import cells, fit, page
@@ -115,7 +115,7 @@ def test_an_interrupted_run_continues(measured: Measured, command: list[str], tm
     assert measured.presets == ["4:50", "4:100", "quick"]
     assert frontier.main(command) == 0 and len(measured.presets) == 3
     assert len(measured.rehearsed) == 2  # once per run that measures anything
-    rows = json.loads((tmp_path / "out" / "frontier.json").read_text())["rows"]
+    rows = read_result(tmp_path / "out" / "frontier.json")["rows"]
     assert [found["cpu_seconds"] for found in rows] == [11, 12, 13]
 
 

@@ -17,12 +17,11 @@ import pytest
 
 from benchmarks import all as everything
 from benchmarks import pages
-from benchmarks.common.build import RESULTS, merged, recorded, write_result
+from benchmarks.common.build import RESULTS, merged, read_result, recorded, write_result
 from benchmarks.fits import page as fits
 from benchmarks.fits.plan import GROUPS, RING, SOURCES, Fit
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.scores import PIXEL_CLASSES
-from mi_refgs.io.files import read_json
 from tests.helpers import ROOT, run_process
 
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in pages.PAGES}
@@ -144,7 +143,7 @@ def test_fits_exist() -> None:
 
 @pytest.mark.parametrize("path", [path for path in sorted(RESULTS.glob("*.json")) if path.stem in GROUPS])
 def test_data_files_have_the_planned_fits(path: Path) -> None:
-    found = [tuple(row[name] for name in FIT_FIELDS) for row in read_json(path)["rows"]]
+    found = [tuple(row[name] for name in FIT_FIELDS) for row in read_result(path)["rows"]]
     assert found == [tuple(getattr(fit, name) for name in FIT_FIELDS) for fit in GROUPS[path.stem]]
 
 
@@ -178,3 +177,11 @@ def test_small_run_continues(tmp_path: Path) -> None:
     before = path.stat().st_mtime_ns
     assert run_process(*command).returncode == 0 and (tmp_path / "images.json").is_file()
     assert path.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("rows", [[], [{"a": 1, "b": "x"}, {"a": 0.5, "b": None}], [{"a": 1}, {"b": 2}]])
+def test_data_file_is_read_as_it_was_written(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+    """Rows of the same keys, of different ones, and none."""
+    result = {"build": {"commit": "abc"}, "seconds": 1.5, "rows": rows}
+    assert write_result(tmp_path / "a.json", result) == result
+    assert read_result(tmp_path / "a.json") == result
