@@ -30,7 +30,7 @@ from mi_refgs.io.resources import resource_dir
 from mi_refgs.progress import say
 from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.new_light import NewLight
-from mi_refgs.reconstruction.reconstruction import Reconstruction
+from mi_refgs.reconstruction.reconstruction import Reconstruction, load
 from mi_refgs.relighting import relight as relighting
 from mi_refgs.runs.run import Run
 from mi_refgs.synthesis.make_dataset import make_dataset
@@ -113,6 +113,21 @@ EXHIBITS: dict[str, Exhibit] = {
 }
 """The exhibits by scene, in the order of the page."""
 
+ROOMS = {
+    "tabletop": "A copper jug with a glazed handle and knob on a laid table.",
+    "figure": "A figure of red gloss and silver in a kitchen.",
+    "can": "A can of printed aluminium on bright tiles.",
+}
+"""Objects in rooms by scene, path-traced as if photographed: without alpha."""
+LIGHTS = {"sky": LIGHT, "studio": "studio.exr"}
+"""Maps of scenes/lights under which these are relit, by title."""
+ROOM_VIEWS = (1, 4)
+"""Test views of them."""
+TILE = 400
+"""Rows of each of their images, pixels."""
+AROUND = 0.15
+"""Width of the border around an object in these images, relative to its own height or width, the smaller."""
+
 
 def make_gallery(
     out: Path = Path("docs/gallery"),
@@ -122,6 +137,7 @@ def make_gallery(
     size: int = 200,
     preset: str = "standard",
     set: tuple[str, ...] = (),
+    rooms: dict[str, Path] | None = None,
 ) -> None:
     """Make the gallery of some exhibits in the folder `out`; exhibits made before stay on the page.
 
@@ -133,6 +149,7 @@ def make_gallery(
         size: Pixels per side.
         preset: Preset of the fits.
         set: Changes of the method, as in `loss.ssim=0.1`.
+        rooms: Evaluated runs of objects in rooms, by scene.
 
     Raises:
         InputError: for an unknown exhibit, a gallery of other settings, and a folder that cannot be written.
@@ -141,8 +158,12 @@ def make_gallery(
     for name in scenes:
         if name not in EXHIBITS:
             raise InputError(f"--scenes: {name}: not in the gallery; use some of {', '.join(EXHIBITS)}")
+    for name in rooms or {}:
+        if name not in ROOMS:
+            raise InputError(f"--rooms: {name}: not in the gallery; use some of {', '.join(ROOMS)}")
     settings = {"views": views, "size": size, "preset": preset, "set": [*set]}
-    record = read_json(out / RECORD) if is_file(out / RECORD) else {"settings": settings, "scenes": {}}
+    empty: dict[str, Any] = {"settings": settings, "scenes": {}, "rooms": {}}
+    record = read_json(out / RECORD) if is_file(out / RECORD) else empty
     if record["settings"] != settings:
         raise InputError(
             f"{out / RECORD}: the gallery was made with {record['settings']}, not {settings}; repeat "
@@ -150,8 +171,15 @@ def make_gallery(
         )
     images = (FIRST, DECOMPOSITION, RELIT, TURNTABLE, EDITS)
     output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{image}" for image in images)), marker=RECORD)
-    output.claim(RECORD, PAGE, *(f"{name}/{image}" for name in scenes for image in images))
-    found = dict(record["scenes"])
+    output.claim(RECORD, PAGE, *(f"{name}/{image}" for name in (*scenes, *(rooms or {})) for image in images))
+    found, in_rooms = dict(record["scenes"]), dict(record["rooms"])
+
+    def write_page() -> None:
+        made = {name: found[name] for name in EXHIBITS if name in found}
+        photographed = {name: in_rooms[name] for name in ROOMS if name in in_rooms}
+        write_json(out / RECORD, {"settings": settings, "scenes": made, "rooms": photographed})
+        write_bytes(out / PAGE, page(settings, made, photographed).encode())
+
     for number, name in enumerate(scenes):
         say(f"{number + 1} of {len(scenes)}: {name}")
         run, scores = _fitted(name, work / name, settings)
@@ -159,9 +187,13 @@ def make_gallery(
             output.remove(f"{name}/{image}" for image in images)
         found[name] = scores
         _write_images(name, run, out / name, settings)
-        made = {name: found[name] for name in EXHIBITS if name in found}
-        write_json(out / RECORD, {"settings": settings, "scenes": made})
-        write_bytes(out / PAGE, page(settings, made).encode())
+        write_page()
+    for name, folder in (rooms or {}).items():
+        in_rooms[name] = evaluation.read_metrics(Run(folder)) or evaluation.evaluate(Run(folder))
+        in_rooms[name] = {key: in_rooms[name][key] for key in ("psnr", "psnr_region", "normal_mae_deg")}
+        output.remove(f"{name}/{image}" for image in images)
+        write_room(load(folder), out / name)
+        write_page()
 
 
 def _fitted(name: str, work: Path, settings: dict[str, Any]) -> tuple[Reconstruction, dict[str, Any]]:
@@ -271,6 +303,57 @@ def _cropped(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {title: image[part] for title, image in images.items()}
 
 
+def write_room(run: Reconstruction, out: Path) -> None:
+    """Write the images of an object in a room: test views, alone and relit, and a turntable."""
+    lights = {title: resource_dir("scenes") / "lights" / name for title, name in LIGHTS.items()}
+    relit = {f"under {title}": run.relight(light) for title, light in lights.items()}
+    rows = []
+    for view in ROOM_VIEWS:
+        camera = run.camera(view)
+        size = FINE * camera.width, FINE * camera.height
+        photograph = Image.fromarray(to_8_bits(run.views().views[view].load().displayed))
+        alone = run.render(view, size=size, samples=SAMPLES, object_only=True)
+        normal = run.aovs(view, ["normal"], size=size, samples=SAMPLES, object_only=True)["normal"]
+        images = {
+            "photograph": np.asarray(photograph.resize(size, Image.Resampling.BICUBIC)) / 255,
+            "ours": displayed_over(run.render(view, size=size, samples=SAMPLES), np.ones(3)),
+            "our normals": normal_colours(normal, alone[..., 3]),
+            "object only": displayed_over(alone, np.ones(3)),
+        }
+        for title, scene in relit.items():
+            images[title] = displayed_over(scene.render(view, size=size, samples=SAMPLES), np.ones(3))
+        part = _around(alone[..., 3])
+        rows.append({title: _resized(image[part]) for title, image in images.items()})
+    write_still(out / FIRST, contact_sheet(rows))
+
+    shots = [[_turned(scene, camera) for scene in relit.values()] for camera in run.turntable(TURN)]
+    part = _around(np.max([image[..., 3] for shot in shots for image in shot], axis=0))
+    frames = [
+        np.concatenate([_resized(displayed_over(image, np.ones(3))[part]) for image in shot], axis=1)
+        for shot in shots
+    ]
+    write_turntable(out / TURNTABLE, frames, TURN_SECONDS)
+
+
+def _turned(run: Reconstruction, camera: Any) -> np.ndarray:
+    """Render the object from a camera of a turntable (H, W, 4)."""
+    return run.render(camera, size=(FINE * camera.width, FINE * camera.height), samples=SAMPLES)
+
+
+def _around(alpha: np.ndarray) -> tuple[slice, slice]:
+    """The rows and columns of an object of this alpha (H, W), with its border where the image has it."""
+    rows, columns = (np.flatnonzero((alpha > 0.5).any(axis=axis)) for axis in (1, 0))
+    border = round(AROUND * min(np.ptp(rows), np.ptp(columns)))
+    first, second = (slice(max(part[0] - border, 0), part[-1] + border + 1) for part in (rows, columns))
+    return first, second
+
+
+def _resized(image: np.ndarray) -> np.ndarray:
+    """An image of TILE rows."""
+    size = round(TILE * image.shape[1] / image.shape[0]), TILE
+    return np.asarray(Image.fromarray(to_8_bits(image)).resize(size, Image.Resampling.LANCZOS)) / 255
+
+
 # ---------- Image files ----------
 
 
@@ -296,8 +379,9 @@ def _write(path: Path, frames: Sequence[np.ndarray], **options: Any) -> None:
 # ---------- README.md ----------
 
 
-def page(settings: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    """Return the Markdown of the page from the settings of the gallery and the scores of each exhibit."""
+def page(settings: Mapping[str, Any], found: Mapping[str, Any], rooms: Mapping[str, Any]) -> str:
+    """Return the Markdown of the page from the settings of the gallery and the scores of each exhibit, and of
+    objects in rooms."""
     options = {"scenes": [*found], **settings}
     command = " ".join(
         f"--{name} {' '.join(value) if isinstance(value, list) else value}"
@@ -325,6 +409,21 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any]) -> str:
             f"![{name} under another environment map, compared with the path tracer]({name}/{RELIT})",
             f"![{name} edited]({name}/{EDITS})",
             f"Edits: {edits}.",
+        ]
+    if rooms:
+        text += [
+            "## In rooms",
+            "Objects photographed with the room around them: path-traced images without alpha, fitted with "
+            "`--for relighting`. The images are sections of test views, at four times the pixels of the "
+            "photographs. [How they were made and fitted](../photographs_in_detail.md#measured).",
+        ]
+    for name, scores in rooms.items():
+        text += [
+            f"### {name}",
+            f"{ROOMS[name]} PSNR {scores['psnr']:.1f} dB, {scores['psnr_region']:.1f} dB in the region of "
+            f"interest; normals {scores['normal_mae_deg']:.1f}°.",
+            f"![{name}: photograph, fit, normals, and the object alone under three lights]({name}/{FIRST})",
+            f"![{name} turning under two environment maps]({name}/{TURNTABLE})",
         ]
     shown = command.replace(" --views", " \\\n    --views")
     text += ["## How was it made?", f"```sh\npython docs/gallery_maker.py {shown}\n```"]
