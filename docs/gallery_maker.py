@@ -421,11 +421,14 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any], rooms: Mapping[s
         text += [
             f"### {name}",
             f"{ROOMS[name]} PSNR {scores['psnr']:.1f} dB, {scores['psnr_region']:.1f} dB in the region of "
-            f"interest; normals {scores['normal_mae_deg']:.1f}°.",
-            f"![{name}: photograph, fit, normals, and the object alone under three lights]({name}/{FIRST})",
+            f"interest{_number(scores['normal_mae_deg'], '; normals {:.1f}°')}.",
+            f"![{name}: photograph, fit, normals, and the object alone under three environment maps]"
+            f"({name}/{FIRST})",
             f"![{name} turning under two environment maps]({name}/{TURNTABLE})",
         ]
-    shown = command.replace(" --views", " \\\n    --views")
+    if rooms:
+        command += " --rooms " + " ".join(f"{name} runs/{name}" for name in rooms)
+    shown = command.replace(" --views", " \\\n    --views").replace(" --rooms", " \\\n    --rooms")
     text += ["## How was it made?", f"```sh\npython docs/gallery_maker.py {shown}\n```"]
     return "\n\n".join(text) + "\n"
 

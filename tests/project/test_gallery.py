@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from tests.helpers import ROOT
+from tests.scenes.tiny import SIZE as PIXELS
+from tests.scenes.tiny import train_command, write_method, write_open_data
 
 sys.path.insert(0, str(ROOT / "docs"))
 maker: Any = importlib.import_module("gallery_maker")
@@ -99,6 +102,25 @@ def test_unknown_scenes_and_other_settings_are_refused(made: Path) -> None:
         maker.make_gallery(made / "other", scenes=("nothing",))
     with pytest.raises(InputError, match=r"the gallery was made with .*'size': 24"):
         maker.make_gallery(made / "out", made / "work", (SCENE,), **SETTINGS | {"size": 25})
+
+
+def test_object_in_a_room_is_added(few: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run without alpha: its images, scores and command."""
+    monkeypatch.setattr(maker, "ROOM_VIEWS", (0,))
+    monkeypatch.setattr(maker, "TILE", PIXELS)
+    data, run, out = write_open_data(tmp_path / "data"), tmp_path / "run", tmp_path / "out"
+    opaque = ["surroundings.opacity=0.9", "surroundings.count=60"]
+    assert main([*train_command(data, run, write_method(tmp_path)), *opaque]) == 0
+    maker.make_gallery(out, tmp_path / "work", (), rooms={"can": run}, **SETTINGS)
+    with Image.open(out / "can" / "turntable.webp") as turntable:
+        assert turntable.n_frames == TURN  # type: ignore[attr-defined]
+    with Image.open(out / "can" / "first.webp") as first:
+        assert first.height > PIXELS and np.asarray(first.convert("RGB")).std() > 5
+    page = (out / "README.md").read_text()
+    scores = json.loads((out / "gallery.json").read_text())["rooms"]["can"]
+    assert f"PSNR {scores['psnr']:.1f} dB" in page and "--rooms can runs/can" in page
+    with pytest.raises(InputError, match="use some of tabletop"):
+        maker.make_gallery(out, scenes=(), rooms={"nothing": run}, **SETTINGS)
 
 
 def test_turntable_turns_and_keeps_colours(tmp_path: Path) -> None:
