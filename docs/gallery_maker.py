@@ -7,7 +7,7 @@ exist are not made again, except images of an exhibit that has been fitted anew.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,15 @@ from PIL import Image
 from mi_refgs import __version__, methods
 from mi_refgs.editing.options import EditOptions
 from mi_refgs.errors import InputError
+from mi_refgs.evaluation import decomposition
 from mi_refgs.evaluation import evaluate as evaluation
-from mi_refgs.evaluation.images import contact_sheet, displayed_over, normal_colours
+from mi_refgs.evaluation.images import (
+    RenderedView,
+    contact_sheet,
+    displayed_over,
+    light_panels,
+    normal_colours,
+)
 from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
 from mi_refgs.io.images import read_png, to_8_bits
 from mi_refgs.io.ownership import OutputFolder
@@ -33,6 +40,7 @@ from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
 from mi_refgs.relighting import relight as relighting
 from mi_refgs.runs.run import Run
+from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.options import DatasetOptions
 from mi_refgs.synthesis.pathtrace import Cameras, Tracer, bounding_sphere
@@ -43,6 +51,8 @@ PURPOSE = "relighting"
 """Purpose of the method by which the scenes are fitted."""
 LIGHT = "sky.exr"
 """A map of scenes/lights under which no scene of the gallery is fitted."""
+METHODS = ("base_2dgs", "base_3dgs_dr")
+"""Methods next to which it is displayed."""
 TEST_VIEWS = 20
 SAMPLES = 4
 """Samples per pixel, 2 × 2."""
@@ -55,7 +65,10 @@ FINE, SHOWN = 4, 2
 and of turntables and edits."""
 FIRST, TURNTABLE, DECOMPOSITION = "first.webp", "turntable.webp", "decomposition.webp"
 RELIT, EDITS = "relit.webp", "edits.webp"
+LIT, COMPARED = "lights.webp", "methods.webp"
 """Image files of an exhibit, in its folder."""
+PER_ROW = 3
+"""Maps in a row of the decomposition, each next to its ground truth."""
 HEAD = """\
 | scene | PSNR | normals | albedo | roughness error | metallic error | relit |
 |---|---|---|---|---|---|---|"""
@@ -137,6 +150,7 @@ def make_gallery(
     size: int = 200,
     preset: str = "standard",
     set: tuple[str, ...] = (),
+    lights: tuple[Path, ...] = (),
     rooms: dict[str, Path] | None = None,
 ) -> None:
     """Make the gallery of some exhibits in the folder `out`; exhibits made before stay on the page.
@@ -149,6 +163,7 @@ def make_gallery(
         size: Pixels per side.
         preset: Preset of the fits.
         set: Changes of the method, as in `loss.ssim=0.1`.
+        lights: Environment maps beside `sky.exr` under which exhibits are displayed.
         rooms: Evaluated runs of objects in rooms, by scene.
 
     Raises:
@@ -162,6 +177,7 @@ def make_gallery(
         if name not in ROOMS:
             raise InputError(f"--rooms: {name}: not in the gallery; use some of {', '.join(ROOMS)}")
     settings = {"views": views, "size": size, "preset": preset, "set": [*set]}
+    settings["lights"] = [light.name for light in lights]
     empty: dict[str, Any] = {"settings": settings, "scenes": {}, "rooms": {}}
     record = read_json(out / RECORD) if is_file(out / RECORD) else empty
     if record["settings"] != settings:
@@ -169,7 +185,7 @@ def make_gallery(
             f"{out / RECORD}: the gallery was made with {record['settings']}, not {settings}; repeat "
             "that, or choose another --out"
         )
-    images = (FIRST, DECOMPOSITION, RELIT, TURNTABLE, EDITS)
+    images = (FIRST, DECOMPOSITION, RELIT, TURNTABLE, EDITS, LIT, COMPARED)
     output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{image}" for image in images)), marker=RECORD)
     output.claim(RECORD, PAGE, *(f"{name}/{image}" for name in (*scenes, *(rooms or {})) for image in images))
     found, in_rooms = dict(record["scenes"]), dict(record["rooms"])
@@ -182,11 +198,11 @@ def make_gallery(
 
     for number, name in enumerate(scenes):
         say(f"{number + 1} of {len(scenes)}: {name}")
-        run, scores = _fitted(name, work / name, settings)
+        run, others, scores = _fitted(name, work / name, settings)
         if scores != found.get(name):  # images of another fit
             output.remove(f"{name}/{image}" for image in images)
         found[name] = scores
-        _write_images(name, run, out / name, settings)
+        _write_images(name, run, others, scores, out / name, settings, lights)
         write_page()
     for name, folder in (rooms or {}).items():
         in_rooms[name] = evaluation.read_metrics(Run(folder)) or evaluation.evaluate(Run(folder))
@@ -196,26 +212,19 @@ def make_gallery(
         write_page()
 
 
-def _fitted(name: str, work: Path, settings: dict[str, Any]) -> tuple[Reconstruction, dict[str, Any]]:
-    """Fit, evaluate and relight an exhibit where that is missing; returns the run and its scores."""
+def _fitted(
+    name: str, work: Path, settings: dict[str, Any]
+) -> tuple[Reconstruction, dict[str, Reconstruction], dict[str, Any]]:
+    """Fit, evaluate and relight an exhibit where that is missing.
+
+    Returns the run, those of METHODS by name, and the scores of all.
+    """
     scenes = resource_dir("scenes")
     light = scenes / "lights" / LIGHT
     traced = _traced(name, settings)
     data = make_dataset(scenes / f"{name}.xml", work / "data", relight=[light], progress=True, **traced)
-    method = methods.for_purpose(PURPOSE)
+    run, metrics = _evaluated(data, methods.for_purpose(PURPOSE), work / "run", settings)
     folder = Run(work / "run")
-    run = fit(
-        data,
-        method,
-        preset=settings["preset"],
-        settings=settings["set"],
-        output=folder.path,
-        resume=True,
-        progress=True,
-    )
-    metrics = evaluation.read_metrics(folder)
-    if metrics is None or metrics.get("iterations") != run.trained.iteration:
-        metrics = evaluation.evaluate(folder, progress=True)
     record = folder.path / "relight" / Path(LIGHT).stem / relighting.RESULT
     if not is_file(record):
         relighting.relight(folder, NewLight(light), samples=SAMPLES, progress=True)
@@ -223,12 +232,30 @@ def _fitted(name: str, work: Path, settings: dict[str, Any]) -> tuple[Reconstruc
         "psnr",
         "normal_mae_deg",
         "albedo_psnr",
+        "albedo_scale",
         "roughness_mae",
         "metallic_mae",
         "surfels",
         "train_seconds",
     )
-    return run, {key: metrics[key] for key in keys} | {"relit_psnr": read_json(record)["psnr_scaled"]}
+    scores = {key: metrics[key] for key in keys} | {"relit_psnr": read_json(record)["psnr_scaled"]}
+    others, scores["methods"] = {}, {}
+    for method in METHODS:
+        others[method], metrics = _evaluated(data, method, work / method, settings)
+        scores["methods"][method] = {key: metrics[key] for key in ("psnr", "normal_mae_deg")}
+    return run, others, scores
+
+
+def _evaluated(
+    data: Path, method: str, folder: Path, settings: Mapping[str, Any]
+) -> tuple[Reconstruction, dict[str, Any]]:
+    """Fit a method and evaluate the run where that is missing; returns the run and its metrics."""
+    how = {"preset": settings["preset"], "settings": settings["set"], "resume": True}
+    run = fit(data, method, output=folder, progress=True, **how)
+    metrics = evaluation.read_metrics(Run(folder))
+    if metrics is None or metrics.get("iterations") != run.trained.iteration:
+        metrics = evaluation.evaluate(Run(folder), progress=True)
+    return run, metrics
 
 
 def _traced(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -237,20 +264,27 @@ def _traced(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     return sizes | {"spp": EXHIBITS[name].samples}
 
 
-def _write_images(name: str, run: Reconstruction, out: Path, settings: Mapping[str, Any]) -> None:
+def _write_images(
+    name: str,
+    run: Reconstruction,
+    others: Mapping[str, Reconstruction],
+    scores: Mapping[str, Any],
+    out: Path,
+    settings: Mapping[str, Any],
+    lights: Sequence[Path],
+) -> None:
     """Write the images of an exhibit that are missing."""
     assert run.folder is not None
     exhibit, size = EXHIBITS[name], SHOWN * settings["size"]
-    other = run.relight(resource_dir("scenes") / "lights" / LIGHT)
+    sky = resource_dir("scenes") / "lights" / LIGHT
+    other = run.relight(sky)
     if not is_file(out / FIRST):
         write_still(out / FIRST, first_image(name, run, other, settings))
-    sheets = {
-        DECOMPOSITION: run.folder / evaluation.DECOMPOSITION,
-        RELIT: run.folder / "relight" / Path(LIGHT).stem / relighting.SHEET,
-    }
-    for target, source in sheets.items():
-        if not is_file(out / target):
-            write_still(out / target, read_png(source))
+    if not is_file(out / DECOMPOSITION):
+        scale = np.array(scores["albedo_scale"])
+        write_still(out / DECOMPOSITION, decomposition_image(run, exhibit.view, scale))
+    if not is_file(out / RELIT):
+        write_still(out / RELIT, read_png(run.folder / "relight" / sky.stem / relighting.SHEET))
     if not is_file(out / TURNTABLE):
         frames = [
             np.concatenate([_shown(scene, camera, size) for scene in (run, other)], axis=1)
@@ -264,6 +298,11 @@ def _write_images(name: str, run: Reconstruction, out: Path, settings: Mapping[s
             made[title] = run.edit(**options)
         rows = [{title: _shown(scene, view, size) for title, scene in made.items()} for view in EDIT_VIEWS]
         write_still(out / EDITS, contact_sheet(rows))
+    if not is_file(out / LIT):
+        lit = {light.stem: _shown(run.relight(light), exhibit.view, size) for light in (sky, *lights)}
+        write_still(out / LIT, contact_sheet([_cropped(lit)]))
+    if not is_file(out / COMPARED):
+        write_still(out / COMPARED, methods_image({**others, "ours": run}, exhibit.view))
 
 
 def _shown(run: Reconstruction, camera: Any, size: int) -> np.ndarray:
@@ -285,6 +324,41 @@ def first_image(
         "relit": _shown(relit, view, size),
     }
     return contact_sheet([_cropped(images)])
+
+
+def decomposition_image(run: Reconstruction, number: int, scale: np.ndarray) -> np.ndarray:
+    """A test view's image, normals and materials, and the light, each next to its ground truth.
+
+    scale: of the albedo, per channel.
+    """
+    views = run.views()
+    view = views.views[number].load()
+    camera, light = view.camera(), run.trained.light
+    assert light is not None and views.environment is not None
+    rendered = RenderedView.of(run.trained.renderer()(camera), views, view)
+    maps = decomposition.material_maps(run.trained)(camera, rendered)
+    found = decomposition.panels(decomposition.MeasuredView(rendered, maps, view, None), scale)
+    titles = [*found]
+    rows = [
+        {title: found[title] for title in titles[i : i + PER_ROW]} for i in range(0, len(titles), PER_ROW)
+    ]
+    radiance = light.radiance().numpy()
+    return contact_sheet(rows, light_panels(radiance, read_radiance(views.environment, len(radiance))))
+
+
+def methods_image(runs: Mapping[str, Reconstruction], number: int) -> np.ndarray:
+    """Images of a test view, and normals below, next to the ground truth."""
+    view = next(iter(runs.values())).views().views[number].load()
+    assert view.normal is not None
+    images = {"ground truth": view.displayed}
+    normals = {"ground truth": normal_colours(view.normal, view.covered())}
+    for title, run in runs.items():
+        image = run.render(number, samples=SAMPLES)
+        images[title] = displayed_over(image, np.ones(3))
+        normals[title] = normal_colours(
+            run.aovs(number, ["normal"], samples=SAMPLES)["normal"], image[..., 3]
+        )
+    return contact_sheet([images, normals])
 
 
 def _path_traced(name: str, options: DatasetOptions, view: int) -> np.ndarray:
@@ -397,7 +471,12 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any], rooms: Mapping[s
         "Normal errors are means over the foreground. Albedo and relit images are compared after per-channel "
         "scaling.",
     ]
-    for name in found:
+    lit = _list(Path(light).stem for light in (LIGHT, *settings["lights"]))
+    for name, scores in found.items():
+        compared = [
+            f"`{method}` ({other['psnr']:.1f} dB, {other['normal_mae_deg']:.1f}°)"
+            for method, other in scores["methods"].items()
+        ]
         edits = "; ".join(f"*{title}*: `{_words(edit)}`" for title, edit in EXHIBITS[name].edits.items())
         text += [
             f"## {name}",
@@ -405,8 +484,12 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any], rooms: Mapping[s
             f"![{name}: ground truth, fit, normals, and under another environment map]({name}/{FIRST})",
             f"![{name} turning, under the estimated environment map and under another]({name}/{TURNTABLE})",
             "Left: the estimated environment map. Right: one that the fit has not seen.",
-            f"![Images and materials of {name} compared with ground truth]({name}/{DECOMPOSITION})",
+            f"![{name} under {lit}]({name}/{LIT})",
             f"![{name} under another environment map, compared with the path tracer]({name}/{RELIT})",
+            f"![Image, normals and materials of {name}, and its environment map, next to the ground truth]"
+            f"({name}/{DECOMPOSITION})",
+            f"![A test view of {name} and its normals, fitted by several methods]({name}/{COMPARED})",
+            f"Methods: {_list([*compared, 'ours, the method for relighting'])}.",
             f"![{name} edited]({name}/{EDITS})",
             f"Edits: {edits}.",
         ]
@@ -444,6 +527,12 @@ def _row(name: str, scores: Mapping[str, Any]) -> str:
         _number(scores["relit_psnr"], "{:.1f} dB"),
     ]
     return f"| {' | '.join(cells)} |"
+
+
+def _list(words: Iterable[str]) -> str:
+    """Words as `a`, `a and b` or `a, b and c`."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _number(value: float | None, form: str) -> str:

@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 maker: Any = importlib.import_module("gallery_maker")
 
 SIZE, SCENE = 24, "plastic_hollows"
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "views": 4,
     "size": SIZE,
     "set": (
@@ -34,6 +34,7 @@ SETTINGS = {
         "light.height=8",
         "mesh.resolution=16",
     ),
+    "lights": (ROOT / "scenes" / "lights" / "studio.exr",),
 }
 TURN, TEST_VIEWS = 4, 4
 """Frames of a turntable, and test views, of the small gallery."""
@@ -64,7 +65,7 @@ def test_gallery_has_its_pictures(made: Path) -> None:
     with Image.open(folder / "turntable.webp") as turntable:
         assert turntable.n_frames == TURN  # type: ignore[attr-defined]
         assert turntable.size == (2 * maker.SHOWN * SIZE, maker.SHOWN * SIZE)
-    for name in ("first", "decomposition", "relit", "edits"):
+    for name in ("first", "decomposition", "relit", "edits", "lights", "methods"):
         with Image.open(folder / f"{name}.webp") as picture:
             assert np.asarray(picture.convert("RGB")).std() > 5, name
 
