@@ -154,7 +154,10 @@ def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss]:
 
 
 def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: int) -> tuple[Float, Float]:
-    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached."""
+    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached.
+
+    Raises InputError for a loss that is not of width 1.
+    """
     image, target = inputs.image, inputs.target
     # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
     factors = {
@@ -171,6 +174,8 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
         loss += ssim * losses.d_ssim(image, target.image, width, height)
     for name, registered in LOSSES.items():
         if name in factors and (value := registered.value(inputs)) is not None:
+            if dr.width(value) != 1:
+                raise InputError(f"loss.{name}: has {dr.width(value)} values; reduce it, as with dr.mean")
             loss += factors[name] * value
     squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
     return loss, sum(squares, mi.Float(0)) / 3

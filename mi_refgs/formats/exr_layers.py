@@ -23,7 +23,8 @@ def write(
     """One view with all its layers in one EXR file, as Blender, Nuke and Natron name them.
 
     R, G, B, A is the image: linear radiance, premultiplied. Every other layer is NAME.R, NAME.G, NAME.B, for
-    vectors NAME.X …, and for one number NAME.V; depth is depth.Z, scene units along the viewing axis.
+    vectors NAME.X …, and for one number NAME.V; depth is depth.Z, scene units along the viewing axis. The
+    background map is the layer background, which R, G, B do not contain: add (1 - A) times it.
     """
     if not 0 <= view < len(shots):
         count = len(shots)

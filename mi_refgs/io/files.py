@@ -183,8 +183,11 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 def require_file(path: Path) -> None:
     """Raise InputError unless this is a file."""
-    if not is_file(path):
-        raise InputError(f"{path}: file: missing; restore it, or remove what refers to it")
+    if is_file(path):
+        return
+    if os.path.isdir(path):  # unlike Path.is_dir, False for an impossible name
+        raise InputError(f"{path}: file: is a folder; name a file in it")
+    raise InputError(f"{path}: file: missing; restore it, or remove what refers to it")
 
 
 def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:

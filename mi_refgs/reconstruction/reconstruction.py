@@ -150,8 +150,8 @@ class Reconstruction:
 
         albedo, roughness, metallic (0 … 1) and unit normals (world, towards the camera) are those of the
         visible surface; depth is the distance along the ray from the near plane, scene units; diffuse,
-        specular and indirect are premultiplied and sum to the image over black. Raises InputError for an
-        unknown name, or an attribute that the surfels do not have.
+        specular and indirect are premultiplied and sum to the image of the object over black. Raises
+        InputError for an unknown name, or an attribute that the surfels do not have.
         """
         kinds = suffixes()
         for name in names:

@@ -7,7 +7,7 @@
     surroundings.ply  the background Gaussians, like surfels.ply, with radiance_sh only
     background.exr    the background map, lat-long radiance
     scene.xml         the scene for `mi.load_file`
-    model.json        iteration and training seconds of these files, and the shading options
+    model.json        iteration and training seconds of these files, their names, and the shading options
 
 Files of what a method does not model are absent.
 """
@@ -91,7 +91,8 @@ def export(
         # Written last: if it is there, the other files are complete.
         note = {"iteration": fitted.iteration, "seconds": fitted.seconds, "surfels": fitted.surfels.count}
         pruned = {} if fitted.pruned is None else {"pruned": asdict(fitted.pruned)}
-        write_json(folder / MODEL, note | pruned | {"shading": asdict(fitted.shading)}, indent=2)
+        more_notes = {"files": written, "shading": asdict(fitted.shading)}
+        write_json(folder / MODEL, note | pruned | more_notes, indent=2)
     return [folder / name for name in written]
 
 

@@ -36,6 +36,11 @@ AROUND_FILE, BACKGROUND_MAP, NEAR_FIELD = "surroundings.ply", "background.exr", 
 ARTEFACTS = (SURFELS, LIGHT_MAP, NEAR_FIELD, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL)
 
 
+def _remedy(folder: Path) -> str:
+    """What to do about a file of a run that cannot be used."""
+    return f"restore it, or write it again with `refgs export {folder}` if the run has checkpoints"
+
+
 @dataclass(frozen=True)
 class Pruned:
     """Record of a pruned scene: how close its images are to those of the whole fit."""
@@ -96,6 +101,7 @@ class TrainedScene:
             for name in shading.required_attributes:
                 attribute(name)  # is registered
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
+            files = {*content.get("files", ())}  # earlier versions did not write it
             pruned = content.get("pruned")
             if pruned is not None:
                 pruned = Pruned(int(pruned["surfels"]), float(pruned["limit"]), float(pruned["psnr"]))
@@ -104,15 +110,14 @@ class TrainedScene:
         except UnknownNameError as error:
             raise InputError(f"{note}: {error}; or register it, as when the run was fitted") from error
         except (ValueError, KeyError, TypeError, OverflowError) as error:
-            raise InputError(
-                f"{note}: cannot be read ({error}); write it again with `refgs export {folder}`"
-            ) from error
+            reason = f"no {error}" if isinstance(error, KeyError) else error
+            raise InputError(f"{note}: cannot be read ({reason}); {_remedy(folder)}") from error
         light, mesh, near = folder / LIGHT_MAP, folder / MESH, folder / NEAR_FIELD
         around, behind = folder / AROUND_FILE, folder / BACKGROUND_MAP
-        if shading.model.light != "none" and not light.is_file():
-            raise InputError(
-                f"{light}: light: missing; restore the file, or write it again with `refgs export {folder}`"
-            )
+        needed = {LIGHT_MAP} if shading.model.light != "none" else set()
+        for name in sorted((needed | files) & {LIGHT_MAP, NEAR_FIELD, AROUND_FILE, BACKGROUND_MAP}):
+            if not (folder / name).is_file():
+                raise InputError(f"{folder / name}: file: missing; {_remedy(folder)}")
         fitted = TrainedScene(
             read_ply(folder / SURFELS),
             EnvironmentLight.from_file(light) if light.is_file() else None,
@@ -129,7 +134,7 @@ class TrainedScene:
             if fitted.surroundings is not None:
                 fitted.surroundings.check(fitted.surfels)
         except InputError as error:
-            raise InputError(f"{folder}: {error}; or write it again with `refgs export {folder}`") from error
+            raise InputError(f"{folder}: {error}; or {_remedy(folder)}") from error
         return fitted
 
     def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:

@@ -314,7 +314,7 @@ def nan_in_ply(run: Path) -> None:
     ("spoil", "words"),
     [
         (nan_in_ply, ["surfels.ply", "x: 1 values are NaN"]),
-        (lambda run: (run / "envmap.exr").unlink(), ["envmap.exr", "light: missing"]),
+        (lambda run: (run / "envmap.exr").unlink(), ["envmap.exr", "file: missing"]),
     ],
     ids=["NaN", "light"],
 )

@@ -213,7 +213,8 @@ def test_unreadable_prune_note_is_refused(note: object, finished: Path, tmp_path
     run = shutil.copytree(finished, tmp_path / "run")
     content = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(content | {"pruned": note}))
-    refused(lambda: TrainedScene.read(run), "model.json: cannot be read", "write it again with `refgs export")
+    remedy = "restore it, or write it again with `refgs export"
+    refused(lambda: TrainedScene.read(run), "model.json: cannot be read", remedy)
 
 
 def test_prune_without_checkpoints_is_refused_in_place(finished: Path, tmp_path: Path) -> None:

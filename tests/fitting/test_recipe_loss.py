@@ -53,6 +53,15 @@ def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path, reg
     assert without < early < weighed
 
 
+def test_loss_per_pixel_is_refused(data: Path, method: Path) -> None:
+    mi_refgs.register_loss(mi_refgs.Loss("uneven", lambda inputs: inputs.frame.object_alpha))
+    try:
+        with pytest.raises(mi_refgs.InputError, match=r"loss\.uneven: has \d+ values; reduce it"):
+            roughness_after(data, method, "loss.uneven=1.0")
+    finally:
+        LOSSES.unregister("uneven")
+
+
 def test_loss_of_an_absent_attribute_is_refused(data: Path, registered: None) -> None:
     colour = methods.load("base_2dgs", "quick", [*SETTINGS[:-1], "loss.rough=1.0"])
     with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: needs the attribute roughness"):

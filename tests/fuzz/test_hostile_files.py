@@ -163,6 +163,8 @@ def test_invalid_methods_are_refused(text: str, tmp_path: Path) -> None:
         {"shading": {"traced_bounces": 10**9}},
         {"shading": {"no": 1}},
         {"shading": [1]},
+        {"files": 7},
+        {"files": [["a"]]},
     ],
 )
 def test_invalid_models_are_refused(content: dict[str, Any], tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs.errors import InputError
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
@@ -98,6 +99,14 @@ def test_run_folder_contains_surroundings_and_background_until_removed(tmp_path:
     assert not {AROUND_FILE, BACKGROUND_MAP} & files
     assert not (tmp_path / AROUND_FILE).exists() and not (tmp_path / BACKGROUND_MAP).exists()
     assert TrainedScene.read(tmp_path).surroundings is None
+
+
+@pytest.mark.parametrize("name", [AROUND_FILE, BACKGROUND_MAP])
+def test_lost_background_is_refused(name: str, tmp_path: Path) -> None:
+    export(fitted(), tmp_path, camera())
+    (tmp_path / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: file: missing; restore it"):
+        TrainedScene.read(tmp_path)
 
 
 def test_object_only_needs_surfels(tmp_path: Path) -> None:

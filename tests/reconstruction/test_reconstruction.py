@@ -279,6 +279,7 @@ def test_settings_become_toml_assignments() -> None:
         (lambda r: r.scene(aovs=["colour"]), "unknown type 'colour'"),
         (lambda r: r.turntable(0), "turntable: 0 is out of range"),
         (lambda r: r.relight("none.exr"), "none.exr: file: missing"),
+        (lambda r: r.relight(Path.cwd()), "file: is a folder; name a file in it"),
         (lambda r: r.relight(np.ones((4, 8))), "is no lat-long map; give linear radiance"),
         (lambda r: r.export("obj", "x.obj"), "--to: .obj. is unknown; use"),
         (lambda r: r.edit(where="metallic > 2", cut=True), "none of the 6000 surfels is in it; choose"),
