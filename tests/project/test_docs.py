@@ -75,6 +75,11 @@ def test_readme_setup_commands_match_ci() -> None:
     assert "bash setup.sh test" in (ROOT / ".ci" / "run").read_text()
 
 
+def test_pages_stay_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 110
+    assert len((ROOT / "docs" / "decisions.md").read_text().split()) <= 5000
+
+
 @pytest.mark.parametrize("page", [pytest.param(page, id=name(page)) for page in PAGES])
 def test_links_resolve(page: Path) -> None:
     """To a file; or, within docs/, to a page that is made. The build of the site checks their anchors."""
