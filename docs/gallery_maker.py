@@ -497,7 +497,7 @@ def page(settings: Mapping[str, Any], found: Mapping[str, Any], rooms: Mapping[s
         text += [
             "## In rooms",
             "Objects photographed with the room around them: path-traced images without alpha, fitted with "
-            "`--for relighting`. The images are sections of test views, at four times the pixels of the "
+            "`--for relighting`. The images are crops of test views, at four times the pixels of the "
             "photographs. [How they were made and fitted](../photographs_in_detail.md#measured).",
         ]
     for name, scores in rooms.items():

@@ -96,9 +96,11 @@ class Train:
         total = (
             "" if expected is None else f" ({minutes(taken)} in all, estimate {minutes(expected.seconds)})"
         )
+        around = trainer.surroundings
+        beside = "" if around is None else f" and {around.surfels.count} of the background"
         text = (
             f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s{total}, "
-            f"{trainer.surfels.count} surfels; next: refgs eval {self.output}"
+            f"{trainer.surfels.count} surfels{beside}; next: refgs eval {self.output}"
         )
         if trainer.fit.decisions:
             data["terms"] = list(trainer.method.components)  # name of this key in version 0.1

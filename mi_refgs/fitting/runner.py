@@ -320,7 +320,7 @@ def method_for(
     views = read_views(method, data, "train", truth=False, decode=False)
     if views.has_alpha or views.region is None:
         return name
-    say(f"{data}: images without alpha: --method {other} fits their background too")
+    say(f"{data}: images without alpha: fitted with their background, by --method {other}")
     return other
 
 
