@@ -81,13 +81,14 @@ class FilmImage:
     def tangent(self) -> Any:
         """Tangent of the image for the tangents of the parameters; zero where none of these changes it."""
         found = self._bands(DERIVATIVE_SAMPLES)
+        # The tangents of the parameters stay: other losses and later passes read them, too.
+        flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
         if len(found) == 1:
-            image = self._developed(self._values(found[0]))
-            return dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            return dr.forward_to(self._developed(self._values(found[0])), flags=flags)
         parts = []
         for band in found:
             values = self._values(band)
-            parts.append(dr.forward_to(values, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad))
+            parts.append(dr.forward_to(values, flags=flags))
             dr.eval(parts[-1])
             del values
         tangent = dr.concat(parts)

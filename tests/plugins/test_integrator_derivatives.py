@@ -11,6 +11,8 @@ import pytest
 
 from tests.helpers import refused
 from tests.scenes.integrator import (
+    HEIGHT,
+    WIDTH,
     check_derivatives,
     image,
     lit_scene,
@@ -89,3 +91,42 @@ def test_a_parameter_that_changes_nothing_has_tangent_zero() -> None:
     image = mi.render(of, params)
     dr.set_grad(leaf, dr.ones(mi.TensorXf, leaf.shape))
     assert not np.any(dr.forward_to(image).numpy())
+
+
+@pytest.mark.parametrize("most", [None, WIDTH * HEIGHT // 3], ids=["whole", "bands"])
+@pytest.mark.parametrize("key", ["position", "albedo", "light"])
+@pytest.mark.parametrize("derived", [False, True], ids=["leaf", "derived"])
+def test_tangents_add_up_over_losses(
+    key: str, derived: bool, most: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forward mode, as reverse mode, with images and other losses on a parameter, in any order."""
+    if most is not None:
+        monkeypatch.setattr("mi_refgs.plugins.film.DERIVATIVE_SAMPLES", most)
+    of = scene(occlusion=False)
+    params = mi.traverse(of)
+    base = mi.TensorXf(params[f"integrator.{key}"])
+
+    def weighed(name: str, leaf: mi.TensorXf) -> mi.Float:
+        if name == "image":
+            return dr.mean(mi.render(of, params), axis=None).array
+        used = leaf if name == "leaf" else params[f"integrator.{key}"]
+        return dr.mean(dr.square(used.array))
+
+    def tangent(*names: str) -> float:
+        leaf = mi.TensorXf(base)
+        dr.enable_grad(leaf)
+        dr.set_grad(leaf, dr.ones(mi.TensorXf, leaf.shape))
+        params[f"integrator.{key}"] = 2 * leaf if derived else leaf
+        params.update()
+        return float(dr.forward_to(sum((weighed(name, leaf) for name in names), mi.Float(0)))[0])
+
+    alone = {name: tangent(name) for name in ("image", "leaf", "parameter")}
+    for names in (
+        ("image", "leaf"),
+        ("parameter", "image", "leaf"),
+        ("image", "parameter"),
+        ("image", "image"),
+    ):
+        expected = sum(alone[name] for name in names)
+        assert tangent(*names) == pytest.approx(expected, rel=1e-4, abs=1e-6), names
+    assert alone["image"] != 0
