@@ -115,7 +115,10 @@ def survey(folder: Path) -> Survey:
 
 def few_views(count: int) -> str | None:
     """A note if there are few training views, else None."""
-    return f"only {count} training views; expect surfaces that fit no others" if count < FEW_VIEWS else None
+    if count >= FEW_VIEWS:
+        return None
+    views = "view" if count == 1 else "views"
+    return f"only {count} training {views}; other views may look wrong"
 
 
 def require_several_sides(data: Dataset) -> None:
