@@ -59,8 +59,9 @@ def benchmark_tables(result: dict[str, Any]) -> list[str]:
 
 
 def rows(scores: Sequence[Score], result: dict[str, Any]) -> list[str]:
-    """Return the lines of a table of scores."""
-    lines = []
+    """Return the lines of a table of scores: those that were measured, then the others by reason."""
+    lines: list[str] = []
+    absent: dict[str, list[str]] = {}
     for score in scores:
         if (value := result[score.key]) is not None:
             form = score.form + score.unit
@@ -68,8 +69,8 @@ def rows(scores: Sequence[Score], result: dict[str, Any]) -> list[str]:
             suffix = "" if concave is None else f"  (concave: {form.format(concave)})"
             lines.append(f"{score.title:<27}{form.format(value)}{suffix}")
         elif score.reason:
-            lines.append(f"{score.title:<27}none: {result[f'{score.reason}_reason']}")
-    return lines
+            absent.setdefault(result[f"{score.reason}_reason"], []).append(score.title)
+    return lines + [f"not measured: {'; '.join(titles)} ({reason})" for reason, titles in absent.items()]
 
 
 def budget_table(budget: dict[str, dict[str, Any]]) -> list[str]:

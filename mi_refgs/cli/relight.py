@@ -40,7 +40,7 @@ class Relight:
     azimuth: Annotated[float, arg(metavar="DEG")] = 0.0
     """rotation of the map about +z, counter-clockwise seen from above"""
     exposure: Annotated[float, arg(metavar="EV")] = 0.0
-    """exposure compensation of the map in stops"""
+    """exposure compensation in stops, of the map and of the ground truth"""
     turntable: Annotated[int, arg(metavar="N")] = 0
     """render N views around the object instead of the test views"""
     data: OtherData = None
@@ -74,6 +74,7 @@ class Relight:
             factors = ", ".join(f"{x:.3f}" for x in result["scale"])
             lines += caption(result, "ours")
             lines.append(f"PSNR                            {result['psnr']:.2f} dB")
-            lines.append(f"PSNR after per-channel scaling  {result['psnr_scaled']:.2f} dB  (scale {factors})")
+            scaled = f"PSNR after per-channel scaling  {result['psnr_scaled']:.2f} dB"
+            lines.append(f"{scaled}  (relit image × {factors})")
             lines += benchmark_tables(result)
         return Result(result, "\n".join(lines))

@@ -10,6 +10,7 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset, read_dataset, reader_of
 from mi_refgs.data.hull import view_focus
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
 SMALL_SIDE = 48  # pixels of the shorter side at which images are read
@@ -52,7 +53,7 @@ class Survey:
             near, far = self.camera_distance
             cameras = f"{near:.3g} to {far:.3g} units from {_triple(self.centre)}"
         if self.region is not None:
-            region = f"{self.region['radius']:.3g} units around {_triple(self.region['centre'])}"
+            region = f"radius {self.region['radius']:.3g} around {_triple(self.region['centre'])}"
         truth = [*self.truth, "environment map"] if self.environment else self.truth
         items = {
             "data set": self.folder,
@@ -83,7 +84,7 @@ def survey(folder: Path) -> Survey:
         test_views = ()
         missing.append(f"no test views ({error})")
     views = (*train.views, *test_views)
-    angles = [2 * np.degrees(np.arctan(view.width / (2 * view.fx))) for view in views]
+    angles = [_across(view) for view in views]
     centre = distance = None
     try:
         (x, y, z), far = view_focus(views)
@@ -99,7 +100,7 @@ def survey(folder: Path) -> Survey:
         views={"train": len(train.views), "test": len(test_views)},
         size=size,
         sizes=len({(view.width, view.height) for view in views}),
-        field_of_view=(float(min(angles)), float(max(angles))),
+        field_of_view=(min(angles), max(angles)),
         centre=centre,
         camera_distance=distance,
         extent=train.scene_extent,
@@ -147,10 +148,16 @@ def _unusual(found: Survey, train: Dataset) -> list[str]:
         if found.region is None:
             notes.append("no region of interest: give one in region.json")
         if not found.points:
-            notes.append("no points to start from")
+            notes.append("no points to start from: the fit searches them in the images")
     if found.alpha == "some" and len({view.has_alpha for view in train.views}) == 1:  # else noted already
         notes.append("only images of one split have alpha; give all images masks, or none")
     return notes
+
+
+def _across(view: View) -> float:
+    """Horizontal field of view in degrees, of the whole file: views that are downscaled leave out a border."""
+    width, fx = (view.width, view.fx) if view.file is None else (view.file.width, view.file.intrinsics[0])
+    return float(2 * np.degrees(np.arctan(width / (2 * fx))))
 
 
 def _triple(values: tuple[float, float, float]) -> str:

@@ -49,7 +49,7 @@ MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}
 class TransformsReader:
     """Reads folders with `transforms_train.json` or `transforms.json`."""
 
-    name = "Blender / NeRF"
+    name = "Blender, NeRF, nerfstudio"
     looks_for = "transforms_train.json or transforms.json"
 
     def recognises(self, folder: Path) -> bool:

@@ -107,8 +107,8 @@ def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[
     if placed and "radiance_sh" in read:
         notes.append(f"the colour radiance_sh keeps the light of the place where it was fitted{convert}")
     if indirect and (placed or change.cut or change.keep or {*names} - {"roughness"}):
-        trace = "; --materials traces it instead" if has_materials else ""
-        notes.append(f"interreflections, indirect_sh, stay as they were fitted{trace}")
+        trace = "; --materials traces rays instead" if has_materials else ""
+        notes.append(f"interreflection (indirect_sh) stays as it was fitted{trace}")
     return notes
 
 

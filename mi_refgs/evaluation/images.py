@@ -30,6 +30,7 @@ MARGIN = 4  # pixels between images
 TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 16
 """Heights of titles in pixels: the largest at which all of a sheet fit, up to TITLE_MAX or, of large images,
 their width over TITLE_PART."""
+BESIDE_GREYS = np.array([0.80, 0.87, 0.95])  # pale blue: on white, a metal (metallic 1) would not be visible
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
 
@@ -101,16 +102,25 @@ def normal_colours(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def material_colours(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert a linear colour (H, W, 3) or a number, (H, W) or (H, W, 1), per pixel to colours over white."""
+    """Convert a linear colour (H, W, 3) per pixel to colours over white, a number to greys over BESIDE_GREYS.
+
+    Numbers are (H, W) or (H, W, 1).
+    """
     values = values.reshape(*alpha.shape, -1)
-    colours = srgb_from_linear(values) if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
-    return on_white(colours, alpha)
+    if values.shape[-1] == 3:
+        return on_white(srgb_from_linear(values), alpha)
+    return over(BESIDE_GREYS, np.repeat(values, 3, axis=-1), alpha)
 
 
 def on_white(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Composite an image (H, W, 3) over white by alpha (H, W)."""
+    return over(np.ones(3), image, alpha)
+
+
+def over(background: np.ndarray, image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Composite an image (H, W, 3) over a colour (3,) by alpha (H, W)."""
     alpha = np.clip(alpha, 0, 1)[..., None]
-    return alpha * image + (1 - alpha)
+    return alpha * image + (1 - alpha) * background
 
 
 def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:

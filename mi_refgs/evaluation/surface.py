@@ -36,7 +36,7 @@ GRAZING = 0.1  # cosine to the viewing ray below which a view does not see a poi
 NEAR_TRUTH = 1.2
 """Radius, relative to the true surface's, beyond which an open scene's mesh is not compared with it."""
 SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
-NO_SURFACE = f"the data set has no {SURFACE}; make it again with this version of `refgs dataset`"
+NO_SURFACE = f"the data set has no true surface: {SURFACE}, which `refgs dataset` writes"
 
 
 @dataclass(frozen=True, eq=False)

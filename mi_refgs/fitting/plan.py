@@ -64,16 +64,22 @@ DECODING = 1.5e-8  # seconds per pixel of a file, once per image: JPEG 8e-9, PNG
 WORTH = 1e7  # iterations × pixels from which a fit takes minutes, and an estimate is worth its time
 
 
-def speed_of(method: Method, has_alpha: bool) -> Speed:
+def speed_of(method: Method, has_alpha: bool, tell: Callable[[str], None] = lambda _: None) -> Speed:
     """Speed of a method on this machine, on images with alpha or without: cached, or measured.
 
-    Methods that differ in learning rates or weights only are equally fast.
+    Methods that differ in learning rates or weights only are equally fast. `tell` is called before it is
+    measured.
     """
     parts = {name: getattr(method, name) for name in ("surfels", "light", "surroundings", "mesh", "stage")}
     subject = machine() | {"simd_width": simd_width(), "mi_refgs": __version__, "cut_out": has_alpha}
     subject["method"] = {name: plain(part) for name, part in parts.items() if part is not None}
     subject["loss"] = {name: bool(loss.weight) for name, loss in method.loss.items()}
-    return cost_model.kept(subject, lambda: measured(method, has_alpha))
+
+    def measure() -> Speed:
+        tell("measuring the speed of this machine, once per kind of method (about half a minute)")
+        return measured(method, has_alpha)
+
+    return cost_model.kept(subject, measure)
 
 
 def measured(method: Method, has_alpha: bool) -> Speed:
@@ -208,7 +214,7 @@ def planned(
     method = method.downscaled(1) if free else sized(method, path, tell)
     if method.iterations * width * height < WORTH:
         return method, None
-    speed = speed_of(method, data.has_alpha)
+    speed = speed_of(method, data.has_alpha, tell)
 
     def at(factor: int, capacity: float = 1.0) -> Estimate:
         size = width, height

@@ -108,6 +108,6 @@ def record(setup: FitSetup, state: FitState) -> dict[str, Any] | None:
 
 def sentence(decision: Mapping[str, Any]) -> str:
     """A decision as one sentence."""
-    verdict = "corrections stay" if decision["corrected"] else "no corrections"
+    verdict = "corrected" if decision["corrected"] else "not corrected"
     change = decision["psnr_registered"] - decision["psnr"]
-    return f"cameras: {verdict}: {change:+.2f} dB on pixels to which they were not fitted"
+    return f"cameras: {verdict}; registered with half of the pixels, they change the others by {change:+.2f} dB"

@@ -162,10 +162,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     This integrator splats surfels in the view of a `perspective` sensor. It does not see the scene's
     shapes, and shows the environment only in reflections. It has no noise, and ignores the seed. A sample
     count n (of ``mi.render``, else of the sensor's sampler, whose default is 4) gives k × k regular samples
-    per pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. `mi.render` differentiates it in both
-    modes with respect to the parameters above, to ``data``, ``scale`` or ``radiance.value`` of the scene's
-    environment, and to ``to_world`` (rigid changes) and ``x_fov`` of sensors, but not to a background colour
-    or the mesh; `mi_refgs.splat.composite` lists the derivatives that are absent.
+    per pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. The film's ``rfilter`` is not used.
+    `mi.render` differentiates it in both modes with respect to the parameters above, to ``data``, ``scale``
+    or ``radiance.value`` of the scene's environment, and to ``to_world`` (rigid changes) and ``x_fov`` of
+    sensors, but not to a background colour or the mesh; `mi_refgs.splat.composite` lists the derivatives
+    that are absent.
 
     A surfel with a value that is NaN or infinite in any attribute, or beyond 1e18 in position or SH
     coefficients, covers no pixel and gets zero gradient; such a value of the light is black. One warning

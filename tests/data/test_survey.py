@@ -28,7 +28,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_survey_of_complete_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_data(tmp_path / "ball", views=5)
     found = survey(data)
-    assert (found.layout, found.views) == ("Blender / NeRF", {"train": 5, "test": 2})
+    assert (found.layout, found.views) == ("Blender, NeRF, nerfstudio", {"train": 5, "test": 2})
     assert found.size == (20, 20) and found.sizes == 1 and found.alpha == "all"
     assert found.camera_distance == pytest.approx((DISTANCE, DISTANCE))
     assert found.centre == pytest.approx((0, 0, 0), abs=1e-9)

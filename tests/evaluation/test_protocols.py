@@ -259,7 +259,7 @@ def test_tables_have_captions() -> None:
     text = "\n".join(benchmark_tables(found))
     for line in ("protocol stanford-orb", "scale: ", "mask:  ", "frame: whole image of 30 × 20 pixels"):
         assert f"\n{line}" in text
-    assert "PSNR-H                     21.50 dB" in text and "none: gone" in text
+    assert "PSNR-H                     21.50 dB" in text and "not measured: " in text and "(gone)" in text
     assert benchmark_tables({"protocols": protocols.captions("ours", (30, 20))}) == []
     for protocol in PROTOCOLS.values():
         assert protocol.caption((3, 2), relit=True)["scale"] != protocol.caption((3, 2), relit=False)["scale"]
