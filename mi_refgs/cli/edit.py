@@ -87,7 +87,8 @@ class Edit:
         edited.save(self.output)
         if sheet is not None:
             write_png(Run(self.output).output.own(PREVIEW), sheet)
-        text = f"{self.output}: {entry['selected']} of {entry['of']} surfels selected; the new run has {entry['surfels']}"
+        selected = f"{entry['selected']} of {entry['of']} surfels selected"
+        text = f"{self.output}: {selected}; the new run has {entry['surfels']}"
         return Result({"output": str(self.output), **entry}, text)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +26,9 @@ from mi_refgs.progress import say
 if TYPE_CHECKING:
     from mi_refgs.io.ownership import OutputFolder
     from mi_refgs.runs.run import Run
+
+
+MOST_LISTED = 12  # files of a folder that are named one by one; the default export writes 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +98,7 @@ class Export:
             fitted, report = prune(fitted, training, views, limit, say)
 
         if names:
+            say(f"{target}: writing {', '.join(names)}")
             try:
                 written = write(fitted, names, target, shots, options, folder.path, self.overwrite)
             except SceneError as error:
@@ -102,8 +108,18 @@ class Export:
             files = [str(path) for path in export(fitted, target, shots[0].camera, output=output)]
         data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
         if not self.prune:
-            return Result(data, "\n".join(files))
-        return Result(data | {"pruned": report}, "\n".join([*files, table(report)]))
+            return Result(data, "\n".join(_listed(files)))
+        return Result(data | {"pruned": report}, "\n".join([*_listed(files), table(report)]))
+
+
+def _listed(files: Sequence[str]) -> list[str]:
+    """A line for each file, or one for a folder of more than MOST_LISTED."""
+    folders = Counter(str(Path(file).parent) for file in files)
+    lines = []
+    for file in files:
+        folder = str(Path(file).parent)
+        lines.append(file if folders[folder] <= MOST_LISTED else f"{folder}: {folders[folder]} files")
+    return list(dict.fromkeys(lines))
 
 
 def command() -> type[Export]:

@@ -51,6 +51,8 @@ class Render:
         out = self.output
         if out.suffix.lower() not in (".exr", ".png"):
             raise InputError(f"{out}: suffix: '{out.suffix}': no known image format; use .exr or .png")
+        if self.aov and out.suffix.lower() == ".png":
+            raise InputError(f"{out}: --aov: a PNG file has room for colour and alpha only; use .exr")
         if not out.parent.is_dir():
             raise InputError(
                 f"{out}: output: its folder does not exist; create it or choose a writable folder"

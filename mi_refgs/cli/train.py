@@ -105,5 +105,6 @@ class Train:
         if trainer.fit.decisions:
             data["terms"] = list(trainer.method.components)  # name of this key in version 0.1
             data["decisions"] = trainer.fit.decisions
-            text = f"{table(trainer.fit.decisions)}\n{text}"
+            if any(row["with_it"] for row in trainer.fit.decisions):  # a trial that measured a gain
+                text = f"{table(trainer.fit.decisions)}\n{text}"
         return Result(data, text)

@@ -155,7 +155,7 @@ def _unusual(found: Survey, train: Dataset) -> list[str]:
 
 
 def _across(view: View) -> float:
-    """Horizontal field of view in degrees, of the whole file: views that are downscaled leave out a border."""
+    """Horizontal field of view (degrees) of the whole file: downscaled views leave out a border."""
     width, fx = (view.width, view.fx) if view.file is None else (view.file.width, view.file.intrinsics[0])
     return float(2 * np.degrees(np.arctan(width / (2 * fx))))
 

@@ -211,10 +211,10 @@ class Protocol:
 DEPTH_SCALE = "depth Σ gt·pred / Σ pred², one for all views"
 PROTOCOLS = {
     "ours": Protocol(
-        scale="images none; albedo and environment map least squares per channel, one for all views",
-        relit_scale="none; where a row says so, least squares of displayed colours per channel, "
+        scale="images unscaled; albedo and environment map by least squares per channel, one for all views",
+        relit_scale="unscaled; where a row says so, least squares of displayed colours per channel, "
         "one for all images",
-        mask="none; normals and materials ground-truth alpha > ½",
+        mask="whole images; normals and materials where ground-truth alpha > ½",
         frame="over the background of the data",
     ),
     "stanford-orb": Protocol(

@@ -183,8 +183,8 @@ class Estimate:
     def sentence(self, iterations: int) -> str:
         """The estimate as one sentence."""
         return (
-            f"estimate: {minutes(self.seconds)} and {self.bytes / 1e9:.1f} GB for {iterations} iterations on "
-            f"{self.width} × {self.height} pixels with {dr.thread_count()} threads"
+            f"estimate: {minutes(self.seconds)} if nothing else runs, and {self.bytes / 1e9:.1f} GB, for "
+            f"{iterations} iterations on {self.width} × {self.height} pixels with {dr.thread_count()} threads"
         )
 
 

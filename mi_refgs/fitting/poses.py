@@ -110,4 +110,6 @@ def sentence(decision: Mapping[str, Any]) -> str:
     """A decision as one sentence."""
     verdict = "corrected" if decision["corrected"] else "not corrected"
     change = decision["psnr_registered"] - decision["psnr"]
-    return f"cameras: {verdict}; registered with half of the pixels, they change the others by {change:+.2f} dB"
+    return (
+        f"cameras: {verdict}; registered with half of the pixels, they change the others by {change:+.2f} dB"
+    )

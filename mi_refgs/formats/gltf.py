@@ -74,8 +74,8 @@ def _add_camera(tree: dict[str, Any], camera: Camera) -> None:
     right, down = float(camera.cx[0]) - camera.width / 2, float(camera.cy[0]) - camera.height / 2
     if max(abs(right), abs(down)) > CENTRED:
         warn(
-            "gltf-mesh: a glTF camera has its principal point at the centre of the image; this one's is "
-            f"{right:.1f} pixels to the right and {down:.1f} below, by which its image is shifted"
+            f"gltf-mesh: the camera's principal point is {right:.1f} pixels to the right of the centre and "
+            f"{down:.1f} below; a glTF camera has it at the centre, so its image is shifted by as much"
         )
     width, height = camera.width / abs(float(camera.fx[0])), camera.height / abs(float(camera.fy[0]))
     lens = {"aspectRatio": width / height, "yfov": 2 * float(np.arctan(height / 2)), "znear": 1e-3}

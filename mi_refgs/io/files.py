@@ -187,7 +187,7 @@ def require_file(path: Path) -> None:
         return
     if os.path.isdir(path):  # unlike Path.is_dir, False for an impossible name
         raise InputError(f"{path}: file: is a folder; name a file in it")
-    raise InputError(f"{path}: file: missing; restore it, or remove what refers to it")
+    raise InputError(f"{path}: file: missing; check the name, or restore it")
 
 
 def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:

@@ -43,7 +43,7 @@ from mi_refgs.runs.trained_scene import ARTEFACTS
 
 SHEET, RESULT = "sheet.png", "relight.json"
 SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
-SHEET_COLUMNS = 6  # frames of a turntable per row of its sheet
+SHEET_COLUMNS = 6  # most frames of a turntable per row of its sheet
 PREFIX = {"test": "r", "turntable": "t"}
 """First letter of image names by folder; test views have the names of a data set."""
 NO_TRUTH = "the data set has no test views under this light; make them with `refgs dataset --relight`"
@@ -136,7 +136,7 @@ def relight(
     result: dict[str, Any] = {
         "run": str(run.path),
         "output": str(output.path),
-        "light": str(light.path),
+        "light": str(requested.path),
         "rotate": light.rotate,
         "exposure": light.exposure,
         "pictures": images,  # name of this key in version 0.1
@@ -232,4 +232,6 @@ def _rows(
             for i in evenly_spread(len(ours), SHEET_VIEWS)
         ]
     frames = [(str(i), displayed_over(image, background)) for i, image in enumerate(ours)]
-    return [dict(frames[i : i + SHEET_COLUMNS]) for i in range(0, len(frames), SHEET_COLUMNS)]
+    lines = -(-len(frames) // SHEET_COLUMNS)
+    columns = -(-len(frames) // lines)  # rows of equal length: 8 frames are 4 and 4, not 6 and 2
+    return [dict(frames[i : i + columns]) for i in range(0, len(frames), columns)]

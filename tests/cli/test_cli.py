@@ -148,7 +148,7 @@ def test_large_images_are_downscaled_unless_set(
     run = tmp_path / "run"
     assert main([*train_command(data, run, method), "iterations=2"]) == 0
     out, err = capsys.readouterr()
-    assert "estimate: 12 s and 0.4 GB for 2 iterations on 10 × 10 pixels" in err
+    assert "estimate: 12 s if nothing else runs, and 0.4 GB, for 2 iterations on 10 × 10 pixels" in err
     assert " in all, estimate 12 s), " in out
     said = [line for line in err.splitlines() if "20 × 20 pixels are read as 10 × 10" in line]
     assert len(said) == 1 and "data.downscale=1" in said[0] and "--minutes M" in said[0]

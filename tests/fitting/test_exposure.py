@@ -174,7 +174,9 @@ def test_gains_are_switched_on_where_images_have_them(
     decide(trainer, DECIDED)
     decision, gains = trainer.fit.exposure, exposure.gains_of(trainer.fit.params)
     assert decision is not None and decision["gains"] and decision["iteration"] == DECIDED
-    assert decision["psnr_gain"] > decision["psnr"] + 10 and len(said) == 1 and "one gain per image" in said[0]
+    assert (
+        decision["psnr_gain"] > decision["psnr"] + 10 and len(said) == 1 and "one gain per image" in said[0]
+    )
     assert gains is not None
     np.testing.assert_allclose(np.log(gains), log - log.mean(axis=0), atol=5e-3)
     record = exposure.record(trainer.setup, trainer.fit)

@@ -325,7 +325,7 @@ def test_usd_camera_keeps_the_principal_point() -> None:
 def test_gltf_camera_warns_of_off_centre_principal_point(capsys: pytest.CaptureFixture[str]) -> None:
     for camera, said in ((off_centre(), True), (shots_around(trained_scene().surfels)[0].camera, False)):
         gltf._add_camera({"nodes": [], "scenes": [{"nodes": []}]}, camera)
-        assert ("8.5 pixels to the right and -7.0 below" in capsys.readouterr().err) is said
+        assert ("8.5 pixels to the right of the centre and -7.0 below" in capsys.readouterr().err) is said
 
 
 def test_usd_passes_its_own_validators(exported: Exported) -> None:
