@@ -231,6 +231,7 @@ def test_aovs_are_appended_to_those_of_the_scene(
     assert layers() == ["nn", "depth"]
     assert layers("albedo", "depth", "nn:normal", "albedo") == ["nn", "depth", "albedo"]
     refused(["render", str(scene), "-o", out, "--aov", "nn:depth"], "aovs", "'nn' occurs twice")
+    refused(["render", str(scene), "-o", "view.png", "--aov", "depth"], "view.png: --aov: a PNG file")
     scene.unlink()
 
 

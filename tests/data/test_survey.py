@@ -42,6 +42,18 @@ def test_survey_of_complete_data_set(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert {*printed} == {field.name for field in dataclasses.fields(Survey)}
 
 
+def test_survey_reports_the_lens_of_the_file(tmp_path: Path) -> None:
+    """Also if the images that it reads, downscaled by whole factors, leave out pixels at the border."""
+    data = write_data(tmp_path / "ball", truth=False)
+    width, height, focal = 127, 100, 150.0
+    camera = {"fl_x": focal, "fl_y": focal, "w": width, "h": height}
+    change_transforms(data, lambda content: content.update(camera))
+    for path in data.glob("t*/*.png"):
+        write_png(path, np.full((height, width, 4), 0.5))
+    angle = np.degrees(2 * np.arctan(width / (2 * focal)))
+    assert survey(data).field_of_view == pytest.approx((angle, angle))
+
+
 def test_survey_reports_missing_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_colmap(tmp_path)
     (data / "images/c.png").unlink()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.evaluation import images
+from mi_refgs.evaluation.images import material_colours
 from mi_refgs.shade.light.lobe_matrices import map_directions
 
 
@@ -34,6 +35,14 @@ def test_maps_are_drawn_with_z_at_the_top(world: tuple[int, int, int], row: int,
     assert drawn.shape == (64, 128, 3)
     bright = drawn[row] if column is None else drawn[row : row + 2, 2 * column : 2 * column + 2]
     assert bright.min() > 0.99 and drawn[row if column is None else 0].max() < 1 + 1e-6
+
+
+def test_metals_differ_from_what_is_beside_them() -> None:
+    """On white, a metal (metallic 1) would not be visible; a white albedo is over white, as images are."""
+    alpha = np.array([[1.0, 0.0]])
+    metal, beside = material_colours(np.ones((1, 2)), alpha)[0]
+    assert (metal == 1).all() and abs(metal - beside).max() > 0.1
+    np.testing.assert_allclose(material_colours(np.ones((1, 2, 3)), alpha), 1)
 
 
 def test_contact_sheet_accepts_rows_of_different_length() -> None:

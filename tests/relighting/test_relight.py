@@ -106,6 +106,7 @@ def test_mitsuba_renders_the_relit_scene_file_the_same(known: Path, dusk: dict[s
 
 def test_relit_files_have_the_encoding_of_a_data_set(known: Path, dusk: dict[str, Any]) -> None:
     out = known / "dusk"
+    assert Path(dusk["light"]) == known / "dusk.exr"
     assert json.loads((out / "relight.json").read_text()) == json.loads(json.dumps(dusk))
     for name in dusk["pictures"]:
         linear, displayed = read_exr_image((out / name).with_suffix(".exr")), read_png(out / name)
