@@ -171,7 +171,7 @@ def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path)
     for key, reason in (
         ("albedo_psnr", "defines no albedo"),
         ("surface_distance", "the run has no mesh"),
-        ("concave_share", "has no surface.ply"),
+        ("concave_share", "has no true surface"),
         ("normal_mae_deg", "no ground-truth normals"),
         ("normal_mae_deg_full", "no ground-truth normals"),
         ("env_scale", "no environment.exr"),

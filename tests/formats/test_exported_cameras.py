@@ -63,7 +63,7 @@ def llff(folder: Path, masks: bool = False) -> Path:
 
 PINHOLE = (110.0, 104.0, 50.3, 34.6)
 LAYOUTS: dict[str, dict[str, Callable[[Path], Path]]] = {
-    "Blender / NeRF": {
+    "Blender, NeRF, nerfstudio": {
         "blender": lambda folder: write_data(folder / "ball", truth=False),
         "exr": lambda folder: write_exr_data(folder / "ball"),
         "perspective": nerfstudio,

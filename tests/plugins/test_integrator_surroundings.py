@@ -105,7 +105,7 @@ def test_run_folder_contains_surroundings_and_background_until_removed(tmp_path:
 def test_lost_background_is_refused(name: str, tmp_path: Path) -> None:
     export(fitted(), tmp_path, camera())
     (tmp_path / name).unlink()
-    with pytest.raises(InputError, match=f"{name}: file: missing; check the name"):
+    with pytest.raises(InputError, match=f"{name}: file: missing; restore it"):
         TrainedScene.read(tmp_path)
 
 
