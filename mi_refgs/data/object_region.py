@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from mi_refgs.data.region import CAMERA_SHARE, Plane, Region
-from mi_refgs.data.view import View
+from mi_refgs.data.view import View, evenly_spread
 
 PLANE_REACH = 2.0  # distance from the centre, in radii, up to which points determine support planes
 PLANE_MARGIN = 0.04
@@ -51,6 +51,7 @@ LEAST_WITHIN = 0.5
 connects it to the scene."""
 FITTED_BALL = 1.1  # radius of the region over that of the smallest ball around a group on fitted surfaces
 BOX_MARGIN = 0.2  # distance of that group, in radii, from planes beside it: thin parts may be missing
+BALL_CENTRES = 100  # points of a group towards which centres of its ball are tried
 BALL_ROUNDS = 500  # rounds of the smallest enclosing ball: the radius is right to 1/√500 … 0.2 % in practice
 
 
@@ -167,6 +168,8 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
         return None
     centre, radius = enclosing_ball(group)
+    if FITTED_BALL * radius > CAMERA_SHARE * np.linalg.norm(origins - centre, axis=1).min():
+        centre, radius = _ball_beside_cameras(group, origins)
     region = _with_ball(region, centre, FITTED_BALL * radius, origins)
     axes = np.linalg.svd(group - group.mean(axis=0), full_matrices=False)[2]
     normals = np.concatenate([axes, -axes])
@@ -175,6 +178,21 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
         (float(a), float(b), float(c), float(d)) for (a, b, c), d in zip(normals, offsets, strict=True)
     )
     return replace(region, planes=(*region.planes, *box))
+
+
+def _ball_beside_cameras(group: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) inside of a group (N, 3) around which the ball that cameras allow contains most of it; and
+    the radius that would contain all.
+
+    An object that cameras approach, such as a head on a wall, does not fit into a ball around its middle.
+    """
+    middle = group.mean(axis=0)
+    outwards = group[evenly_spread(len(group), BALL_CENTRES)] - middle
+    centres = np.concatenate([middle + share * outwards for share in (0.0, 0.25, 0.5, 0.75)])
+    limits = CAMERA_SHARE * KDTree(origins).query(centres)[0]
+    away = np.linalg.norm(group[None] - centres[:, None], axis=-1)
+    best = int(np.argmax(np.mean(away <= limits[:, None], axis=1)))
+    return centres[best], float(away[best].max())
 
 
 def _with_ball(region: Region, centre: np.ndarray, radius: float, origins: np.ndarray) -> Region:

@@ -130,6 +130,27 @@ def test_surfaces_of_fit_enclose_object_alone(rng: np.random.Generator) -> None:
     assert fitted_region(region, origins, table(rng), seen) is None
 
 
+def test_object_that_cameras_approach_is_whole(rng: np.random.Generator) -> None:
+    """A long object on a wall: around its middle, cameras near its end leave room for a part of it only."""
+    wall = np.column_stack([np.zeros(2000), rng.uniform(-3, 3, (2000, 2))])
+    thing = box((0.1, -0.4, -0.4), (2.2, 0.4, 0.4), 3000, rng)
+    origins = np.array([[2.3, 0.5 * np.sin(t), 0.5 * np.cos(t)] for t in np.linspace(0, 6, 20)])
+    region = Region((1.0, 0, 0), 1.2, ((1.0, 0.0, 0.0, 0.05),))
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return np.ones(len(points))
+
+    found = fitted_region(region, origins, np.concatenate([wall, thing]), seen)
+    assert found is not None
+    nearest = np.linalg.norm(origins - np.array(found.centre), axis=1).min()
+    assert found.radius <= 0.8 * nearest + 1e-9
+    middle, _ = enclosing_ball(thing)
+    room = 0.8 * np.linalg.norm(origins - middle, axis=1).min()
+    around_middle = np.mean(np.linalg.norm(thing - middle, axis=1) <= room)
+    assert np.mean(found.contains(thing)) > around_middle + 0.05
+    assert 0.1 < found.centre[0] < middle[0]
+
+
 def test_enclosing_ball_is_smallest(rng: np.random.Generator) -> None:
     offset = rng.normal(size=(3000, 3))
     points = offset / np.linalg.norm(offset, axis=1, keepdims=True) * 2 + [1, 2, 3]
