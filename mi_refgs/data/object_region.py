@@ -16,6 +16,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from mi_refgs.data.region import CAMERA_SHARE, Plane, Region
 from mi_refgs.data.view import View, evenly_spread
@@ -52,6 +53,7 @@ connects it to the scene."""
 FITTED_BALL = 1.1  # radius of the region over that of the smallest ball around a group on fitted surfaces
 BOX_MARGIN = 0.2  # distance of that group, in radii, from planes beside it: thin parts may be missing
 BALL_CENTRES = 100  # points of a group towards which centres of its ball are tried
+BALL_SHARES = (0.0, 0.25, 0.5, 0.75)  # fractions of the way from its middle to them, where they are
 BALL_ROUNDS = 500  # rounds of the smallest enclosing ball: the radius is right to 1/√500 … 0.2 % in practice
 
 
@@ -168,7 +170,7 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
         return None
     centre, radius = enclosing_ball(group)
-    if FITTED_BALL * radius > CAMERA_SHARE * np.linalg.norm(origins - centre, axis=1).min():
+    if FITTED_BALL * radius > _room(centre, origins):
         centre, radius = _ball_beside_cameras(group, origins)
     region = _with_ball(region, centre, FITTED_BALL * radius, origins)
     axes = np.linalg.svd(group - group.mean(axis=0), full_matrices=False)[2]
@@ -188,18 +190,21 @@ def _ball_beside_cameras(group: np.ndarray, origins: np.ndarray) -> tuple[np.nda
     """
     middle = group.mean(axis=0)
     outwards = group[evenly_spread(len(group), BALL_CENTRES)] - middle
-    centres = np.concatenate([middle + share * outwards for share in (0.0, 0.25, 0.5, 0.75)])
-    limits = CAMERA_SHARE * KDTree(origins).query(centres)[0]
-    away = np.linalg.norm(group[None] - centres[:, None], axis=-1)
-    best = int(np.argmax(np.mean(away <= limits[:, None], axis=1)))
+    centres = np.concatenate([middle + share * outwards for share in BALL_SHARES])
+    away = cdist(centres, group)
+    best = int(np.argmax(np.mean(away <= _room(centres, origins)[:, None], axis=1)))
     return centres[best], float(away[best].max())
 
 
 def _with_ball(region: Region, centre: np.ndarray, radius: float, origins: np.ndarray) -> Region:
     """The region with another sphere, which is smaller if a camera is near."""
-    nearest = float(np.linalg.norm(origins - centre, axis=1).min())
     x, y, z = map(float, centre)
-    return replace(region, centre=(x, y, z), radius=min(radius, CAMERA_SHARE * nearest))
+    return replace(region, centre=(x, y, z), radius=min(radius, float(_room(centre, origins))))
+
+
+def _room(centres: np.ndarray, origins: np.ndarray) -> np.ndarray:
+    """Largest radius (...) of a region around centres (..., 3), with the cameras (V, 3) outside."""
+    return np.asarray(CAMERA_SHARE * np.linalg.norm(origins - centres[..., None, :], axis=-1).min(axis=-1))
 
 
 def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatter) -> np.ndarray:
