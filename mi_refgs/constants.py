@@ -71,10 +71,6 @@ GAUSSIAN_SLOPE_MARGIN = 0.15
 linearised at the margin's border instead of at the centre: far outside the view, the affine approximation
 would cover the whole image. [3DGS, released code: 1.3 tan(fov/2)]"""
 
-PRUNE_LIMIT = 50.0
-"""PSNR in dB of a pruned image against the whole one, at least: a root mean square error of 0.8 of a step of
-an 8-bit image. The default of `refgs export --limit`."""
-
 TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
 """Rows of (limit of the focal length, (tile width, tile height)), all in pixels: a camera has the tiles of
 the first row whose limit is above its focal length. The pixels of a tile share a list of surfels and its

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -38,10 +38,6 @@ Cameras = Annotated[Path | None, optional("FILE.json")]
 Samples = Annotated[
     int,
     arg(metavar="N", help="samples per pixel, box filter: 4 are 2 × 2; 1 is the pixel centre, as in a fit"),
-]
-Protocol = Annotated[
-    Literal["ours", "stanford-orb", "tensoir"],
-    arg(help="score also as a benchmark does, with its scale, mask and measures"),
 ]
 Settings = Annotated[
     UseAppendAction[tuple[tuple[str, ...], ...]],

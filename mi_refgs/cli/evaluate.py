@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mi_refgs.cli.command import OtherData, Protocol, Rendering, Result, RunFolder, Samples
-from mi_refgs.evaluation.scores import PIXEL_CLASSES, PROTOCOL_SCORES, SCORES, Score
+from mi_refgs.cli.command import OtherData, Rendering, Result, RunFolder, Samples
+from mi_refgs.evaluation.scores import PIXEL_CLASSES, SCORES, Score, caption_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +21,6 @@ class Eval:
     run_folder: RunFolder
     data: OtherData = None
     samples: Samples = 1
-    protocol: Protocol = "ours"
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -30,32 +29,16 @@ class Eval:
         from mi_refgs.runs.run import Run
 
         folder = Run(self.run_folder)
-        result = evaluate(folder, self.data, progress=True, samples=self.samples, protocol=self.protocol)
+        result = evaluate(folder, self.data, progress=True, samples=self.samples)
         return Result(result, f"{table(result)}\nsheets: {self.run_folder / SHEET}, {DECOMPOSITION}")
 
 
 def table(result: dict[str, Any]) -> str:
     """Return the numbers of metrics.json as text."""
-    lines = [*caption(result, "ours"), *rows(SCORES, result)]
+    lines = [*caption_lines(result["caption"]), *rows(SCORES, result)]
     if result["error_budget"]:
         lines += budget_table(result["error_budget"])
-    return "\n".join([*lines, *benchmark_tables(result)])
-
-
-def caption(result: dict[str, Any], name: str) -> list[str]:
-    """Return the lines of the caption of a table; none for metrics.json of an earlier version."""
-    about = result.get("protocols", {}).get(name, {})
-    return [f"{key + ':':<7}{about[key]}" for key in ("scale", "mask", "frame") if key in about]
-
-
-def benchmark_tables(result: dict[str, Any]) -> list[str]:
-    """Return the tables of benchmarks in metrics.json or relight.json, each after its caption, as lines."""
-    lines = []
-    for name, found in result.get("protocols", {}).items():
-        if name != "ours":
-            lines += ["", f"protocol {name}", *caption(result, name)]
-            lines += rows([score for score in PROTOCOL_SCORES if score.key in found], result | found)
-    return lines
+    return "\n".join(lines)
 
 
 def rows(scores: Sequence[Score], result: dict[str, Any]) -> list[str]:

@@ -19,7 +19,6 @@ from mi_refgs.cli.command import (
     optional,
     separated,
 )
-from mi_refgs.constants import PRUNE_LIMIT
 from mi_refgs.errors import InputError, SceneError
 from mi_refgs.progress import say
 
@@ -42,10 +41,6 @@ class Export:
     data: OtherData = None
     overwrite: Flag = False
     """replace files in the output folder that are not this export of RUN, but never those of a run"""
-    prune: Flag = False
-    """leave out surfels that the training views do not need; export again without it to restore them"""
-    limit: Annotated[float | None, optional("DB", f"(default: {PRUNE_LIMIT:g})")] = None
-    """with --prune: least PSNR of each image of the pruned compared with the whole scene"""
     format: Any = None
     common: Rendering = Rendering()
 
@@ -56,13 +51,10 @@ class Export:
         from mi_refgs.runs.export import export, newest
         from mi_refgs.runs.run import Run
         from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
-        from mi_refgs.runs.views import views_of_run
 
         # Refuse options that do not belong together.
         names = separated(self.to)
         options = {name: value for name, value in vars(self.format).items() if value not in (None, False)}
-        if self.limit is not None and not self.prune:
-            raise InputError("--limit: limits what --prune drops; add --prune, or leave it out")
         if options and not names:
             raise InputError(
                 f"--{next(iter(options)).replace('_', '-')}: belongs to a format; name it with --to"
@@ -84,19 +76,6 @@ class Export:
         if not names:
             output.require_free(ARTEFACTS)
 
-        report: dict[str, Any] = {}
-        if self.prune:
-            from mi_refgs.evaluation.prune import prune
-
-            if state is None and target.resolve() == folder.path.resolve():
-                raise InputError(
-                    f"{folder.path}: checkpoints: none, from which the whole scene could be restored; write "
-                    "the pruned one to another folder with -o"
-                )
-            training, views = (views_of_run(folder, method, split, self.data) for split in ("train", "test"))
-            limit = PRUNE_LIMIT if self.limit is None else self.limit
-            fitted, report = prune(fitted, training, views, limit, say)
-
         if names:
             say(f"{target}: writing {', '.join(names)}")
             try:
@@ -107,9 +86,7 @@ class Export:
         else:
             files = [str(path) for path in export(fitted, target, shots[0].camera, output=output)]
         data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
-        if not self.prune:
-            return Result(data, "\n".join(_listed(files)))
-        return Result(data | {"pruned": report}, "\n".join([*_listed(files), table(report)]))
+        return Result(data, "\n".join(_listed(files)))
 
 
 def _listed(files: Sequence[str]) -> list[str]:
@@ -166,26 +143,3 @@ def _output(run: Run, target: Path, overwrite: bool) -> OutputFolder:
         raise InputError(f"{target}: output: contains a run, which is never overwritten; choose another -o")
     remedy = "choose another -o, or replace it with --overwrite"
     return OutputFolder(target, f"export of {run.path.resolve()}", remedy=remedy, overwrite=overwrite)
-
-
-def table(report: dict[str, Any]) -> str:
-    """Return the report of `evaluation.prune` as text."""
-    before, after = report["before"], report["after"]
-    lines = [
-        f"{'surfels':<22}{before['surfels']} -> {after['surfels']}",
-        f"{'surfels.ply':<22}{before['ply_bytes'] / 1e6:.2f} -> {after['ply_bytes'] / 1e6:.2f} MB",
-    ]
-    for name, columns in before["channels"].items():
-        left = after["channels"].get(name, 0)
-        if left != columns:
-            lines.append(f"{name:<22}{columns} -> {left} columns")
-    lines += [f"{name:<22}dropped" for name in ("light", "mesh") if before[name] and not after[name]]
-    for split in ("train", "test"):
-        if split in report:
-            scores = report[split]
-            lines.append(
-                f"{f'{split} views':<22}worst {scores['worst']:.1f} dB, mean {scores['mean']:.1f} dB "
-                f"({scores['views']}), compared with the whole scene"
-            )
-    lines.append(f"{'frame':<22}{before['ms_per_frame']:.1f} -> {after['ms_per_frame']:.1f} ms")
-    return "\n".join(lines)

@@ -12,13 +12,12 @@ from mi_refgs.cli.command import (
     Flag,
     OptionalOutput,
     OtherData,
-    Protocol,
     Rendering,
     Result,
     RunFolder,
     Samples,
 )
-from mi_refgs.cli.evaluate import benchmark_tables, caption
+from mi_refgs.evaluation.scores import caption_lines
 from mi_refgs.progress import warn
 
 
@@ -45,7 +44,6 @@ class Relight:
     """render N views around the object instead of the test views"""
     data: OtherData = None
     samples: Samples = 1
-    protocol: Protocol = "ours"
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -61,7 +59,6 @@ class Relight:
             turntable=self.turntable,
             data=self.data,
             samples=self.samples,
-            protocol=self.protocol,
             progress=True,
         )
         if relit.warning:
@@ -72,9 +69,8 @@ class Relight:
             lines.append(f"score: none: {result['score_reason']}")
         else:
             factors = ", ".join(f"{x:.3f}" for x in result["scale"])
-            lines += caption(result, "ours")
+            lines += caption_lines(result["caption"])
             lines.append(f"PSNR                            {result['psnr']:.2f} dB")
             scaled = f"PSNR after per-channel scaling  {result['psnr_scaled']:.2f} dB"
             lines.append(f"{scaled}  (relit image × {factors})")
-            lines += benchmark_tables(result)
         return Result(result, "\n".join(lines))

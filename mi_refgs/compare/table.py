@@ -12,8 +12,7 @@ from typing import Any
 from mi_refgs.compare.jobs import FAILED, Job, finished, jobs_in, require_one_size, settings_of
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
-from mi_refgs.evaluation.protocols import PROTOCOLS
-from mi_refgs.evaluation.scores import SCORES, Score
+from mi_refgs.evaluation.scores import SCORES, Score, caption
 from mi_refgs.io.files import read_json
 
 NOTHING = "–"
@@ -183,8 +182,8 @@ def heading(scene: Scene) -> str:
 
 def remarks(scene: Scene) -> list[str]:
     """Return the caption, failures, and reasons of missing numbers, of a scene."""
-    caption = PROTOCOLS["ours"].caption(scene.image_size, relit=False) if scene.image_size else {}
-    said = ["; ".join(f"{key}: {text}" for key, text in caption.items()) + "."] if caption else []
+    about = caption(scene.image_size) if scene.image_size else {}
+    said = ["; ".join(f"{key}: {text}" for key, text in about.items()) + "."] if about else []
     for row in scene.rows:
         said += [f"{row.variant}, seed {seed}: failed: {why}." for seed, why in row.failed.items()]
         said += [f"{row.variant}, seed {seed}: not finished." for seed in row.unfinished]

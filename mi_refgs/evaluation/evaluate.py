@@ -7,7 +7,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import decomposition, metrics
 from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
-from mi_refgs.evaluation.protocols import Maps, Measures, ProtocolScores, captions, measures_of
-from mi_refgs.evaluation.scores import MAP_SCORES
-from mi_refgs.evaluation.surface import TrueSurface, sample, surface_scores
+from mi_refgs.evaluation.scores import caption
+from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, displayed_of, image_of, with_gain
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
@@ -42,7 +41,6 @@ DECOMPOSITION = "decomposition.png"
 METRICS = "metrics.json"
 LONGEST_STEM = 60  # characters of the view's name in an image's file name; file systems allow 255 bytes
 SHEET_VIEWS = 4  # rows of either sheet, spread evenly over the test views
-CHAMFER_POINTS = 30_000  # on each surface, as Stanford-ORB samples
 MEANS = """psnr psnr_gain psnr_registered ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
     normal_mae_deg_full""".split()  # scores of views whose means are reported
 
@@ -52,14 +50,13 @@ def evaluate(
     data: Path | None = None,
     progress: bool = False,
     samples: int = 1,
-    protocol: str = "ours",
 ) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
     Every key of the upper level is always present. Where a score does not apply it is null, and `NAME_reason`
-    says why; `exposure`, `cameras` and `pruned` are null if nothing was decided or pruned. An entry of
-    `views` has only the scores of that view.
+    says why; `exposure` and `cameras` are null if nothing was decided. An entry of `views` has only the
+    scores of that view.
 
     `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
     `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
@@ -75,19 +72,16 @@ def evaluate(
                                    pixels of the file; scores of different sizes are not comparable
     `ms_per_frame`                 median over single synchronised frames of the displayed image without AOVs,
                                    with the environment map prefiltered beforehand
-    `pruned`                       null for a scene that was not pruned
-    `protocols`                    scale, mask and frame of these numbers (`ours`), and the same with the
-                                   numbers of a benchmark if `protocol` names one (`evaluation.protocols`)
+    `caption`                      scale, mask and frame of these numbers
 
     Renders have `samples` per pixel, box filtered (`render.samples`).
 
     Raises InputError for a folder that is no run or contains neither a scene nor a checkpoint, for data
-    that is gone, for a foreign file in the run that has the name of a result, and as `measures_of` does.
+    that is gone, and for a foreign file in the run that has the name of a result.
     """
     # The scene, its test views, and the files to write.
     method = run.method()
     views = views_of_run(run, method, "test", data)
-    measures = measures_of(protocol, views)
     renders = render_names(views.views)
     outputs = [*renders, SHEET, DECOMPOSITION, METRICS]
     run.output.require_free(outputs)
@@ -98,7 +92,7 @@ def evaluate(
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
     files = [run.path / name for name in renders]
-    measured = _measure(fitted, views, surface, samples, files, progress, measures)
+    measured = _measure(fitted, views, surface, samples, files, progress)
     cameras_decided = _decision(run, CAMERAS, "to_world")
     if cameras_decided is not None and cameras_decided.get("corrected"):
         _register(measured.per_view, fitted, views, samples, progress)
@@ -112,15 +106,15 @@ def evaluate(
         | measured.budget.result()
         | surface_scores(fitted.mesh, surface, views.views)
     )
-    result |= _protocols(protocol, measured.benchmark, fitted, surface, views)
     cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
+    size = [views.views[0].width, views.views[0].height]
     result |= {
+        "caption": caption(size),
         "exposure": _decision(run, EXPOSURE_FILE, "gain"),
         "cameras": cameras_decided,
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
-        "pruned": None if fitted.pruned is None else asdict(fitted.pruned),
         "samples": per_pixel,
         "antialias": fitted.shading.antialias,
         "ms_per_frame": metrics.frame_milliseconds([timed], cameras, views)[0],
@@ -129,7 +123,7 @@ def evaluate(
         "preset": method.preset,
         "dataset": str(views.path),
         "test_views": len(measured.per_view),
-        "image_size": [views.views[0].width, views.views[0].height],
+        "image_size": size,
         "downscale": method.data.downscale or 1,
         "machine": machine(),
         "views": [
@@ -153,7 +147,6 @@ class Measured:
     per_view: list[dict[str, Any]] = field(default_factory=list)
     errors: decomposition.Decomposition = field(default_factory=decomposition.Decomposition)
     budget: ErrorBudget = field(default_factory=ErrorBudget)
-    benchmark: ProtocolScores | None = None
     panels: list[dict[str, np.ndarray]] = field(default_factory=list)  # rows of SHEET
     materials: list[decomposition.MeasuredView] = field(default_factory=list)  # rows of DECOMPOSITION
 
@@ -165,7 +158,6 @@ def _measure(
     samples: int,
     images: Sequence[Path],  # one per view
     progress: bool,
-    measures: Measures | None,  # of a benchmark
 ) -> Measured:
     """Render and measure the test views one by one, and write their images."""
     render = fitted.renderer(samples=samples)
@@ -174,7 +166,7 @@ def _measure(
         object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     material_maps = decomposition.material_maps(fitted, samples)
     in_sheets = evenly_spread(len(views.views), SHEET_VIEWS)
-    measured = Measured(benchmark=None if measures is None else ProtocolScores(measures))
+    measured = Measured()
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
@@ -192,9 +184,6 @@ def _measure(
         )
         measured.errors.add(materials)
         measured.budget.add(rendered, view, classify(view, surface))
-        if measured.benchmark is not None:
-            ours = Maps.rendered(frame, rendered.normal, materials.maps.get("albedo"))
-            measured.benchmark.add(ours, Maps.true(view, views.background))
 
         # Images.
         write_png(images[index], rendered.image)
@@ -222,24 +211,6 @@ def _register(
     for scores, view in rows:
         moved = registered(view, shown, views.scene_extent)
         scores["psnr_registered"] = metrics.psnr(shown(moved), moved.displayed)
-
-
-def _protocols(
-    name: str,
-    benchmark: ProtocolScores | None,
-    fitted: TrainedScene,
-    surface: TrueSurface | None,
-    views: Dataset,
-) -> dict[str, Any]:
-    """Return `protocols`, and why depth is missing."""
-    found = captions(name, [views.views[0].width, views.views[0].height])
-    known = any(view.depth is not None for view in views.views)
-    if benchmark is not None:
-        found[name] |= dict.fromkeys(score.key for score in MAP_SCORES) | benchmark.result()
-        if surface is not None and fitted.mesh is not None and len(fitted.mesh.faces):
-            points = (sample(mesh, CHAMFER_POINTS)[0] for mesh in (fitted.mesh, surface.mesh))
-            found[name]["chamfer"] = metrics.squared_chamfer(*points)
-    return {"protocols": found, "depth_reason": None if known else "the data set has no ground-truth depth"}
 
 
 def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Metrics of images, normals, shapes and fitted environment maps, in NumPy; and the time of a frame.
+"""Metrics of images, normals and fitted environment maps, in NumPy; and the time of a frame.
 
 Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the
 mean over its images. Normals are (H, W, 3) world vectors. Environment maps are (h, w, 3) linear lat-long
@@ -15,7 +15,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 from scipy.ndimage import correlate1d
-from scipy.spatial import cKDTree
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
@@ -50,18 +49,15 @@ def ssim(
     image: np.ndarray,  # (H, W, 3)
     truth: np.ndarray,  # (H, W, 3)
     where: Any = ...,
-    radius: int = WINDOW_RADIUS,
-    border: str = "constant",
 ) -> float:
     """Compute the structural similarity that the loss uses (`fitting.ssim`); `where` as in `psnr`.
 
-    The Gaussian window has 2 radius + 1 pixels on a side. Outside of the image it reads zeros, as in 3DGS and
-    Ref-Gaussian, or with the border "mirror" the mirrored image; means are over every pixel.
+    Outside of the image the window reads zeros, as in 3DGS and Ref-Gaussian; means are over every pixel.
     """
-    weights = window(radius)
+    weights = window(WINDOW_RADIUS)
 
     def blur(values: np.ndarray) -> np.ndarray:
-        return correlate1d(correlate1d(values, weights, 0, mode=border), weights, 1, mode=border)
+        return correlate1d(correlate1d(values, weights, 0, mode="constant"), weights, 1, mode="constant")
 
     x, y = _pair(image, truth)
     μx, μy = blur(x), blur(y)
@@ -70,15 +66,12 @@ def ssim(
     return float(similar[where].mean())
 
 
-def lpips(image: np.ndarray, truth: np.ndarray, network: str = "alex") -> tuple[float | None, str]:
-    """Return (LPIPS, ""), or (None, reason) without the extra `lpips` or its weights.
-
-    The network is "alex" or "vgg".
-    """
+def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
+    """Return (LPIPS, ""), or (None, reason) without the extra `lpips` or its weights."""
     try:
         import torch
 
-        measure = _lpips_network(network)
+        measure = _lpips_network()
         with torch.no_grad():
             planes = [array.transpose(2, 0, 1)[None] for array in _pair(image, truth)]
             tensors = [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)) * 2 - 1 for p in planes]
@@ -89,12 +82,12 @@ def lpips(image: np.ndarray, truth: np.ndarray, network: str = "alex") -> tuple[
         return None, f"cannot run: {error}"
 
 
-@functools.lru_cache(maxsize=2)
-def _lpips_network(name: str) -> Any:
+@functools.cache
+def _lpips_network() -> Any:
     import lpips as package
 
     # The authors recommend "alex" for comparing images ("forward" scores).
-    return package.LPIPS(net=name, verbose=False).eval()
+    return package.LPIPS(net="alex", verbose=False).eval()
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
@@ -148,36 +141,6 @@ def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
     cosine = np.sum(normal * truth, axis=-1)
     sine = np.linalg.norm(np.cross(normal, truth), axis=-1)
     return np.where((cosine == 0) & (sine == 0), 90.0, np.degrees(np.arctan2(sine, cosine)))
-
-
-# ---------------- shape ----------------
-
-
-def depth_si_mse(
-    depths: Sequence[np.ndarray],  # (P,) inside of the mask of each view
-    truth: Sequence[np.ndarray],  # (P,)
-    sizes: Sequence[int],  # pixels of each frame
-) -> float:
-    """Compute the scale-invariant squared error of depths along the viewing axis, in scene units², times 10³.
-
-    One scale Σ gt·pred / Σ pred² for all views; the error of a view is its sum inside of the mask over the
-    pixels of the frame, and the result the mean over views. [Stanford-ORB, Kuang et al. 2023]
-    """
-    ours, true = (np.concatenate(parts).astype(np.float64) for parts in (depths, truth))
-    scale = np.sum(ours * true) / max(np.sum(ours**2), 1e-30)
-    errors = (np.sum((scale * a.astype(np.float64) - b) ** 2) for a, b in zip(depths, truth, strict=True))
-    return 1e3 * float(np.mean([error / size for error, size in zip(errors, sizes, strict=True)]))
-
-
-def squared_chamfer(points: np.ndarray, truth: np.ndarray) -> float:
-    """Compute the squared Chamfer distance of points (P, 3) and (Q, 3), in scene units², times 10³.
-
-    It is the sum of the mean squared distances to the nearest point in both directions, as in the tables of
-    Stanford-ORB: 2 · 10³ times the mean of the two that its program computes. That program compares points on
-    the mesh with the vertices of the scan.
-    """
-    both = (points, truth), (truth, points)
-    return 1e3 * sum(float(np.mean(cKDTree(a).query(b)[0] ** 2)) for a, b in both)
 
 
 # ---------------- light ----------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 
@@ -41,29 +42,10 @@ SCORES = (
     Score("concave_share", "concave pixels", "{:.1%}", " of the foreground", "concave"),
     Score("train_seconds", "training", "{:.0f}", " s", compared=True, higher=False),
     Score("surfels", "surfels", "{:.0f}", compared=True),
-    Score("pruned", "pruned", "from {0[surfels]} surfels, training views within {0[psnr]:.1f}", " dB"),
     Score("iterations", "iterations", "{}"),
     Score("samples", "samples per pixel", "{}"),
     Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True, higher=False),
 )
-
-MAP_SCORES = (
-    Score("normal_cosine", "normal error, 1 − cos", "{:.4f}", "", "normal"),
-    Score("normal_deg", "normal error", "{:.2f}", "°", "normal"),
-    Score("depth_si_mse", "depth, SI-MSE × 10³", "{:.4f}", " units²", "depth"),
-    Score("chamfer", "Chamfer, squared × 10³", "{:.4f}", " units²", "surface"),
-    Score("albedo_psnr", "albedo, PSNR after scale", "{:.2f}", " dB", "albedo"),
-)
-"""Numbers of a benchmark that `refgs eval` prints where ground truth is known, units of the scene."""
-PROTOCOL_SCORES = (
-    Score("psnr", "PSNR", "{:.2f}", " dB"),
-    Score("psnr_h", "PSNR-H", "{:.2f}", " dB", "psnr_h"),
-    Score("psnr_l", "PSNR-L", "{:.2f}", " dB"),
-    Score("ssim", "SSIM", "{:.4f}"),
-    Score("lpips", "LPIPS", "{:.4f}", "", "lpips"),
-    *MAP_SCORES,
-)
-"""Numbers of a benchmark, `protocols` of metrics.json and relight.json."""
 
 PIXEL_CLASSES = {
     "silhouette": "silhouette, within 2 px",
@@ -74,3 +56,19 @@ PIXEL_CLASSES = {
     "background": "background",
 }
 """Classes of pixels in `error_budget`: key in metrics.json → name in the table of `refgs eval`."""
+
+
+def caption(size: Sequence[int], relit: bool = False) -> dict[str, str]:
+    """Return `scale`, `mask` and `frame` of a table of images with this width and height."""
+    scale = "images unscaled; albedo and environment map by least squares per channel, one for all views"
+    mask = "whole images; normals and materials where ground-truth alpha > ½"
+    if relit:
+        scale = "unscaled, and by least squares of displayed colours per channel, one for all images"
+        mask = "whole images"
+    frame = f"whole image of {size[0]} × {size[1]} pixels, over the background of the data"
+    return {"scale": scale, "mask": mask, "frame": frame}
+
+
+def caption_lines(found: Mapping[str, str]) -> list[str]:
+    """Return a caption as lines of text."""
+    return [f"{key + ':':<7}{text}" for key, text in found.items()]

@@ -13,7 +13,6 @@ _OBJECT = Option(
 _DEGREE = Option("degree", 3, "SH degree of the colours of exported Gaussians, 0 to 3")
 _FACES = Option("faces", 50_000, "maximum number of triangles of an exported mesh")
 _TEXTURE = Option("texture", 1024, "texels along each side of its textures")
-_WHERE = Option("where", "", "surfels of the masked object, an expression as in `refgs edit --where`")
 _VIEW = Option("view", 0, "the view of an EXR file, by number; test views come first")
 _SAMPLES = Option("samples", 4, "samples per pixel of an EXR file, box filtered: 4 are 2 × 2")
 
@@ -36,15 +35,7 @@ for _format in (
         "",
         Writer("mitsuba_scene"),
     ),
-    _mesh("usd", "USD: a mesh with a UsdPreviewSurface, its textures, a dome light", ".usdz", Writer("usd")),
     Format("cameras", "transforms.json and COLMAP's text files of the cameras", "", Writer("cameras")),
-    Format(
-        "masks",
-        "masks of the object in all images, for the data set's folder",
-        "",
-        Writer("masks"),
-        (_WHERE,),
-    ),
     Format("exr", "one view with all its layers", ".exr", Writer("exr_layers"), (_VIEW, _SAMPLES, _OBJECT)),
 ):
     FORMATS.register(_format)

@@ -264,7 +264,6 @@ class Reconstruction:
         data: str | Path | None = None,
         *,
         samples: int = 1,
-        protocol: str = "ours",
         progress: bool = False,
     ) -> dict[str, Any]:
         """Measure the run on its test views, or on those of `data`, as `refgs eval` does.
@@ -274,7 +273,7 @@ class Reconstruction:
         if self.folder is None:
             raise InputError("evaluate: folder: only in memory; measure what save(folder) returns")
         data = None if data is None else Path(data)
-        return evaluation.evaluate(Run(self.folder), data, progress, samples, protocol)
+        return evaluation.evaluate(Run(self.folder), data, progress, samples)
 
 
 def load(run: str | Path, *, write: bool = True) -> Reconstruction:

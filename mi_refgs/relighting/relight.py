@@ -24,7 +24,7 @@ from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import contact_sheet, displayed_over, image_array, light_image
-from mi_refgs.evaluation.protocols import captions, measures_of, relit_scores
+from mi_refgs.evaluation.scores import caption
 from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
@@ -67,7 +67,6 @@ def relight(
     turntable: int = 0,
     data: Path | None = None,
     samples: int = 1,
-    protocol: str = "ours",
     progress: bool = False,
 ) -> Relit:
     """Render the scene of a run under another light into a folder.
@@ -79,12 +78,10 @@ def relight(
     the mesh's shadows and bounces; reflections are traced. The views are the test views of the run's data
     set, or of `data`; with `turntable`, so many cameras on a circle around the object instead. Without a data
     set both are around the object (`Provenance.shots`). If the data set has ground truth under this light
-    (`truth_under`), the test views are compared with it, also by a benchmark's `protocol`, a name in
-    `evaluation.protocols.PROTOCOLS`; the scores are `protocols` of relight.json.
+    (`truth_under`), the test views are compared with it.
 
     Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
-    folder that cannot be written or contains a run, images of another light, or foreign files of these names;
-    and as `measures_of` does.
+    folder that cannot be written or contains a run, images of another light, or foreign files of these names.
     """
     if turntable < 0:
         raise InputError(f"--turntable: {turntable} is out of range; give a number of views from 1")
@@ -95,7 +92,6 @@ def relight(
     requested, true_views = light, None
     if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
         true_views, light = _true_views(provenance.method, known[0], views), known[1]
-    measures = measures_of(protocol, true_views)
 
     # The scene under the new light.
     fitted = write_if_stale(run, provenance.method, provenance.first_camera)
@@ -146,9 +142,7 @@ def relight(
     if true_views is not None and views is not None:
         truth = _truth(true_views, light.exposure)
         result |= score([view.name for view in views.views], ours, truth, background) | {"score_reason": None}
-        result["protocols"] = captions(protocol, truth[0].shape[1::-1], relit=True)
-        if measures is not None:
-            result["protocols"][protocol] |= relit_scores(measures, ours, truth)
+        result["caption"] = caption(truth[0].shape[1::-1], relit=True)
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
     radiance = new_light.radiance().numpy()
     sheet = _beside(kind, SHEET)

@@ -35,13 +35,11 @@ class SceneFiles:
     near_field: str | None = None  # distances of what the envmap shows
 
 
-def write_scene_xml(
-    path: str | Path, files: SceneFiles, shading: Shading, cameras: Sequence[Camera], remark: str = ""
-) -> None:
+def write_scene_xml(path: str | Path, files: SceneFiles, shading: Shading, cameras: Sequence[Camera]) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and a sensor per camera, atomically.
 
     The scene has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in
-    training. remark: a comment in the file, if not empty.
+    training.
 
     Mitsuba's `perspective` sensor has square pixels. Where those of the camera are not (fx ≠ fy), the film
     has more of them along one axis, and a comment says so: the same view, to half a pixel at that border.
@@ -53,8 +51,6 @@ def write_scene_xml(
         raise InputError(f"{path}: mesh: there is none to trace; give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
-    if remark:
-        scene.append(ElementTree.Comment(f" {remark} "))
     put(scene, "default", "spp", "1")
     integrator = ElementTree.SubElement(scene, "integrator", type="refgs", id="refgs")
     put(integrator, "string", "filename", files.ply)

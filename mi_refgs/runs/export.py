@@ -86,13 +86,11 @@ def export(
         # scene file cannot express. Without a background map it is black, as in `render`.
         black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
         files = SceneFiles(SURFELS, light, mesh, around, behind or black, near)
-        remark = "" if fitted.pruned is None else f"pruned: had {fitted.pruned.surfels} surfels"
-        write_scene_xml(folder / SCENE, files, fitted.shading, [camera, *more], remark)
+        write_scene_xml(folder / SCENE, files, fitted.shading, [camera, *more])
         # Written last: if it is there, the other files are complete.
         note = {"iteration": fitted.iteration, "seconds": fitted.seconds, "surfels": fitted.surfels.count}
-        pruned = {} if fitted.pruned is None else {"pruned": asdict(fitted.pruned)}
-        more_notes = {"files": written, "shading": asdict(fitted.shading)}
-        write_json(folder / MODEL, note | pruned | more_notes, indent=2)
+        about = {"files": written, "shading": asdict(fitted.shading)}
+        write_json(folder / MODEL, note | about, indent=2)
     return [folder / name for name in written]
 
 

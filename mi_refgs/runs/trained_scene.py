@@ -41,19 +41,6 @@ def _remedy(folder: Path) -> str:
     return f"restore it, or write it again with `refgs export {folder}` if the run has checkpoints"
 
 
-@dataclass(frozen=True)
-class Pruned:
-    """Record of a pruned scene: how close its images are to those of the whole fit."""
-
-    surfels: int  # of the whole fit
-    limit: float  # PSNR, dB, that every training view had to reach
-    psnr: float  # dB, of the worst training view
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.limit) and math.isfinite(self.psnr)):
-            raise ValueError("pruned: a number is not finite")
-
-
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
     """A fitted scene: all that rendering requires, and nothing that only training requires."""
@@ -64,7 +51,6 @@ class TrainedScene:
     shading: Shading
     iteration: int
     seconds: float  # spent training
-    pruned: Pruned | None = None  # absent: the whole fit
     surroundings: Surroundings | None = None  # background Gaussians and map, of images without alpha
     near: NearField | None = None  # distances of what the light shows; None: infinitely far
 
@@ -102,9 +88,6 @@ class TrainedScene:
                 attribute(name)  # is registered
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
             files = {*content.get("files", ())}  # earlier versions did not write it
-            pruned = content.get("pruned")
-            if pruned is not None:
-                pruned = Pruned(int(pruned["surfels"]), float(pruned["limit"]), float(pruned["psnr"]))
             if iteration < 0 or not 0 <= seconds < math.inf:
                 raise ValueError("iteration or seconds out of range")
         except UnknownNameError as error:
@@ -125,7 +108,6 @@ class TrainedScene:
             shading,
             iteration,
             seconds,
-            pruned,
             Surroundings.read(around, behind if behind.is_file() else None) if around.is_file() else None,
             NearField.read(near) if near.is_file() else None,
         )

@@ -381,7 +381,6 @@ def test_unwritable_output(finished: Path, data: Path, method: Path, tmp_path: P
         ("render no.xml -o x.png --samples x", ["--samples: 'x'"]),
         ("render no.xml -o x.png --smaples 4", ["--smaples"]),
         ("edit run -o x --split all", ["--split", "test"]),
-        ("export run --limit 40", ["--limit", "--prune"]),
     ],
 )
 def test_bad_arguments_are_refused(

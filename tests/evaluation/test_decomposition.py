@@ -121,7 +121,7 @@ def test_missing_materials_are_null_with_a_reason() -> None:
 
 def test_evaluate_scores_a_perfect_run(data: Path, tmp_path: Path) -> None:
     run = write_known_run(data, tmp_path / "run")
-    result = evaluate(run, protocol="stanford-orb")
+    result = evaluate(run)
     assert result["albedo_psnr"] > 28 and result["roughness_mae"] < 0.005 and result["metallic_mae"] < 0.02
     np.testing.assert_allclose(result["albedo_scale"], 1, atol=0.02)
     assert result["surface_distance"] < 0.1 and result["surface_distance_concave"] < 0.1
@@ -129,11 +129,7 @@ def test_evaluate_scores_a_perfect_run(data: Path, tmp_path: Path) -> None:
     assert result["psnr_concave"] < result["psnr"]  # neither shadows nor bounces
     text = table(result)
     assert "albedo, PSNR after scale" in text and "(concave: " in text
-    assert text.startswith("scale: ") and "protocol stanford-orb" in text
-    benchmark = result["protocols"]["stanford-orb"]
-    assert benchmark["psnr_h"] is None and benchmark["psnr_l"] > 20 and benchmark["ssim"] > 0.9
-    assert benchmark["normal_deg"] < result["normal_mae_deg"] and benchmark["normal_cosine"] < 0.01
-    assert benchmark["depth_si_mse"] < 1 and benchmark["chamfer"] < 0.2 and benchmark["albedo_psnr"] > 28
+    assert text.startswith("scale: ") and "whole image of " in text
     assert json.loads((run.path / "metrics.json").read_text())["surface_reason"] is None
     sheet = read_png(run.path / DECOMPOSITION)
     assert sheet.shape[1] > 10 * SIZE and sheet.std() > 0.1

@@ -1,4 +1,4 @@
-"""Meshes with baked textures: a known scene in glTF, USD and plain Mitsuba, read by other libraries."""
+"""Meshes with baked textures: a known scene in glTF and plain Mitsuba, read by other libraries."""
 
 from __future__ import annotations
 
@@ -14,12 +14,10 @@ import pytest
 import trimesh
 
 from mi_refgs.evaluation.images import image_array
-from mi_refgs.formats import FORMATS, Shot, gltf, write
-from mi_refgs.formats import usd as usd_format
+from mi_refgs.formats import Shot, gltf, write
 from mi_refgs.formats.baking import TexturedMesh, bake, simplified, texels, unwrap
 from mi_refgs.formats.mitsuba_scene import base_colour, diffuse_ratio
 from mi_refgs.formats.orbits import shots_around
-from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import linear_from_srgb, read_png
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -55,7 +53,7 @@ def coloured_light() -> EnvironmentLight:
 
 @dataclass(frozen=True)
 class Exported:
-    """The scene and cameras that the three formats were written from, and their folder."""
+    """The scene and cameras that the formats were written from, and their folder."""
 
     trained: TrainedScene
     shots: list[Shot]
@@ -74,14 +72,14 @@ def trained_scene() -> TrainedScene:
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
-    """The balls in all three formats."""
+    """The balls in both formats."""
     mi.set_variant("llvm_ad_rgb")  # before that of the tests
     trained = trained_scene()
     around = shots_around(trained.surfels)
     chosen = around[1], around[3], *around[4::4]
     shots = [replace(shot, camera=shot.camera.resized(SIZE)) for shot in chosen]
     folder = tmp_path_factory.mktemp("baked")
-    write(trained, ["mitsuba", "gltf-mesh", "usd"], folder, shots, {"faces": FACES, "texture": TEXTURE})
+    write(trained, ["mitsuba", "gltf-mesh"], folder, shots, {"faces": FACES, "texture": TEXTURE})
     return Exported(trained, shots, folder, bake(trained, shots, FACES, TEXTURE))
 
 
@@ -253,73 +251,10 @@ def test_principled_albedo_equals_ours(roughness: float) -> None:
     assert float(dr.mean(weight.x)[0]) == pytest.approx(float(ours[0]), rel=0.01)
 
 
-def test_usd_has_mesh_materials_and_dome_light(exported: Exported, tmp_path: Path) -> None:
-    usd = pytest.importorskip("pxr.Usd")
-    from pxr import Gf, UsdGeom, UsdLux, UsdShade, UsdUtils
-
-    stage = usd.Stage.Open(str(exported.folder / "usd.usdz"))
-    made = exported.baked
-    assert UsdGeom.GetStageUpAxis(stage) == "Z" and stage.GetDefaultPrim().GetPath() == "/root"
-    mesh = UsdGeom.Mesh.Get(stage, "/root/object")
-    np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get()), made.vertices, atol=1e-6)
-    np.testing.assert_allclose(np.array(mesh.GetNormalsAttr().Get()), made.normals, atol=1e-6)
-    assert (np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3) == made.faces).all()
-    material, _ = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()
-    source = material.ComputeSurfaceSource()[0]
-    folder = tmp_path / "unpacked"
-    assert UsdUtils.ExtractUsdzPackage(str(exported.folder / "usd.usdz"), str(folder), False, False)
-    uv = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
-    maps = []
-    inputs = ("diffuseColor", "sRGB", "rgb"), ("roughness", "raw", "r"), ("metallic", "raw", "r")
-    for name, space, channel in inputs:
-        texture, output, _ = source.GetInput(name).GetConnectedSource()
-        image = UsdShade.Shader(texture.GetPrim())
-        assert output == channel and image.GetInput("sourceColorSpace").Get() == space
-        file = next(folder.rglob(Path(image.GetInput("file").Get().path).name))
-        picture = read_png(file)
-        maps.append(linear_from_srgb(picture) if space == "sRGB" else picture[..., 0])
-    check_materials(made.vertices, uv, *maps)
-
-    # The layout of the dome's texture, from the documentation of UsdLux: longitude π at the left edge, 0 in
-    # the middle; latitude π/2 at the first row; longitude 0 is +z and π/2 is +x, latitude π/2 is +y.
-    light = UsdLux.DomeLight.Get(stage, "/root/light")
-    assert light.GetLocalTransformation() == Gf.Matrix4d(1)
-    assert light.GetTextureFormatAttr().Get() == "latlong"
-    panorama = read_exr_image(next(folder.rglob("envmap.exr")))
-    assert exported.trained.light is not None
-    sky = exported.trained.light.unfiltered()
-    for axis in np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.48, 0.64]]]):
-        longitude, latitude = np.arctan2(axis[0], axis[2]), np.arcsin(axis[1])
-        column = int((0.5 - longitude / (2 * np.pi)) * 64) % 64
-        row = min(int((0.5 - latitude / np.pi) * 32), 31)
-        radiance = np.array(sky.radiance(mi.Vector3f(*map(float, axis)))).ravel()
-        np.testing.assert_allclose(panorama[row, column], radiance, atol=0.2)
-
-
 def off_centre() -> Camera:
     """A camera with an off-centre principal point and pixels that are not square."""
     pose = shots_around(trained_scene().surfels)[2].camera.pose()
     return Camera.from_pose(64, 48, -70.0, -55.0, 40.5, 17.0, pose)
-
-
-def test_usd_camera_keeps_the_principal_point() -> None:
-    """USD's own frustum projects points to the pixels of our camera."""
-    usd = pytest.importorskip("pxr.Usd")
-    from pxr import Gf, UsdGeom
-
-    camera = off_centre()
-    stage = usd.Stage.CreateInMemory()
-    prim = UsdGeom.Camera.Define(stage, "/camera")
-    usd_format._add_camera(prim, camera, Gf)
-    frustum = prim.GetCamera(0).frustum
-    matrix = np.array(frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix())
-    points = MIDDLES[:, None] + np.array([[0.0, 0, 0], [0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2]])
-    for point in points.reshape(-1, 3):
-        clip = np.append(point, 1) @ matrix
-        x, y = (clip[:2] / clip[3] + 1) / 2
-        local = np.array(camera.to_camera(mi.Point3f(*map(float, point)))).ravel()
-        ours = local[0] / local[2] * -70 + 40.5, local[1] / local[2] * -55 + 17
-        np.testing.assert_allclose((64 * x, 48 * (1 - y)), ours, atol=1e-3)
 
 
 def test_gltf_camera_warns_of_off_centre_principal_point(capsys: pytest.CaptureFixture[str]) -> None:
@@ -328,31 +263,17 @@ def test_gltf_camera_warns_of_off_centre_principal_point(capsys: pytest.CaptureF
         assert ("8.5 pixels to the right of the centre and -7.0 below" in capsys.readouterr().err) is said
 
 
-def test_usd_passes_its_own_validators(exported: Exported) -> None:
-    pytest.importorskip("pxr.UsdValidation")
-    from pxr import Usd, UsdValidation
-
-    stage = Usd.Stage.Open(str(exported.folder / "usd.usdz"))
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    assert len(validators) > 10
-    errors = UsdValidation.ValidationContext(validators).Validate(stage)
-    assert [error.GetMessage() for error in errors] == []
-
-
 # ---------------- refusals ----------------
 
 
-@pytest.mark.parametrize(
-    ("package", "form"),
-    [("xatlas", "gltf-mesh"), ("fast_simplification", "gltf-mesh"), ("pxr.UsdUtils", "usd")],
-)
+@pytest.mark.parametrize("package", ["xatlas", "fast_simplification"])
 def test_missing_package_is_refused(
-    exported: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, form: str
+    exported: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     again = replace(exported.trained, iteration=2)  # another scene, whose mesh is not cached
     message = f'{package} is not installed; pip install "mi_refgs[export]"'
-    refused(lambda: write(again, [form], tmp_path / f"a{FORMATS[form].suffix}", exported.shots), message)
+    refused(lambda: write(again, ["gltf-mesh"], tmp_path / "a.glb", exported.shots), message)
 
 
 @pytest.mark.parametrize(

@@ -88,9 +88,9 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
             ["--to", "exr", "-o", "OUT.exr", "--view", "9"],
             "--view: 9 is out of range; there are 5, give 0 to 4",
         ),
-        (["--to", "usd", "-o", "OUT.usdz", "--faces=3"], "--faces: 3 is out of range"),
-        (["--to", "usd", "-o", "OUT.usdz", "--texture=7"], "--texture: 7 is out of range"),
-        (["--to", "usd", "-o", "OUT.usdz", "--texture=100000"], "--texture: 100000 is out of range"),
+        (["--to", "gltf-mesh", "-o", "OUT.glb", "--faces=3"], "--faces: 3 is out of range"),
+        (["--to", "gltf-mesh", "-o", "OUT.glb", "--texture=7"], "--texture: 7 is out of range"),
+        (["--to", "gltf-mesh", "-o", "OUT.glb", "--texture=100000"], "--texture: 100000 is out of range"),
     ],
 )
 def test_bad_export_arguments_are_refused(
