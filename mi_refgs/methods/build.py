@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.methods.ranges import require_in_range
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.shade.options import NOT_A_SETTING
 
@@ -76,9 +77,11 @@ def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
             if field.metadata == FLAT:
                 inner = hints[field.name]
                 built[field.name] = inner(**{key: built.pop(key) for key in settings(inner) if key in built})
-        return kind(**built)
+        made = kind(**built)
     except (InputError, ValueError) as error:
         raise InputError(f"{where}: {error}") from error
+    require_in_range(made, where)
+    return made
 
 
 def plain(value: Any) -> Any:
@@ -110,7 +113,7 @@ def scaled(value: Any, factor: float) -> Any:
     fields = {}
     for field in dataclasses.fields(value):
         inner = getattr(value, field.name)
-        if field.metadata != ITERATIONS:
+        if not ITERATIONS.items() <= field.metadata.items():
             fields[field.name] = scaled(inner, factor)
         elif inner is not None and inner > 0:
             fields[field.name] = max(round(inner * factor), 1)
