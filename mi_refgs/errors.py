@@ -1,11 +1,45 @@
 """Exceptions for input that a user can fix, and values in their messages."""
 
+from __future__ import annotations
+
+import copy
+from typing import Self
+
 
 class InputError(ValueError):
-    """Bad input: the message names the file, the field and the remedy.
+    """Bad input: what is wrong, the file and the field where it is, and a remedy.
 
-    The command line prints it as one sentence and exits with code 2.
+    `str` is the sentence "file: field: what; remedy", which the command line prints before exit code 2.
     """
+
+    def __init__(
+        self, what: str, file: object = None, field: str | None = None, remedy: str | None = None
+    ) -> None:
+        """`file` is a path, or the name of what was given instead, such as an option or an object."""
+        super().__init__(what)
+        self.what = what
+        self.file = file
+        self.field = field
+        self.remedy = remedy
+
+    @property
+    def advice(self) -> str:
+        """What is wrong and the remedy, without the place."""
+        return self.what if self.remedy is None else f"{self.what}; {self.remedy}"
+
+    def __str__(self) -> str:
+        return ": ".join(_given(self.file, self.field, self.advice))
+
+    def at(self, file: object = None, field: str | None = None) -> Self:
+        """A copy whose place is inside `file` and `field`, which precede the place that it had."""
+        inside = copy.copy(self)
+        inside.file = file
+        inside.field = ": ".join(_given(field, self.file, self.field)) or None
+        return inside
+
+
+def _given(*parts: object) -> list[str]:
+    return [str(part) for part in parts if part is not None]
 
 
 class UnknownNameError(InputError):

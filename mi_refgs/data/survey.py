@@ -132,7 +132,7 @@ def require_several_sides(data: Dataset) -> None:
         scale = max(scale, float(np.median(np.linalg.norm(data.points.position - middle, axis=1))))
     if spread <= ONE_PLACE * scale:
         views = "a single training view shows" if len(origins) == 1 else "training views in one place show"
-        raise InputError(f"{data.path}: cameras: {views} no shape; add images from other sides")
+        raise InputError(f"{views} no shape", data.path, "cameras", "add images from other sides")
 
 
 def _unusual(found: Survey, train: Dataset) -> list[str]:
@@ -140,7 +140,7 @@ def _unusual(found: Survey, train: Dataset) -> list[str]:
     try:
         require_several_sides(train)
     except InputError as error:
-        notes.append(str(error).partition(": cameras: ")[2])
+        notes.append(error.advice)
     if found.views["train"] > 1 and (few := few_views(found.views["train"])):
         notes.append(few)
     if found.alpha == "none":

@@ -41,8 +41,10 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
         if len(bad):
             row, column = bad[0]
             raise InputError(
-                f"{path}: channel {name}: {len(bad)} NaN or infinite values, the first at row {row}, "
-                f"column {column}; render the image again"
+                f"{len(bad)} NaN or infinite values, the first at row {row}, column {column}",
+                path,
+                f"channel {name}",
+                "render the image again",
             )
     return channels
 
@@ -114,7 +116,7 @@ def _image_channels(
     """The channels of an image, in order; raises InputError as `read_exr_image` does."""
     primaries = header.get("chromaticities", SRGB_CHROMATICITIES)
     if "R" in channels and not np.allclose(primaries, SRGB_CHROMATICITIES, atol=CHROMATICITY_TOLERANCE):
-        raise InputError(f"{path}: chromaticities: not those of sRGB; convert the image to linear sRGB")
+        raise InputError("not those of sRGB", path, "chromaticities", "convert the image to linear sRGB")
     for names in ("RGBA", "RGB", *(("XYZ",) if vectors else ()), "YA"):
         if set(names) <= set(channels):
             return list(names)
@@ -122,7 +124,7 @@ def _image_channels(
         return list(channels)
     found, wanted = ", ".join(sorted(channels)), "X, Y, Z, " if vectors else ""
     raise InputError(
-        f"{path}: channels: found {found}; export R, G, B (and A), {wanted}or one channel (and A)"
+        f"found {found}", path, "channels", f"export R, G, B (and A), {wanted}or one channel (and A)"
     )
 
 
@@ -148,7 +150,7 @@ def _readable(path: Path, field: str = "pixels") -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise InputError(f"{path}: {field}: not a readable EXR file ({error}); export it again") from error
+        raise InputError(f"not a readable EXR file ({error})", path, field, "export it again") from error
 
 
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:

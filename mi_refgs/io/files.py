@@ -36,7 +36,7 @@ def cannot_write(path: Path, error: Exception) -> InputError:
     reason = getattr(error, "strerror", None) or error
     full = getattr(error, "errno", None) in NO_ROOM
     remedy = "free some space there, or choose another folder" if full else "choose a writable folder"
-    return InputError(f"{path}: output: cannot be written ({reason}); {remedy}")
+    return InputError(f"cannot be written ({reason})", path, "output", remedy)
 
 
 def make_folder(path: Path) -> None:
@@ -45,7 +45,7 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"{path}: output: cannot be created ({error.strerror}); choose a writable folder with -o"
+            f"cannot be created ({error.strerror})", path, "output", "choose a writable folder with -o"
         ) from error
 
 
@@ -175,9 +175,11 @@ def read_json(path: str | Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: JSON: cannot be read ({error}); correct it or export it again") from error
+        raise InputError(
+            f"cannot be read ({error})", path, "JSON", "correct it or export it again"
+        ) from error
     if not isinstance(content, dict):
-        raise InputError(f"{path}: JSON: the outermost value is not an object; export the file again")
+        raise InputError("the outermost value is not an object", path, "JSON", "export the file again")
     return content
 
 
@@ -186,8 +188,8 @@ def require_file(path: Path) -> None:
     if is_file(path):
         return
     if os.path.isdir(path):  # unlike Path.is_dir, False for an impossible name
-        raise InputError(f"{path}: file: is a folder; name a file in it")
-    raise InputError(f"{path}: file: missing; check the name, or restore it")
+        raise InputError("is a folder", path, "file", "name a file in it")
+    raise InputError("missing", path, "file", "check the name, or restore it")
 
 
 def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
@@ -197,13 +199,15 @@ def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> Non
     """
     if width * height > MAX_PIXELS:
         raise InputError(
-            f"{path}: size: {width} × {height} pixels are more than {MAX_PIXELS // 10**6} million; save a "
-            "smaller copy"
+            f"{width} × {height} pixels are more than {MAX_PIXELS // 10**6} million",
+            path,
+            "size",
+            "save a smaller copy",
         )
     promised = width * height * bytes_per_pixel
     if promised > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
         raise InputError(
-            f"{path}: size: {width} × {height} pixels are more than the file can hold; export it again"
+            f"{width} × {height} pixels are more than the file can hold", path, "size", "export it again"
         )
 
 

@@ -28,7 +28,7 @@ def hdr_strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
         header = file.read(MAX_HDR_HEADER)
     size = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", header)
     if not header.startswith(b"#?") or b"32-bit_rle_xyze" in header or size is None:
-        raise InputError(f"{path}: header: no Radiance image of rows from the top; save it as EXR")
+        raise InputError("no Radiance image of rows from the top", path, "header", "save it as EXR")
     height, width = int(size.group(1)), int(size.group(2))
     check_size(path, width, height, 4)
     return (height, width), _strips(path, height, width, size.end())
@@ -51,7 +51,7 @@ def _strips(path: Path, height: int, width: int, position: int) -> Iterator[np.n
                     values, position = _runs(data, position, width)
                     row[:, channel] = np.frombuffer(values, np.uint8)
         except (IndexError, ValueError) as error:
-            raise InputError(f"{path}: pixels: truncated or broken; export it again") from error
+            raise InputError("truncated or broken", path, "pixels", "export it again") from error
         yield rgbe[..., :3] * SCALES[rgbe[..., 3:]]
 
 

@@ -114,7 +114,7 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
     path = Path(path)
     with open_image(path) as image:
         if image.mode.startswith(("I", "F")):
-            raise InputError(f"{path}: pixels: more than 8 bits per channel; save it as 8-bit PNG or EXR")
+            raise InputError("more than 8 bits per channel", path, "pixels", "save it as 8-bit PNG or EXR")
         factor = math.gcd(shrink, JPEG_SHRINK) if image.format == "JPEG" else 1
         if factor > 1:
             image.draft(None, tuple(max(side // factor, 1) for side in image.size))
@@ -152,7 +152,7 @@ def read_tiff(path: str | Path) -> np.ndarray:
     path = Path(path)
     with open_image(path, "TIFF") as image:
         if image.mode != "F" and not image.mode.startswith("I;16"):
-            raise InputError(f"{path}: pixels: not one channel of floats or 16 bits; export it again")
+            raise InputError("not one channel of floats or 16 bits", path, "pixels", "export it again")
         scale = 1 if image.mode == "F" else 65535
         return np.nan_to_num(np.asarray(image, dtype=np.float32) / np.float32(scale))
 
@@ -183,7 +183,7 @@ def open_image(path: Path, *formats: str) -> Iterator[Any]:
     except InputError:
         raise
     except Exception as error:  # Pillow raises half a dozen types for broken files
-        raise InputError(f"{path}: pixels: not a readable image ({error}); export it again") from error
+        raise InputError(f"not a readable image ({error})", path, "pixels", "export it again") from error
 
 
 def exif_tags(image: Any) -> tuple[dict[int, Any], dict[int, Any]]:

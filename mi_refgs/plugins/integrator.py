@@ -223,8 +223,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             try:
                 EnvironmentLight(light.raw)  # checks the shape, which an update may have changed
             except InputError as error:
-                found = str(error).removeprefix("EnvironmentLight: raw: ")
-                raise InputError(f"refgs: {name}: {found}") from error
+                raise InputError(error.what, "refgs", name, error.remedy) from error
 
     @property
     def _models(self) -> dict[str, Surfels]:

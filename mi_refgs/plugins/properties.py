@@ -146,7 +146,7 @@ def read_background(props: Any) -> Any:
         try:
             return EnvironmentLight.from_file(Path(_path(props, "background") or ""))
         except InputError as error:
-            raise InputError(f"refgs: background: {error}") from error
+            raise error.at("refgs", "background") from error
     try:
         if getattr(value, "ndim", 0) == 3:
             return EnvironmentLight(mi.TensorXf(value))
@@ -175,7 +175,7 @@ def read_near_field(props: Any) -> NearField | None:
     try:
         return None if path is None else NearField.read(path)
     except InputError as error:
-        raise InputError(f"refgs: near_field: {error}") from error
+        raise error.at("refgs", "near_field") from error
 
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
@@ -185,13 +185,10 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     diffuse = _choice(props, "diffuse", Shading.default_diffuse(reflectance, surfels.raw), DIFFUSE)
     at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
-    try:
-        shading = Shading(at, reflectance, diffuse)
-        occlusion = _get(props, "occlusion", mesh is not None and shading.traceable)
-        quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
-        shading = replace(shading, occlusion=occlusion, **quality)
-    except InputError as error:  # the plugin's name of `at`
-        raise InputError(str(error).replace("needs at =", "needs shade_at =")) from error
+    shading = Shading(at, reflectance, diffuse)
+    occlusion = _get(props, "occlusion", mesh is not None and shading.traceable)
+    quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
+    shading = replace(shading, occlusion=occlusion, **quality)
     return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None
 
 

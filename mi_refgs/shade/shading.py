@@ -24,35 +24,45 @@ class Shading(ShadingOptions):
         super().__post_init__()
         model, chosen = MODELS.find(self.reflectance, "shading: reflectance"), self.chosen()
         mirrors = " or ".join(name for name, other in MODELS.items() if other.visibility == "mirror")
-        # (what is not allowed, the message)
+        # (what is not allowed, its option, what is wrong, the remedy)
         rules = [
             (
                 self.shaded_at not in model.shaded_at,
-                f"reflectance: {self.reflectance} needs at = {model.shaded_at[0]}; set it",
+                "reflectance",
+                f"{self.reflectance} needs shading at {model.shaded_at[0]}",
+                "set it",
             ),
             (
                 self.occlusion and not self.traceable,
-                f"occlusion: needs at = pixel and reflectance = {mirrors}; set these",
+                "occlusion",
+                f"needs shading at pixel and reflectance = {mirrors}",
+                "set these",
             ),
             (
                 self.ambient_rays > 0 and self.diffuse != "irradiance",
-                "ambient_rays: need diffuse = irradiance; set it",
+                "ambient_rays",
+                "need diffuse = irradiance",
+                "set it",
             ),
             (
                 not self.occlusion and bool({*chosen} & {*TRACED}),
-                f"{', '.join(TRACED)}: need occlusion; trace a `mesh`",
+                ", ".join(TRACED),
+                "need occlusion",
+                "trace a `mesh`",
             ),
             (
                 self.antialias and self.shaded_at != "pixel",
-                "antialias: needs at = pixel; set it, or leave it out",
+                "antialias",
+                "needs shading at pixel",
+                "set it, or leave it out",
             ),
         ]
         for name in chosen:
             able = " or ".join(other for other in MODELS if name in MODELS[other].honours)
-            rules.append((name not in model.honours, f"{name}: needs reflectance = {able}; set it"))
-        for refused, message in rules:
+            rules.append((name not in model.honours, name, f"needs reflectance = {able}", "set it"))
+        for refused, option, wrong, remedy in rules:
             if refused:
-                raise InputError(f"shading: {message}")
+                raise InputError(wrong, "shading", option, remedy)
 
     @staticmethod
     def resolve(options: ShadingOptions, mesh: bool) -> Shading:

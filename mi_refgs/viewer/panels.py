@@ -131,7 +131,7 @@ def light_of(name: str, content: bytes, world: bool) -> EnvironmentLight:
         try:
             return NewLight(path, world).read()
         except InputError as error:
-            raise InputError(str(error).replace(str(path), name)) from error
+            raise InputError(error.what, name, error.field, error.remedy) from error
 
 
 # ---------------- materials ----------------

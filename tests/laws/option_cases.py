@@ -86,12 +86,12 @@ RULES = [
     Rule(
         ("shading", "occlusion"),
         lambda shading, occlusion: occlusion and not _traceable(shading),
-        "shading: occlusion: needs shade_at = pixel and reflectance = split_sum",
+        "shading: occlusion: needs shading at pixel and reflectance = split_sum",
     ),
     Rule(
         ("shading", "accuracy"),
         lambda shading, accuracy: accuracy == "antialias" and "/pixel" not in shading,
-        "shading: antialias: needs shade_at = pixel",
+        "shading: antialias: needs shading at pixel",
     ),
     Rule(
         ("shading", "accuracy"),

@@ -125,7 +125,7 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
     ("changes", "words"),
     [
         ({"shade_at": "voxel"}, "shade_at: 'voxel' is unknown"),
-        ({"shade_at": "pixel", "reflectance": "monte_carlo"}, "monte_carlo needs shade_at = surfel; set it"),
+        ({"shade_at": "pixel", "reflectance": "monte_carlo"}, "monte_carlo needs shading at surfel; set it"),
         ({"reflectance": "phong"}, "reflectance: 'phong'"),
         ({"terms": "diffuse,caustic"}, "terms: 'caustic'"),
         ({"terms": ""}, "terms: '' names none; use some of diffuse, specular, indirect"),

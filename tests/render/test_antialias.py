@@ -164,4 +164,4 @@ def test_antialias_requires_deferred_shading() -> None:
     assert Shading().antialiased() == Shading(antialias=True)
     for other in (Shading("surfel"), Shading("surfel", reflectance="radiance")):
         assert other.antialiased() == other
-    refused(lambda: Shading("surfel", antialias=True), "antialias: needs at = pixel")
+    refused(lambda: Shading("surfel", antialias=True), "antialias: needs shading at pixel")

@@ -271,7 +271,7 @@ def test_hemisphere_is_blocked_where_mesh_stands() -> None:
 
 
 def test_what_models_refuse() -> None:
-    with pytest.raises(InputError, match="gaussian_shader needs at = surfel"):
+    with pytest.raises(InputError, match="gaussian_shader needs shading at surfel"):
         Shading("pixel", "gaussian_shader")
     with pytest.raises(InputError, match="'lambert' is unknown; use split_sum or"):
         Shading(reflectance="lambert")

@@ -61,7 +61,7 @@ IMPOSSIBLE = {
     ),
     "a model of surfels shaded per pixel": (
         f"[surfels]\nattributes = ['albedo', 'roughness']\n{LIGHT}{STAGE}reflectance = 'monte_carlo'",
-        ["stage.only", "monte_carlo needs at = surfel; set it"],
+        ["stage.only", "monte_carlo needs shading at surfel; set it"],
     ),
     "materials reset that are none": (
         f"[surfels]\nattributes = ['radiance_sh']\n{STAGE}reflectance = 'radiance'\nrestart = ['metallic']",
@@ -90,8 +90,8 @@ def test_radiance_needs_no_order_of_shading(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"at": "surfel", "occlusion": True}, "occlusion: needs at = pixel"),
-        ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs at = pixel"),
+        ({"at": "surfel", "occlusion": True}, "occlusion: needs shading at pixel"),
+        ({"reflectance": "radiance", "occlusion": True}, "occlusion: needs shading at pixel"),
         ({"reflectance": "radiance", "dominant": True}, "dominant: needs reflectance"),
         ({"visibility_rays": 4}, "visibility_rays, traced_bounces, ambient_rays: need occlusion"),
         ({"diffuse": "sh", "ambient_rays": 9}, "need diffuse = irradiance"),

@@ -131,10 +131,12 @@ class UnfilteredLight:
         return interpolated(lambda i: dr.gather(mi.Color3f, self.texels, i), u, v, h, 2 * h)
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
-        raise InputError("light: irradiance: the light is not filtered; use EnvironmentLight.prefilter()")
+        raise InputError(
+            "the light is not filtered", "light", "irradiance", "use EnvironmentLight.prefilter()"
+        )
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        raise InputError("light: specular: the light is not filtered; use EnvironmentLight.prefilter()")
+        raise InputError("the light is not filtered", "light", "specular", "use EnvironmentLight.prefilter()")
 
 
 def interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -> Any:
@@ -192,8 +194,10 @@ class EnvironmentLight:
         h = shape[0] if shape else 0
         if shape != (h, 2 * h, 3) or not is_height(h):
             raise InputError(
-                f"EnvironmentLight: raw: shape {shape}; need (h, 2h, 3), h ≥ {MIN_HEIGHT} a multiple of 4: "
-                "EnvironmentLight.from_file resamples"
+                f"shape {shape}",
+                "EnvironmentLight",
+                "raw",
+                f"need (h, 2h, 3), h ≥ {MIN_HEIGHT} a multiple of 4: EnvironmentLight.from_file resamples",
             )
 
     @classmethod
@@ -209,7 +213,7 @@ class EnvironmentLight:
         """
         radiance = np.asarray(radiance, np.float64)
         if not np.isfinite(radiance).all():
-            raise InputError("EnvironmentLight: radiance: NaN or infinite values; replace those texels")
+            raise InputError("NaN or infinite values", "EnvironmentLight", "radiance", "replace those texels")
         return cls(upload_tensor(nearest_raw(np.maximum(radiance, RADIANCE_FLOOR))))
 
     @classmethod

@@ -33,7 +33,7 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
     (height, width), strips = _strips(path)
     if min(height, width) < 2:
         size = f"{width} × {height} pixels"
-        raise InputError(f"{path}: environment: {size} are no lat-long image; give 2 × 2 at least")
+        raise InputError(f"{size} are no lat-long image", path, "environment", "give 2 × 2 at least")
     h, w = min(height, rows), min(width, 2 * rows)
     image = np.zeros((h, w, 3), np.float32)
     down = None if h == height else hat_rows(height, h)
@@ -43,8 +43,10 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
         if not np.isfinite(strip).all():
             row, column, _ = np.argwhere(~np.isfinite(strip))[0]
             raise InputError(
-                f"{path}: environment: NaN or infinite values, the first at row {top + row}, "
-                f"column {column}; replace those texels"
+                f"NaN or infinite values, the first at row {top + row}, column {column}",
+                path,
+                "environment",
+                "replace those texels",
             )
         part, count = np.maximum(strip, 0), len(strip)
         if across is not None:
@@ -69,8 +71,8 @@ def _strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
         with path.open("rb") as file:
             first = file.read(4)
     except OSError as error:
-        failed = f"{path}: environment: cannot be read ({error.strerror})"
-        raise InputError(f"{failed}; give an EXR or HDR file") from error
+        failed = f"cannot be read ({error.strerror})"
+        raise InputError(failed, path, "environment", "give an EXR or HDR file") from error
     if first[:2] == b"#?":
         return hdr_strips(path)
     if first == EXR_MAGIC:

@@ -43,11 +43,13 @@ class NearField:
     def __post_init__(self) -> None:
         centre, nearness = np.shape(self.centre), np.shape(self.nearness)
         if centre != (3,) or len(nearness) != 2 or nearness[1] != 2 * nearness[0] or nearness[0] < 2:
-            raise InputError(f"near field: shapes {centre} and {nearness}; need (3,) and (h, 2h), h ≥ 2")
+            raise InputError(
+                f"shapes {centre} and {nearness}", "near field", remedy="need (3,) and (h, 2h), h ≥ 2"
+            )
         if not (np.isfinite(self.centre).all() and np.isfinite(self.nearness).all()):
-            raise InputError("near field: a value is not finite; replace it")
+            raise InputError("a value is not finite", "near field", remedy="replace it")
         if np.min(self.nearness) < 0:
-            raise InputError("near field: nearness: a value is negative; replace it")
+            raise InputError("a value is negative", "near field", "nearness", "replace it")
 
     @staticmethod
     def read(path: str | os.PathLike[str]) -> NearField:
@@ -57,9 +59,9 @@ class NearField:
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
                 return NearField(archive["centre"], archive["nearness"])
         except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+            raise error.at(path) from error
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: near field: cannot be read ({error}); restore the file") from error
+            raise InputError(f"cannot be read ({error})", path, "near field", "restore the file") from error
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write `centre` and `nearness` as an .npz file, atomically; raises InputError if that fails."""
