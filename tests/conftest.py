@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import gc
-import os
 import signal
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +17,6 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 from mi_refgs.cli import main
-from mi_refgs.fitting.cost_model import FOLDER_VARIABLE
 from mi_refgs.io.exr import MITSUBA_EXR_THREADS
 from tests.scenes.known import write_known_data, write_known_run
 from tests.scenes.tiny import train_command, write_data, write_method
@@ -37,10 +34,6 @@ settings.register_profile(
 )
 settings.register_profile("thorough", settings.get_profile("mi_refgs"), max_examples=400, derandomize=False)
 settings.load_profile("mi_refgs")
-
-CACHE = tempfile.TemporaryDirectory(prefix="refgs_cache_")
-os.environ[FOLDER_VARIABLE] = CACHE.name
-"""What tests measure of this machine goes there, in processes of their own too, and never to the user's."""
 
 THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
 """Tests let Mitsuba read EXR files, on machines of one core too."""

@@ -19,11 +19,11 @@ from benchmarks.common.report import Row
 from benchmarks.common.view import ROOT
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.plan import sized
 from mi_refgs.io.files import TEMPORARY, make_folder, read_json, write_json
 from mi_refgs.kernels import device
 from mi_refgs.methods.build import plain
 from mi_refgs.methods.method import Method
+from mi_refgs.runs.views import sized
 
 SCORES = ("psnr", "ssim", "normal_mae_deg")
 """Means over the validation views; None where there is no ground truth."""

@@ -34,7 +34,6 @@ def page() -> str:
                 "surfels at first",
                 "at most",
                 "pixels of an image",
-                "minutes, two cores",
             ],
             [
                 [
@@ -43,7 +42,6 @@ def page() -> str:
                     f"{p.surfels:,}",
                     f"{p.max_surfels:,}",
                     f"{p.pixels:,}",
-                    "no promise" if p.minutes is None else f"{p.minutes:g}",
                 ]
                 for name, p in PRESETS.items()
             ],

@@ -46,8 +46,6 @@ def examine() -> dict[str, Any]:
     """
     import drjit as dr
 
-    from mi_refgs.fitting import cost_model
-
     cuda, version = bool(dr.has_backend(dr.JitBackend.CUDA)), dr.detail.llvm_version()
     problem, width = llvm.problem(), None
     if problem is None:
@@ -70,7 +68,6 @@ def examine() -> dict[str, Any]:
         "threads": int(dr.thread_count()),
         "simd_width": width,
         "kernel_cache": os.environ.get("DRJIT_CACHE_DIR", str(Path.home() / ".drjit")),
-        "speeds": cost_model.summary(),
         "extras": {name: _version(distribution) for name, distribution in EXTRAS.items()},
         "problems": [] if problem is None else [asdict(problem)],
     }
@@ -89,7 +86,6 @@ def text(report: dict[str, Any]) -> str:
         "threads": report["threads"],
         "SIMD width": f"{width} floats" if width else "unknown",
         "kernel cache": report["kernel_cache"],
-        "speeds": "; ".join(report["speeds"]) or "none measured yet",
     }
     for name, installed in report["extras"].items():
         found[name] = installed or f'not installed (optional: pip install "mi_refgs[{name}]")'

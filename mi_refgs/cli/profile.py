@@ -92,10 +92,9 @@ class ProfileCommand:
 
     def _trainer(self, folder: Run) -> tuple[Trainer, list[str]]:
         """Return the trainer of a run or of a new fit, and the stages of the schedule to measure."""
-        from mi_refgs.fitting.plan import sized
         from mi_refgs.fitting.runner import load_method
         from mi_refgs.fitting.train import Trainer
-        from mi_refgs.runs.views import read_views, views_of_run
+        from mi_refgs.runs.views import read_views, sized, views_of_run
 
         if not self.path.is_dir():
             raise InputError(f"{self.path}: RUN|DATA: no such folder; give a run folder or a data set")

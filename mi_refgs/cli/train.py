@@ -40,8 +40,6 @@ class Train:
     purpose: Annotated[str | None, optional("{photographs,relighting}", name="for")] = None
     """choose the method by a purpose"""
     preset: Preset = None
-    minutes: Annotated[float | None, optional("M")] = None
-    """time that the fit may take, by smaller or larger images"""
     set: Settings = ()
     resume: Flag = False
     """continue from the newest checkpoint, if there is one"""
@@ -52,7 +50,6 @@ class Train:
 
     def run(self) -> Result:
         """Fit, from the start or from the newest checkpoint."""
-        from mi_refgs.fitting.plan import minutes
         from mi_refgs.fitting.runner import method_for
         from mi_refgs.fitting.select import table
         from mi_refgs.reconstruction.fit import ProgressBar, fit
@@ -72,38 +69,32 @@ class Train:
             self.data,
             method,
             preset=self.preset,
-            minutes=self.minutes,
             settings=settings,
             output=self.output,
             resume=self.resume,
             progress=progress,
         )
-        taken, trainer, expected = time.monotonic() - begin, progress.trainer, progress.expected
+        taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None
 
         data: dict[str, Any] = {
             "run": str(self.output),
             "method": trainer.method.name,
-            "variant": trainer.method.name,  # name of this key in version 0.1
             "preset": trainer.method.preset,
             "iterations": trainer.iteration,
             "seconds": round(trainer.fit.seconds, 3),
             "total_seconds": round(taken, 3),
-            "estimated_seconds": None if expected is None else round(expected.seconds, 3),
             "surfels": trainer.surfels.count,
             "loss": trainer.statistics()["loss"],
         }
-        total = (
-            "" if expected is None else f" ({minutes(taken)} in all, estimate {minutes(expected.seconds)})"
-        )
         around = trainer.surroundings
         beside = "" if around is None else f" and {around.surfels.count} of the background"
         text = (
-            f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s{total}, "
-            f"{trainer.surfels.count} surfels{beside}; next: refgs eval {self.output}"
+            f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s "
+            f"({taken:.0f} s in all), {trainer.surfels.count} surfels{beside}; next: refgs eval {self.output}"
         )
         if trainer.fit.decisions:
-            data["terms"] = list(trainer.method.components)  # name of this key in version 0.1
+            data["components"] = list(trainer.method.components)
             data["decisions"] = trainer.fit.decisions
             if any(row["with_it"] for row in trainer.fit.decisions):  # a trial that measured a gain
                 text = f"{table(trainer.fit.decisions)}\n{text}"

@@ -17,14 +17,13 @@ from typing import Any
 from mi_refgs import __version__
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
-from mi_refgs.fitting.plan import sized
 from mi_refgs.fitting.select import as_decided
 from mi_refgs.io.files import read_json, write_json
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import differences, load
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.views import read_views
+from mi_refgs.runs.views import read_views, sized
 
 RUNS = "runs"
 """Folder of the runs: runs/<data>/<method>/seed<k>."""

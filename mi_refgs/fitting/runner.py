@@ -3,7 +3,6 @@ it."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +29,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import exposure, poses
 from mi_refgs.fitting.metal_trial import install_metal_trial
 from mi_refgs.fitting.objective import require_losses
-from mi_refgs.fitting.plan import Estimate, planned
 from mi_refgs.fitting.select import DECISIONS, as_decided, install_trials, with_components
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
@@ -39,7 +37,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import MODEL
-from mi_refgs.runs.views import read_views, with_region
+from mi_refgs.runs.views import read_views, sized, with_region
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
 Tell = Callable[[str], None]  # is called with sentences for the user
@@ -56,20 +54,16 @@ class Choice:
     alpha the method that fits their background too. A `Method` is fitted as it is."""
     preset: str | None = None  # "standard" by default
     settings: Settings = ()
-    minutes: float | None = None  # time that the fit may take; a resumed run has to have its size of images
 
     def __post_init__(self) -> None:
         if isinstance(self.method, Method) and (self.preset or self.settings):
             raise InputError("method: preset, settings: a Method has its own; change it, or name one")
-        if self.minutes is not None and not 0 < self.minutes < math.inf:
-            raise InputError(f"--minutes: {self.minutes} is no time; give more than 0")
 
 
 class Progress:
     """A listener to a fit that displays nothing; subclasses override methods."""
 
     trainer: Trainer | None = None  # of the fit, also after its end
-    expected: Estimate | None = None  # of a new fit
 
     def say(self, message: str) -> None:
         """Is called with messages about the fit and its decisions."""
@@ -101,7 +95,7 @@ def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Pro
     resumed = resume and run.exists()
     if not resumed:
         run.require_none()
-    method = _resumed_method(run, data, choice) if resumed else _new_method(data, choice, progress)
+    method = _resumed_method(run, choice) if resumed else _new_method(data, choice, progress)
     views = read_views(method, data, "train", truth=False)
     if note := few_views(len(views.views)):
         progress.warn(f"{views.path}: {note}")
@@ -123,24 +117,13 @@ def _new_method(data: Path, choice: Choice, progress: Progress) -> Method:
         name = choice.method or method_for(data, None, choice.preset, choice.settings, progress.say)
         wanted = load_method(name, choice.preset, choice.settings)
     require_losses(wanted)
-    if choice.minutes is not None and wanted.data.downscale is not None:
-        raise InputError(
-            f"--minutes: data.downscale={wanted.data.downscale} decides the size of images; drop either"
-        )
-    method, progress.expected = planned(wanted, data, choice.minutes and 60 * choice.minutes, progress.say)
-    if progress.expected is not None:
-        progress.say(progress.expected.sentence(method.iterations))
-    return method
+    return sized(wanted, data, progress.say)
 
 
-def _resumed_method(run: Run, data: Path, choice: Choice) -> Method:
+def _resumed_method(run: Run, choice: Choice) -> Method:
     """The method of a run; raises InputError if the choice would have made another one."""
     method = run.method()
     _require_same(run, method, choice)
-    if choice.minutes is not None:
-        free = methods.with_components(method, ()).downscaled(None)  # as it was planned
-        size = planned(free, data, 60 * choice.minutes)[0].data.downscale
-        _require(run, "--minutes", method, method.downscaled(size))
     return method
 
 

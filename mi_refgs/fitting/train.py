@@ -283,25 +283,21 @@ class Trainer:
         return mesh
 
     @contextmanager
-    def held_in_stage(
-        self, name: str, first: int | None = None, share_light: bool = False
-    ) -> Iterator[Callable[[], None]]:
+    def held_in_stage(self, name: str) -> Iterator[Callable[[], None]]:
         """Keep steps within a stage, for measurements: nothing is refined, extracted, decided or saved.
 
-        Yields a function to call before each step. Steps start at iteration `first`, by default near the end
-        of the stage, where every SH degree is in use. Every step filters its light, so that all steps are
-        alike, unless they `share_light` as in a fit. Afterwards the iteration is what it was before.
+        Yields a function to call before each step. Steps start near the end of the stage, where every SH
+        degree is in use. Every step filters its light, so that all steps are alike. Afterwards the iteration
+        is what it was before.
         """
         setup, before = self.setup, self.iteration
         end = setup.method.stage[name].until
         begin = max((x.until for _, x in setup.method.stages() if x.until < end), default=0)
         again = min(begin + 1, end - 1)  # the first iteration of a stage may reset materials
-        if first is not None:
-            self.fit.iteration = first
-        elif not again <= before < end:
+        if not again <= before < end:
             self.fit.iteration = max(again, end - 100)
         light = setup.method.light
-        if light is not None and not share_light:
+        if light is not None:
             light = replace(light, every=1)
         still = replace(setup.method, refine=Refine(), mesh=None, exposure=None, cameras=None, light=light)
         self.setup = FitSetup(still, setup.data)

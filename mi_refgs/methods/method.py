@@ -304,12 +304,6 @@ class DataOptions:
         )
         return max(wide, 1), max(high, 1)
 
-    def pixels_at(self, iteration: int, width: int, height: int) -> int:
-        """Pixels that a (1-based) iteration renders of an image."""
-        block = self.block_at(iteration, width * height)
-        wide, high = self.crop_of(width // block, height // block)
-        return wide * high
-
 
 @dataclass(frozen=True)
 class MethodComponent:

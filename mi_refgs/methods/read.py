@@ -62,15 +62,14 @@ class Preset:
     iterations: int
     surfels: int
     max_surfels: int
-    pixels: int  # per image; larger ones are downscaled when methods are compared, or without `minutes`
-    minutes: float | None = None  # per fit at most, on two cores; larger images are downscaled for that
+    pixels: int  # per image at most; larger ones are downscaled by the smallest whole factor
 
 
-# About 4 and 11 minutes for 200² images on one AVX-512 core; the last follows from these. A step of 256²
-# pixels takes 1.14 times as long as one of 200², one of 400² 1.9 times; the paper's images have 800².
+# A step of 256² pixels takes 1.14 times as long as one of 200², one of 400² 1.9 times; the paper's images
+# have 800². None is below 256².
 PRESETS = {
-    "quick": Preset(2_000, 15_000, 20_000, 256 * 256, 5.0),
-    "standard": Preset(4_000, 25_000, 40_000, 256 * 256, 30.0),
+    "quick": Preset(2_000, 15_000, 20_000, 256 * 256),
+    "standard": Preset(4_000, 25_000, 40_000, 400 * 400),
     "paper": Preset(50_000, 30_000, 100_000, 800 * 800),
 }
 START_FRACTION = 0.75
@@ -80,7 +79,7 @@ START_FRACTION = 0.75
 def preset_of(text: str) -> Preset:
     """Return the preset of a name, or of ITERATIONS:SURFELS, the largest number of surfels: "1000:20000".
 
-    The latter has no limits of pixels and minutes. Raises InputError for any other text.
+    The latter has no limit of pixels. Raises InputError for any other text.
     """
     if text in PRESETS:
         return PRESETS[text]

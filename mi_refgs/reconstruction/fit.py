@@ -30,7 +30,6 @@ def fit(
     method: str | Path | Method | None = None,
     *,
     preset: str | None = None,
-    minutes: float | None = None,
     settings: runner.Settings = (),
     output: str | Path | None = None,
     resume: bool = False,
@@ -41,8 +40,7 @@ def fit(
     method: a method of the package (`variants/`), the path of a .toml, or a `Method`; None fits what the
     scene needs of the full method (`auto`), and to images without alpha background Gaussians too. preset: how
     long, "quick", "standard" (the default), "paper", or iterations and largest number of surfels,
-    "1000:20000". minutes: time that the fit may take, which chooses the image size.
-    settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"].
+    "1000:20000". settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"].
 
     output: the run folder, which is kept. Without one a temporary folder is used, which is removed with the
     last `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`, if there is
@@ -61,7 +59,7 @@ def fit(
         output = temporary.path
         listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")
     try:
-        choice = runner.Choice(str(method) if isinstance(method, Path) else method, preset, settings, minutes)
+        choice = runner.Choice(str(method) if isinstance(method, Path) else method, preset, settings)
         runner.fit(Path(data), Path(output), choice, resume=resume, progress=listener)
     except KeyboardInterrupt:
         if temporary is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +11,31 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import Method
+from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.run import DATASET, Run
+
+
+def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:
+    """The method with the size of images decided: its own `data.downscale`, or the smallest that brings them
+    to the pixels of its preset.
+
+    `tell` is called if images are downscaled. Raises InputError as `read_dataset` does.
+    """
+    if method.data.downscale is not None:
+        return method
+    pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
+    factor, width, height = fitting_downscale(path, method.data.images, pixels)
+    if factor > 1:
+        tell(
+            f"{path}: images of {width} × {height} pixels are read as {width // factor} × "
+            f"{height // factor}; preset {method.preset} takes {pixels:,} pixels at most, --set "
+            f"data.downscale=1 reads them whole"
+        )
+    return method.downscaled(factor)
 
 
 def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mi_refgs import llvm
 from mi_refgs.cli import doctor
-from mi_refgs.fitting import cost_model
 from tests.helpers import run_process
 
 
@@ -65,15 +63,3 @@ def test_doctor_reports_missing_library() -> None:
     assert done.returncode == 1
     assert "PROBLEM: DRJIT_LIBLLVM_PATH=/none/libLLVM.so does not exist" in done.stdout
     assert f"unset {llvm.ENVIRONMENT_VARIABLE}" in done.stdout
-
-
-def test_doctor_lists_measured_speeds(
-    report: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(cost_model.FOLDER_VARIABLE, str(tmp_path))
-    assert "none measured yet" in doctor.text(report | {"speeds": cost_model.summary()})
-    for threads in (1, 2):
-        cost_model.kept({"threads": threads}, lambda: cost_model.Speed({"all": [1.0, 2.0]}, 0.0, 0.0))
-    text = doctor.text(report | {"speeds": cost_model.summary()})
-    assert "1 measured with 1 thread;" in text and "1 measured with 2 threads" in text
-    assert f"in {tmp_path}, which may be removed to measure them anew" in text

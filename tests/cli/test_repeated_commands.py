@@ -25,7 +25,6 @@ from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs
 from mi_refgs.compare.jobs import Job
-from mi_refgs.fitting import cost_model, plan
 from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import BusyError
@@ -82,7 +81,6 @@ KEPT: dict[str, dict[str, Row]] = {
         "--method": refuses("--method", "{other}"),
         "--for": Refused(("--for", "relighting"), ("--for",)),
         "--preset": refuses("--preset", "standard"),
-        "--minutes": refuses("--minutes", "0.001"),
         "--set": refuses("--set", "loss.ssim=0.4"),
         "--resume": Free("absent, the run is refused: see test_a_run_is_not_begun_twice"),
         "--watch": Free("shows the fit"),
@@ -213,9 +211,6 @@ def began(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Began:
     """Outputs of commands, and what takes long left out of their repetition."""
-    slow = cost_model.Speed({"initial": [1.0, 4.0], "deferred": [1.0, 4.0]}, 0.0, 0.0)
-    for name, value in {"speed_of": lambda *_: slow, "WORTH": 0, "LEAST": 10, "SMALL_IMAGE": 0}.items():
-        monkeypatch.setattr(plan, name, value)
     out = tmp_path / "out"
 
     def train() -> list[str]:
@@ -336,7 +331,7 @@ def test_same_command_resumes(began: Began) -> None:
     argv, out = began("train")
     state = tree(out / "checkpoints")
     config = Run(out).method()
-    for more in ([], ["--minutes", "1e6"], ["--method", config.file], ["--preset", "quick"]):
+    for more in ([], ["--method", config.file], ["--preset", "quick"]):
         assert main([*argv, *more]) == 0
     assert main([*argv[:4], "--resume"]) == 0 and tree(out / "checkpoints") == state
     refused([*argv[:4], "--resume", "--for", "relighting"], "--for")
@@ -351,13 +346,6 @@ def test_resume_refuses_changed_method(began: Began, places: dict[str, str]) -> 
     longer = dataclasses.replace(made, iterations=500)
     again = lambda: reconstruct.fit(data, longer, output=out, resume=True, progress=Progress())  # noqa: E731
     refused(again, "method: iterations: the run was started with 6", " 500")
-
-
-def test_minutes_and_downscale_exclude_each_other(places: dict[str, str], tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    argv = train_command(Path(places["data"]), out, Path(places["method"]), "--minutes", "5")
-    refused([*argv, "data.downscale=1"], "--minutes: data.downscale=1")
-    assert not out.exists()
 
 
 def test_comparison_keeps_its_mitsuba_variant(began: Began) -> None:
