@@ -3,7 +3,7 @@
 `import mi_refgs` chooses a usable LLVM for Dr.Jit (`mi_refgs.llvm`) and registers the Mitsuba plugins
 (`mi_refgs.plugins`): at once if a variant is set, and after every switch. It may come before or after
 `mi.set_variant`, and should come before `import mitsuba`, so that it can still choose the LLVM. The public
-names are those of `__init__.pyi`; their modules are imported on first use, so that the import is quick.
+names are those of `mi_refgs.public`, which is imported on first use, so that the import is quick.
 
 Without a usable LLVM and without a CUDA device, the import warns (RuntimeWarning) and names the remedy.
 `mi.set_variant` to an LLVM variant then raises ImportError; if one is set already, the import does.
@@ -11,40 +11,34 @@ Without a usable LLVM and without a CUDA device, the import warns (RuntimeWarnin
 
 from __future__ import annotations
 
-import ast
-import importlib
+import importlib.util
 import warnings
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mi_refgs import llvm
 
+if TYPE_CHECKING:
+    from mi_refgs.public import *  # noqa: F403
+
 __version__ = "0.1.0"
-
-PUBLIC: dict[str, tuple[str, str]] = {}
-"""Public name → the module that defines it, and its name there, from `__init__.pyi`."""
-
-for _node in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body:
-    if isinstance(_node, ast.ImportFrom):  # from MODULE import NAME as NAME
-        PUBLIC |= {alias.name: (str(_node.module), alias.name) for alias in _node.names}
-    elif isinstance(_node, ast.Assign):  # NAME = MODULE.INNER
-        _module, _, _inner = ast.unparse(_node.value).rpartition(".")
-        PUBLIC[ast.unparse(_node.targets[0])] = (_module, _inner)
-
-__all__ = sorted(PUBLIC)
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use. [PEP 562]"""
-    if name not in PUBLIC:
+    """Import a module of the package, or all public names, at the first use of one. [PEP 562]"""
+    if name.startswith("_") and name != "__all__":
+        raise AttributeError(name)
+    if importlib.util.find_spec(f"{__name__}.{name}"):
+        return importlib.import_module(f"{__name__}.{name}")
+    found = vars(importlib.import_module(f"{__name__}.public"))
+    found = {key: value for key, value in found.items() if not key.startswith("_")}
+    globals().update(found, __all__=[*found])
+    if name not in globals():
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    module, inner = PUBLIC[name]
-    value = globals()[name] = getattr(importlib.import_module(module), inner)
-    return value
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__getattr__("__all__")]
 
 
 llvm.select()

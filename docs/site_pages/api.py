@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 
 import mi_refgs
-from mi_refgs.registry import Registry
 from site_pages import ROOT
 
 FIRST = ("reconstruct", "reconstruction")
@@ -31,10 +30,11 @@ def page() -> str:
 def by_package() -> dict[str, list[tuple[str, str]]]:
     """First name below `mi_refgs` → public names, and where each is defined."""
     found: dict[str, list[tuple[str, str]]] = {}
-    for name, (module, inner) in mi_refgs.PUBLIC.items():
-        registry = isinstance(getattr(getattr(mi_refgs, name), "__self__", None), Registry)
-        target = "mi_refgs.registry.Registry.register" if registry else f"{module}.{inner}"
-        found.setdefault(module.split(".")[1], []).append((name, target))
+    for name in mi_refgs.__all__:
+        value = getattr(mi_refgs, name)
+        found.setdefault(value.__module__.split(".")[1], []).append(
+            (name, f"{value.__module__}.{value.__qualname__}")
+        )
     return dict(sorted(found.items(), key=lambda item: (item[0] not in FIRST, item[0])))
 
 

@@ -112,8 +112,6 @@ def _check(attribute: Attribute) -> None:
 ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check)
 """Every attribute by name, in the order of the surfel model."""
 
-Channel = Attribute  # former name, for one release
-
 
 def register(attribute: Attribute) -> Attribute:
     """Add an attribute, which is returned, to surfel models, PLY files, method files, AOVs and the plugin.

@@ -30,13 +30,13 @@ FLOORS: list[set[str]] = [
     {"reconstruction"},
     {"relighting"},
     {"viewer"},
-    {"cli"},
+    {"cli", "public"},
     {"__main__"},
 ]
 """Folders and modules of the package from the ground up: each imports from the floors below it only.
 
 Those of one floor do not import each other. `reference` imports `constants` only, and nothing of the package
-imports it. The package's own `__init__` contains the public names: folders import only `__version__` from it.
+imports it. `public` has the public names; of the package's own `__init__`, folders import only `__version__`.
 """
 
 PATHS = sorted((ROOT / "mi_refgs").rglob("*.py"))
@@ -121,7 +121,7 @@ def test_numpy_arrays_reach_the_device_by_upload() -> None:
 
 
 def test_package_root_has_few_modules() -> None:
-    assert len([*(ROOT / "mi_refgs").glob("*.py")]) <= 8
+    assert len([*(ROOT / "mi_refgs").glob("*.py")]) <= 9
 
 
 def test_no_test_module_imports_a_test_module() -> None:

@@ -139,7 +139,7 @@ def test_wheel_contains_the_package_and_nothing_else(built: Path) -> None:
         for path in (ROOT / "scenes").rglob("*")
         if path.suffix in {".toml", ".xml", ".ply", ".exr"}
     }
-    assert expected | {"mi_refgs/py.typed", "mi_refgs/__init__.pyi"} <= packed
+    assert expected | {"mi_refgs/py.typed"} <= packed
     tops = {name.split("/")[0] for name in packed}
     assert tops == {"mi_refgs", *(top for top in tops if top.endswith(".dist-info"))}
     assert points["console_scripts"]["refgs"] == "mi_refgs.cli:main"

@@ -1,15 +1,8 @@
-# The public names, each stated once: `mi_refgs.NAME` is imported from where this file says on first use.
+"""The public names: `mi_refgs.NAME` is NAME of this module, which is imported at the first use of one."""
 
-import mi_refgs.data.dataset
-import mi_refgs.fitting.objective
-import mi_refgs.formats.format
-import mi_refgs.methods.read
-import mi_refgs.render.pipeline
-import mi_refgs.shade.reflectance
-import mi_refgs.surfels.attributes
-import mi_refgs.surfels.primitives
 from mi_refgs.data.dataset import Dataset as Dataset
 from mi_refgs.data.dataset import read_dataset as read_dataset
+from mi_refgs.data.dataset import register_reader as register_reader
 from mi_refgs.data.images import Pixels as Pixels
 from mi_refgs.data.view import View as View
 from mi_refgs.editing.options import EditOptions as EditOptions
@@ -47,7 +40,6 @@ from mi_refgs.shade.reflectance.model import SurfelView as SurfelView
 from mi_refgs.shade.shading import Shading as Shading
 from mi_refgs.splat.camera import Camera as Camera
 from mi_refgs.surfels.attributes import Attribute as Attribute
-from mi_refgs.surfels.attributes import Channel as Channel
 from mi_refgs.surfels.init import from_points as from_points
 from mi_refgs.surfels.ply import read_ply as read_ply
 from mi_refgs.surfels.ply import write_ply as write_ply
@@ -55,18 +47,3 @@ from mi_refgs.surfels.primitives import Primitive as Primitive
 from mi_refgs.surfels.table import Surfels as Surfels
 from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
 from mi_refgs.synthesis.options import DatasetOptions as DatasetOptions
-
-FormatOption = mi_refgs.formats.format.Option
-load_method = mi_refgs.methods.read.load
-register_attribute = mi_refgs.surfels.attributes.register
-register_channel = mi_refgs.surfels.attributes.register
-register_format = mi_refgs.formats.format.register
-register_loss = mi_refgs.fitting.objective.register
-register_primitive = mi_refgs.surfels.primitives.register
-register_reader = mi_refgs.data.dataset.register_reader
-register_reflectance = mi_refgs.shade.reflectance.register
-render_frame = mi_refgs.render.pipeline.render
-
-__all__: list[str]
-__version__: str
-PUBLIC: dict[str, tuple[str, str]]
