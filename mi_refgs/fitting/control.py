@@ -1,4 +1,4 @@
-"""Adaptive control: densification, pruning, resets, propagation, relocation and restarts of a fit's surfels.
+"""Adaptive control: densification, pruning, resets, propagation and restarts of a fit's surfels.
 
 Surfels that cross the border of the region of interest change tables: one of the object that is more than
 MARGIN radii outside becomes one of the background, with its geometry and the spherical harmonics of the
@@ -112,20 +112,13 @@ class AdaptiveControl:
 
     def changes_rows(self, iteration: int) -> bool:
         """Whether surfels are added or removed after this iteration."""
-        densify, relocate = self.options.densify, self.options.relocate
-        due = densify is not None and densify.due(iteration)
-        return due or (relocate is not None and relocate.when.due(iteration))
+        return self.options.densify is not None and self.options.densify.due(iteration)
 
     def refine(self, iteration: int) -> None:
         """Apply the edits that are due after this iteration."""
         options, state = self.options, self.state
         if options.densify is not None and options.densify.due(iteration):
             self._densify(iteration)
-        if options.relocate is not None and options.relocate.when.due(iteration):
-            draws = self.setup.rng(iteration, "relocate")
-            for table in state.tables:
-                table.apply(refine.relocate(table.surfels, options.relocate, table.max_count, draws))
-            state.occluder.vertex_surfels = None
 
         # Resets and propagation: of the object only, since the background map would replace the background's
         # surfels, blurred.
@@ -214,19 +207,6 @@ class AdaptiveControl:
         for table, edit in zip(self.state.tables, edits, strict=True):
             table.apply(edit)
         self.state.occluder.vertex_surfels = None
-
-    def wander(self, iteration: int) -> None:
-        """Apply the random step of positions that follows the optimiser's. [3DGS-MCMC]"""
-        options, extent = self.options.relocate, self.setup.data.scene_extent
-        if options is None or not options.noise or not options.when.start < iteration <= options.when.until:
-            return
-        for table in self.state.tables:
-            name = f"{table.prefix}position"
-            rate = self.state.optimiser.rate(name, iteration - 1) / extent
-            moved = refine.wander(table.surfels, rate, extent, options, iteration, self.setup.method.seed)
-            dr.eval(moved)
-            dr.enable_grad(moved)
-            self.state.params[name] = moved
 
     def restart(self, names: tuple[str, ...], iteration: int) -> None:
         """Set attributes, and the light if it is named, back to their initial values, without history."""

@@ -358,7 +358,6 @@ class Trainer:
             dr.schedule(self.loss, self.error)
         fit.optimiser.stage = stage.rates
         fit.optimiser.step(iteration - 1, self.loss)
-        control.wander(iteration)
 
     def _decide_exposure(self) -> None:
         """Decide about gains, if that is due, and continue with them or without."""

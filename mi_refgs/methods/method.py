@@ -151,19 +151,6 @@ class Propagation:
 
 
 @dataclass(frozen=True)
-class Relocation:
-    """Transparent surfels move onto visible ones, and positions take random steps until the window ends.
-
-    [3DGS-MCMC, Kheradmand et al. 2024]
-    """
-
-    when: Window  # iterations of its events
-    opacity: float = 0.005  # surfels of at most this opacity are moved
-    grow: float = 0.0  # fraction of the surfels that is added at each event, up to max_count
-    noise: float = 1e7  # of positions: 5e5 per squared unit where the extent is 4.5 units; 0: none
-
-
-@dataclass(frozen=True)
 class Refine:
     """Adaptive density control [3DGS §5.2; Ref-Gaussian §3.4], by error [Rota Bulò et al. 2024]."""
 
@@ -176,7 +163,6 @@ class Refine:
     reset_opacity: float = 0.01  # after a reset, at most
     reset_raise: tuple[str, ...] = ()  # attributes that a reset raises to at least their initial value
     propagate: Propagation | None = None  # normal propagation; absent: none
-    relocate: Relocation | None = None  # of transparent surfels; absent: none
 
 
 @dataclass(frozen=True)

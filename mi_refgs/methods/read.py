@@ -435,7 +435,7 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
 
 def _require_consistent(method: Method, where: str) -> None:
     """Raise InputError for unknown names, values out of range, and stages without what they need."""
-    surfels, light, relocate = method.surfels, method.light, method.refine.relocate
+    surfels, light = method.surfels, method.light
     for name, table in (("surroundings", method.surroundings), ("surfels", surfels)):
         try:
             attributes = {*table.names} if table is not None else set()
@@ -473,8 +473,6 @@ def _require_consistent(method: Method, where: str) -> None:
         ranges.append(("cameras.rate", method.cameras.rate, method.cameras.rate >= 0, "0 or more"))
     ranges.append(("surfels.capacity", surfels.capacity, surfels.capacity > 0, "more than 0"))
     ranges.append(("refine.grow", method.refine.grow, method.refine.grow >= 0, "0 or more"))
-    if relocate is not None:
-        ranges.append(("refine.relocate.grow", relocate.grow, relocate.grow >= 0, "0 or more"))
     if (metals := method.metal_trial) is not None:
         ranges.append(("metal_trial.until", metals.until, metals.until >= 1, "1 or more"))
     if (around := method.surroundings) is not None:

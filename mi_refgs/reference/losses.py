@@ -1,4 +1,4 @@
-"""Losses, depth normals, Adam and relocation in float64.
+"""Losses, depth normals and Adam in float64.
 
 Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fast path.
 """
@@ -154,19 +154,3 @@ def adam(
         corrected_m, corrected_v = m / (1 - 0.9**t), v / (1 - 0.999**t)
         θ = θ - rate * corrected_m / (np.sqrt(corrected_v) + epsilon / math.sqrt(1 - 0.999**t))
     return θ
-
-
-def relocated(opacity: float, number: int) -> tuple[float, float]:
-    """Opacity of each of `number` Gaussians, and the factor of their scales: eq. 9 as printed."""
-    new = 1 - (1 - opacity) ** (1 / number)
-    total = 0.0
-    for i in range(1, number + 1):
-        for k in range(i):
-            total += math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
-    return new, opacity / total
-
-
-def line_integral(opacity: float, number: int, scale: float, steps: int = 20_000) -> float:
-    """∫ 1 - (1 - o exp(-x²/2s²))^N dx along a line through their centre, by the middles of equal steps."""
-    x = 20 * scale * ((np.arange(steps) + 0.5) / steps - 0.5)
-    return float(20 * scale * np.mean(1 - (1 - opacity * np.exp(-0.5 * (x / scale) ** 2)) ** number))

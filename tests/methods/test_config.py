@@ -349,7 +349,6 @@ SURROUNDINGS = dict(count=0, degree=4, scattered=1.5, size=0, prune_extent=-1, r
         ("stage.deferred.rates.light=nan", "out of range"),
         ("surfels.from_images=['metallic']", "metallic"),
         ("surfels.attributes=['metallic', 'roughness']", "albedo"),
-        ("refine.relocate={when={start=0, until=9, every=3}, grow=-0.1}", r"relocate\.grow: -0\.1"),
         ("refine.grow=-0.1", r"refine\.grow: -0\.1"),
         ("loss.ssim=1.5", r"loss\.ssim\.weight: 1.5 is out of range; give a fraction from 0 to 1"),
         ("loss.normal=-0.1", r"loss\.normal\.weight: -0.1 is out of range; give 0 or more"),

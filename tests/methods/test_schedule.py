@@ -37,7 +37,7 @@ def test_views_come_once_an_epoch_in_an_order_of_its_own() -> None:
 
 def test_draws_follow_seed_iteration_and_operation() -> None:
     """Two operations of one iteration share no random numbers, nor does one with the next iteration."""
-    keys = [(seed, i, name) for seed in (0, 1) for i in (0, 1, 2) for name in ("densify", "relocate", "r")]
+    keys = [(seed, i, name) for seed in (0, 1) for i in (0, 1, 2) for name in ("densify", "propagate", "r")]
     draws = [schedule(seed).rng(i, name).random() for seed, i, name in keys]
     assert len(set(draws)) == len(draws)
     assert draws == [schedule(seed).rng(i, name).random() for seed, i, name in keys]

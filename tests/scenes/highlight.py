@@ -44,7 +44,6 @@ prune_extent = 1.0
 reset = { start = 0, until = 24, every = 14 }
 reset_raise = ["metallic"]
 propagate = { when = { start = 0, until = 24, every = 5 }, hold = 4, noise = 0.1 }
-relocate = { when = { start = 3, until = 24, every = 7 }, opacity = 0.2, grow = 0.1, noise = 1e5 }
 [data]
 coarse = [{ until = 6, block = 3 }, { until = 12, block = 2 }]
 [loss]
