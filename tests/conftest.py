@@ -25,7 +25,7 @@ from tests.scenes.tiny import train_command, write_data, write_method
 # simplified, since examples are mostly seeds.
 settings.register_profile(
     "mi_refgs",
-    max_examples=25,
+    max_examples=8,
     derandomize=True,
     database=None,
     deadline=None,

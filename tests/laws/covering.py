@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
 
+import pytest
+
 Dimensions = Mapping[str, Sequence[Hashable]]
 Case = dict[str, Any]
 Combination = tuple[tuple[str, Any], ...]
@@ -100,3 +102,14 @@ def _candidate(
         partial[name] = next(v for v in values if completed(partial | {name: v}, dimensions, rules))
     covered = {c: None for name in dimensions for c in new(partial, name)}
     return {name: partial[name] for name in dimensions}, [*covered]
+
+
+def marked(cases: Sequence[Mapping[str, Any]]) -> list[Sequence[pytest.MarkDecorator]]:
+    """Marks of cases: slow, unless one has a value that none before it has."""
+    seen: set[tuple[str, str]] = set()
+    marks: list[Sequence[pytest.MarkDecorator]] = []
+    for case in cases:
+        values = {(name, str(value)) for name, value in case.items()}
+        marks.append([] if values - seen else [pytest.mark.slow])
+        seen |= values
+    return marks

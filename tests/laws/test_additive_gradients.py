@@ -129,6 +129,10 @@ SCENES: dict[str, Callable[[Path], Any]] = {
 }
 
 
+SAMPLE = {"3D Gaussians", "surroundings at surfels", "traced bounces", "resampled envmap", "BSDF, prb"}
+"""Scenes that are tested without `-m slow`."""
+
+
 # ---------------- losses ----------------
 
 
@@ -251,7 +255,10 @@ class Losses:
 # ---------------- the law ----------------
 
 
-@pytest.fixture(scope="module", params=SCENES)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=() if name in SAMPLE else pytest.mark.slow) for name in SCENES],
+)
 def losses(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Losses:
     mi.set_variant("llvm_ad_rgb")
     scene = SCENES[request.param](tmp_path_factory.mktemp("scene"))

@@ -1,9 +1,8 @@
 """Every two values of any two options in some image: the float64 reference's, with its derivatives.
 
-Rays beyond the mirror ray are no option here, because the reference does not trace them.
-
-A case that fails is one line; `pytest tests/laws/test_option_pairs.py -k "[17]"` runs case 17 alone. With
-`--hypothesis-profile thorough`, every three values of any three options.
+Without `-m slow`, only enough of the cases to have each value once. Rays beyond the mirror ray are no option
+here, because the reference does not trace them. `-k "[17]"` runs case 17 alone. With `--hypothesis-profile
+thorough`, every three values of any three options.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.reference.models import MODELS as REFERENCE_MODELS
 from mi_refgs.render.load_scene import reason
 from mi_refgs.shade.reflectance import MODELS
-from tests.laws.covering import Case, combinations_of, completed, covering_array
+from tests.laws.covering import Case, combinations_of, completed, covering_array, marked
 from tests.laws.option_cases import DIMENSIONS, RULES, spec, unlisted_accuracy
 from tests.laws.option_oracle import Oracle
 from tests.laws.option_scenes import AROUND, Built, Values, build, values
@@ -52,7 +51,11 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "case" in metafunc.fixturenames:
         thorough = metafunc.config.getoption("--hypothesis-profile") == "thorough"
         found = cases(3 if thorough else 2)
-        metafunc.parametrize("case", found, ids=range(len(found)))
+        params = [
+            pytest.param(case, id=str(i), marks=m)
+            for i, (case, m) in enumerate(zip(found, marked(found), strict=True))
+        ]
+        metafunc.parametrize("case", params)
 
 
 @pytest.fixture

@@ -1,7 +1,8 @@
 """One image by every route: whichever way a scene is rendered, its image and every AOV are the same.
 
 Routes, states of a scene and features are lists that the test crosses: every shading of every method and of
-every registered reflectance model goes through every route, and every pair of the other features occurs.
+every registered reflectance model goes through every route, and every pair of the other features occurs;
+without `-m slow`, only enough of the cases to have each of them once.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, composited
 from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
-from tests.laws.covering import covering_array
+from tests.laws.covering import covering_array, marked
 from tests.scenes.integrator import (
     OTHER_OPTIONS,
     background_light,
@@ -354,12 +355,17 @@ def cases() -> Iterator[Any]:
     count = max(len(SHADINGS), len(ROWS))
     crossed = [(*SHADINGS[i % len(SHADINGS)], ROWS[i % len(ROWS)]) for i in range(count)]
     alone = {"samples": 4, "crop": True, "around": "nothing", "meshed": False, "state": through_a_ply}
-    for index, (shading, primitive, row) in enumerate([*crossed, *((*one, alone) for one in LOSSLESS)]):
+    crossed += [(*one, alone) for one in LOSSLESS]
+    values = [
+        row | dict.fromkeys((*shading.chosen(), shading.at, shading.reflectance))
+        for shading, _, row in crossed
+    ]
+    for index, ((shading, primitive, row), marks) in enumerate(zip(crossed, marked(values), strict=True)):
         options = "-".join(shading.chosen())
         rays = "traced" if shading.occlusion else "open"
         state = row["state"].__name__
         name = f"{primitive}-{shading.at}-{shading.reflectance}-{shading.diffuse}-{rays}-{options}-{state}"
-        yield pytest.param(shading, primitive, row, index % 3, id=name)
+        yield pytest.param(shading, primitive, row, index % 3, id=name, marks=marks)
 
 
 # ---------------- the law ----------------

@@ -169,7 +169,7 @@ def test_alpha_is_the_composited_feature_one(scene: Scene, seed: int) -> None:
 
 
 @BOTH
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(scene=SCENES, seed=SEEDS)
 def test_view_does_not_depend_on_other_views(shading: Shading, scene: Scene, seed: int) -> None:
     """Gradients of views one by one add up to those of a set, and an image is the same in any set."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -72,6 +72,23 @@ def make_scene(seed: int) -> Scene:
     # Round once, so that both sides see the same float32 numbers.
     raw = {name: values.astype(np.float32).astype(np.float64) for name, values in raw.items()}
     return Scene(raw, rng.uniform(size=(count, 4)).astype(np.float32).astype(np.float64), camera)
+
+
+def make_gaussians(seed: int) -> Scene:
+    """The surfels of `make_scene` with a third axis, needles and pancakes among them, and some whose centres
+    lie beside the image."""
+    scene = make_scene(seed)
+    rng, count = np.random.default_rng(seed + 7), len(scene.features)
+    scale = np.concatenate([scene.raw["scale"], np.log(rng.uniform(0.005, 0.4, (count, 1)))], axis=1)
+    position, kind = scene.raw["position"].copy(), np.arange(count) % 10
+    scale[kind == 3] = np.log(0.002)
+    scale[kind == 7] = np.log([0.5, 0.5, 1e-4])
+    scale[kind == 8] = np.log([1.0, 1e-3, 1e-3])
+    beside = kind == 9
+    position[beside] += scene.camera.to_world[:3, 0] * rng.choice([-2.5, 2.5], (beside.sum(), 1))
+    scale[beside] = np.log(0.8)
+    raw = scene.raw | {"scale": scale, "position": position}
+    return replace(scene, raw={n: x.astype(np.float32).astype(np.float64) for n, x in raw.items()})
 
 
 def quaternion_to(normal: np.ndarray) -> np.ndarray:

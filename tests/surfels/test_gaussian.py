@@ -1,15 +1,12 @@
-"""3D Gaussians by EWA against their float64 reference: images, both derivatives, lists, degenerate rows."""
+"""3D Gaussians by EWA: what `tests/splat` does not compare with surfels."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs import constants
-from mi_refgs.cli import main
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS
 from mi_refgs.fitting import refine
 from mi_refgs.methods import Refine
@@ -22,50 +19,14 @@ from mi_refgs.render.pipeline import Request, Shading, SurfelScene, render
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.splats import (
-    DEGENERATE,
-    Scene,
-    check_degenerate,
-    check_gradients,
-    check_image,
-    check_lists,
-    check_reference_slopes,
-    check_transpose,
-    fast_maps,
-    make_scene,
-)
-from tests.scenes.tiny import train_command, write_data, write_method
+from tests.scenes.splats import Scene, fast_maps, make_gaussians
 
 IMAGE_TOLERANCE = 1e-5  # observed 2e-6
-GRADIENT_TOLERANCE = 1e-3  # relative L2
-
-
-def gaussians(seed: int) -> Scene:
-    """The surfels of `make_scene` (sub-pixel, clamped, behind the camera, on top of each other) with a third
-    axis, needles and pancakes among them, and some whose centres lie beside the image."""
-    scene = make_scene(seed)
-    rng, count = np.random.default_rng(seed + 7), len(scene.features)
-    scale = np.concatenate([scene.raw["scale"], np.log(rng.uniform(0.005, 0.4, (count, 1)))], axis=1)
-    position, kind = scene.raw["position"].copy(), np.arange(count) % 10
-    scale[kind == 3] = np.log(0.002)
-    scale[kind == 7] = np.log([0.5, 0.5, 1e-4])
-    scale[kind == 8] = np.log([1.0, 1e-3, 1e-3])
-    beside = kind == 9
-    position[beside] += scene.camera.to_world[:3, 0] * rng.choice([-2.5, 2.5], (beside.sum(), 1))
-    scale[beside] = np.log(0.8)
-    raw = scene.raw | {"scale": scale, "position": position}
-    raw = {name: values.astype(np.float32).astype(np.float64) for name, values in raw.items()}
-    return Scene(raw, scene.features, scene.camera)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_image_matches_oracle(seed: int) -> None:
-    check_image(gaussians(seed), IMAGE_TOLERANCE)
 
 
 def test_reference_footprints_match_textbook_matrices() -> None:
     """J W Σ Wᵀ Jᵀ + λ I of one Gaussian after another, where its centre is in view."""
-    scene, compared = gaussians(8), 0
+    scene, compared = make_gaussians(8), 0
     camera = scene.camera
     at = np.stack([v.ravel() + 0.5 for v in np.meshgrid(range(camera.width), range(camera.height))], axis=1)
     sample = exact.footprint(scene.raw, camera, Rules(), *at.T)
@@ -87,44 +48,6 @@ def test_reference_footprints_match_textbook_matrices() -> None:
     assert compared >= 10
 
 
-def test_the_oracles_derivatives_are_its_differences() -> None:
-    check_reference_slopes(gaussians(8))
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_gradients_match_the_oracle(seed: int) -> None:
-    check_gradients(gaussians(seed), seed, GRADIENT_TOLERANCE)
-
-
-@pytest.mark.parametrize("tile", [size for _, size in constants.TILE_SIZES], ids=str)
-def test_images_and_gradients_with_every_tile_size(
-    tile: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(constants, "TILE_SIZES", ((np.inf, tile),))
-    check_image(gaussians(12), IMAGE_TOLERANCE)
-    check_gradients(gaussians(8), 8, GRADIENT_TOLERANCE)
-
-
-@pytest.mark.parametrize("seed", [3, 9, 14])
-def test_forward_mode_is_the_transpose_of_reverse(seed: int) -> None:
-    check_transpose(gaussians(seed), seed)
-
-
-@pytest.mark.parametrize("seed", range(0, 20, 3))
-def test_tile_lists_hold_what_contributes_and_little_else(seed: int) -> None:
-    scene = gaussians(seed)
-    lists = check_lists(scene, exact, most=1.25)
-    begin, end, row = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
-    depth = exact.sort_key(scene.raw, scene.camera, np.zeros(1, int), (0, 0))[:, 0]
-    for first, last in zip(begin, end, strict=True):
-        assert np.all(np.diff(depth[row[first:last]]) >= 0)
-
-
-@pytest.mark.parametrize("case", DEGENERATE)
-def test_degenerate_rows_stay_finite(case: str) -> None:
-    check_degenerate(gaussians(9), case)
-
-
 def test_point_covers_the_area_of_the_low_pass() -> None:
     """Far below a pixel only the filter is left: 2π λ pixels, of which the cut takes α_min / o."""
     raw = {
@@ -139,9 +62,6 @@ def test_point_covers_the_area_of_the_low_pass() -> None:
         scene = Scene(raw, np.zeros((1, 0)), oracle.PinholeCamera(16, 16, -20, -20, x, y, np.eye(4)))
         mass += fast_maps(scene).alpha.numpy().sum() / places**2
     assert mass == pytest.approx(2 * np.pi * GAUSSIAN_LOW_PASS * (0.5 - ALPHA_MIN), rel=1e-2)
-
-
-# ---------------- tables ----------------
 
 
 def test_rendered_3dgs_file_matches_the_oracle(tmp_path: Path) -> None:
@@ -160,7 +80,7 @@ def test_rendered_3dgs_file_matches_the_oracle(tmp_path: Path) -> None:
     raw["scale"] += rng.normal(size=(60, 3)).astype(np.float32)
     raw["radiance_sh"][:, 3:] = 0.2 * rng.normal(size=(60, 24))
     write_ply(tmp_path / "3dgs.ply", Surfels.from_numpy(raw))
-    surfels, scene = read_ply(tmp_path / "3dgs.ply"), gaussians(15)
+    surfels, scene = read_ply(tmp_path / "3dgs.ply"), make_gaussians(15)
     camera = scene.camera
     drawn = SurfelScene(surfels, Shading(at="surfel", reflectance="radiance"))
     frame = render(drawn, scene.fast_camera(), Request(("normal",)))
@@ -177,13 +97,8 @@ def test_rendered_3dgs_file_matches_the_oracle(tmp_path: Path) -> None:
 
 def test_the_normal_is_the_shortest_axis() -> None:
     scales = np.log([[1, 2, 3], [2, 1, 3], [3, 2, 1], [1, 1, 1], [1, 1, 2]])
-    raw = {
-        "position": np.zeros((5, 3)),
-        "rotation": np.random.default_rng(0).normal(size=(5, 4)),
-        "scale": scales,
-        "opacity": np.zeros((5, 1)),
-    }
-    surfels = Surfels.from_numpy(raw)
+    raw = {"position": np.zeros((5, 3)), "scale": scales, "opacity": np.zeros((5, 1))}
+    surfels = Surfels.from_numpy(raw | {"rotation": np.random.default_rng(0).normal(size=(5, 4))})
     axes = np.stack([np.array(axis).T for axis in surfels.frame()], axis=1)
     expected = axes[np.arange(5), [0, 1, 2, 2, 0]]
     normal = np.array(surfels.primitive.normal(surfels)).T
@@ -206,13 +121,3 @@ def test_a_gaussian_is_split_along_its_longest_axis() -> None:
     np.testing.assert_allclose(offsets, expected, atol=1e-6)
     shrunk = np.exp(children["scale"] - raw["scale"][[0, 1, 0, 1]])
     np.testing.assert_allclose(shrunk, np.where(expected, refine.SPLIT_SCALE, 1), rtol=1e-5)
-
-
-def test_the_whole_method_runs_on_them(tmp_path: Path) -> None:
-    """Both stages, the mesh, the run's files and its scene; the method only names another primitive."""
-    data, run = write_data(tmp_path / "data"), tmp_path / "run"
-    command = train_command(data, run, write_method(tmp_path))
-    assert main([*command, "surfels.primitive='gaussian'"]) == 0
-    assert read_ply(run / "surfels.ply").primitive.name == "gaussian"
-    assert main(["eval", str(run)]) == 0
-    assert np.isfinite(np.array(mi.render(mi.load_file(str(run / "scene.xml"))))).all()
