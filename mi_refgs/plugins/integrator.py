@@ -38,7 +38,7 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
-from mi_refgs.surfels.primitives import require_known_primitive
+from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0
@@ -213,7 +213,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for attributes that are required but absent."""
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
-        require_known_primitive(self.surfels.raw)
+        primitive_of(self.surfels.raw)
         self.shading.require_inputs(self.surfels.raw, mesh=self.occluder is not None)
         for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
             if not self.surfels.has(name):

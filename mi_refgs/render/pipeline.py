@@ -32,7 +32,7 @@ from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.surfels.attributes import attribute
-from mi_refgs.surfels.primitives import require_known_primitive
+from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, Float, Point3f, Vector3f
 
@@ -120,7 +120,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     `Shading.require_inputs` does.
     """
     require_supported_variant("mi_refgs.render_frame")
-    require_known_primitive(scene.surfels.raw)
+    primitive_of(scene.surfels.raw)
     scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
     view = _View.of(*_without_empty_tables(scene, request), camera)
     frame, buffer = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)

@@ -24,7 +24,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.kernels.rows import columns_of
 from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
-from mi_refgs.surfels.primitives import Primitive, primitive_of, require_known_primitive
+from mi_refgs.surfels.primitives import Primitive, primitive_of
 from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, Vector3f
 
 QUATERNION_FLOOR = 1e-12
@@ -119,7 +119,7 @@ class Surfels:
     def validate(self) -> None:
         """Raise InputError if a shape is wrong, an attribute missing, or a value not finite."""
         self._check_shapes()
-        require_known_primitive(self.raw)
+        primitive_of(self.raw)
         for name, tensor in self.raw.items():
             bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
             if bad:

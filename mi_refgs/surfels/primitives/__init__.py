@@ -10,7 +10,6 @@ from mi_refgs.surfels.primitives.primitive import evaluating_both as evaluating_
 from mi_refgs.surfels.primitives.primitive import nearest_primitive as nearest_primitive
 from mi_refgs.surfels.primitives.primitive import primitive_of as primitive_of
 from mi_refgs.surfels.primitives.primitive import register as register
-from mi_refgs.surfels.primitives.primitive import require_known_primitive as require_known_primitive
 from mi_refgs.surfels.primitives.surfel import Surfel
 
 register(Surfel())

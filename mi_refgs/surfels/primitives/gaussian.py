@@ -19,34 +19,29 @@ needles and pancakes keep their digits in float32.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS, GAUSSIAN_SLOPE_MARGIN, SIZE_RANGE
 from mi_refgs.surfels.primitives.primitive import (
     Footprints,
-    Primitive,
+    FootprintSample,
+    Oriented,
     cutoff_radius_squared,
     dot2,
+    projected,
     rectangle,
-    rotation_axes,
-    sorted_frame,
 )
 from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
 
 @dataclass(frozen=True)
-class GaussianSample:
+class GaussianSample(FootprintSample):
     """A Gaussian's footprint at one pixel, with the intermediate values that its derivatives reuse."""
 
-    alpha: Float  # after the clamp
-    z: Float  # depth of the centre
-    valid: Bool  # contributes: α ≥ ALPHA_MIN
     gaussian: Float  # exp(-ρ/2)
     clamped: Bool  # α_max was reached: no derivative
     delta: Vector2f  # pixel offset from the centre
@@ -64,13 +59,12 @@ def _as_surfel(columns: list[Float]) -> list[Float]:
     return [a_x, a_y, none, b, none, none, *others]
 
 
-class Gaussian(Primitive):
+class Gaussian(Oriented):
     """A 3D Gaussian with three standard deviations along the axes of a rotation. [3DGS, §4]"""
 
     name = "gaussian"
     widths = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1}  # noqa: RUF012
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
-    sizes = ("scale",)
     rows_as = {"surfel": _as_surfel}  # noqa: RUF012
     first_order = True
 
@@ -79,14 +73,9 @@ class Gaussian(Primitive):
 
         Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
         """
-        p = camera.to_camera(surfels.position())
+        ahead, z, nearness, slope = projected(surfels, camera)
         axes = [camera.rotate_to_camera(t) for t in surfels.frame()]
         s, opacity = surfels.scale(), surfels.opacity()
-        ahead = dr.detach((p.z > camera.near) & (p.z > 0))
-        # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.
-        z = dr.select(ahead, p.z, 1)
-        nearness = dr.rcp(z)
-        slope = mi.Vector2f(p.x, p.y) * nearness
         visible = ahead & dr.detach(
             (opacity >= ALPHA_MIN) & dr.isfinite(dr.sum(slope) + dr.sum(s) + opacity + dr.square(nearness))
         )
@@ -164,19 +153,6 @@ class Gaussian(Primitive):
     def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
         """The centre's depth: samples lie there, and other programs fit in this order. [3DGS, §6]"""
         return row[3]
-
-    def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
-        """A ball with the neighbours' distance as standard deviation; third axis: the normal. [3DGS, §5.1]"""
-        return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 3, axis=1)}
-
-    def like(self, axes: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
-        """With the same axes; a flat one is thin."""
-        rotation, s = sorted_frame(axes, deviations)
-        return {"rotation": rotation, "scale": np.log(s)}
-
-    def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The three axes, and the standard deviations along them."""
-        return rotation_axes(raw["rotation"]), np.exp(raw["scale"])
 
 
 def _near_image(slope: Any, camera: Any) -> Any:

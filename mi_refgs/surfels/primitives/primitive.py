@@ -49,20 +49,13 @@ class Footprints:
         return self.columns if primitive is own else own.rows_as[primitive.name](self.columns)
 
 
-class FootprintSample(Protocol):
+@dataclass(frozen=True)
+class FootprintSample:
     """One footprint at one pixel; a primitive adds the intermediate values that its derivatives reuse."""
 
-    @property
-    def alpha(self) -> Float:
-        """Opacity, at most ALPHA_MAX."""
-
-    @property
-    def z(self) -> Float:
-        """Camera-z depth, scene units."""
-
-    @property
-    def valid(self) -> Bool:
-        """Whether it contributes: α ≥ ALPHA_MIN, and beyond the near plane."""
+    alpha: Float  # opacity, at most ALPHA_MAX
+    z: Float  # camera-z depth, scene units
+    valid: Bool  # whether it contributes: α ≥ ALPHA_MIN, and beyond the near plane
 
 
 class Adjoint(Protocol):
@@ -162,6 +155,25 @@ class Primitive(ABC):
             raw[name][rows] += np.log(factor) * (np.arange(raw[name].shape[1]) == along[:, None])
 
 
+class Oriented(Primitive):
+    """A primitive with a `rotation`, and a `scale` along the first two of its axes, or all three."""
+
+    sizes = ("scale",)
+
+    def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
+        """Round in these axes, with the neighbours' distance as standard deviation. [3DGS, §5.1]"""
+        return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], self.widths["scale"], 1)}
+
+    def like(self, axes: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
+        """With the same axes: a disc in the plane of the two longest, or a Gaussian, thin if it is flat."""
+        rotation, s = sorted_frame(axes, deviations)
+        return {"rotation": rotation, "scale": np.log(s[:, : self.widths["scale"]])}
+
+    def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The axes of `scale`, and the standard deviations along them."""
+        return rotation_axes(raw["rotation"])[:, : self.widths["scale"]], np.exp(raw["scale"])
+
+
 def _check(primitive: Primitive) -> None:
     mine = {*primitive.widths.items()}
     for other in PRIMITIVES.values():
@@ -209,11 +221,6 @@ def primitive_of(raw: Mapping[str, Any]) -> Primitive:
     raise InputError(f"surfels: {name}: the attribute is missing; add it, every {nearest.name} needs it")
 
 
-def require_known_primitive(raw: Mapping[str, Any]) -> None:
-    """Raise InputError unless raw attributes (N, D) are those of a primitive."""
-    primitive_of(raw)
-
-
 def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
     """The one of two primitives that evaluates the rows of both; raises InputError if neither does."""
     for one, other in ((first, second), (second, first)):
@@ -226,6 +233,18 @@ def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
 
 
 # ---------------- what all primitives share ----------------
+
+
+def projected(surfels: Any, camera: Any) -> tuple[Bool, Float, Float, Vector2f]:
+    """Which centres lie beyond the near plane, their depth z, 1 / z, and (x, y) / z in the camera's frame.
+
+    Depths of the others are 1: a masked Inf would still poison the adjoint.
+    """
+    p = camera.to_camera(surfels.position())
+    ahead = dr.detach((p.z > camera.near) & (p.z > 0))
+    z = dr.select(ahead, p.z, 1)
+    nearness = dr.rcp(z)
+    return ahead, z, nearness, mi.Vector2f(p.x, p.y) * nearness
 
 
 def cutoff_radius_squared(opacity: Float) -> Float:

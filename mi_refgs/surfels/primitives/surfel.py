@@ -20,13 +20,11 @@ intersection may be anywhere along the ray).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_refgs.constants import (
     ALPHA_MAX,
@@ -40,24 +38,21 @@ from mi_refgs.constants import (
 )
 from mi_refgs.surfels.primitives.primitive import (
     Footprints,
-    Primitive,
+    FootprintSample,
+    Oriented,
     cutoff_radius_squared,
     dot2,
+    projected,
     rectangle,
-    rotation_axes,
-    sorted_frame,
 )
 from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
 
 @dataclass(frozen=True)
-class SurfelSample:
+class SurfelSample(FootprintSample):
     """A surfel's footprint at one pixel, with the intermediate values that its derivatives reuse."""
 
-    alpha: Float  # after the clamp
-    z: Float  # depth of the sample
     ratio: Float  # of that to the depth of the centre
-    valid: Bool  # contributes: α ≥ ALPHA_MIN and beyond the near plane
     gaussian: Float  # exp(-ρ/2)
     clamped: Bool  # α_max was reached: no derivative
     low_pass: Bool  # the 2D filter decides
@@ -66,13 +61,12 @@ class SurfelSample:
     v: Float
 
 
-class Surfel(Primitive):
+class Surfel(Oriented):
     """A flat Gaussian: the point p(u, v) = position + s_u u t_u + s_v v t_v, n = t_u × t_v. [2DGS, §4.1]"""
 
     name = "surfel"
     widths = {"position": 3, "rotation": 4, "scale": 2, "opacity": 1}  # noqa: RUF012
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
-    sizes = ("scale",)
 
     def project(self, surfels: Any, camera: Any) -> Footprints:
         """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
@@ -80,15 +74,9 @@ class Surfel(Primitive):
         Culled: centre not beyond the near plane, edge-on by EDGE_ON_COSINE, opacity below ALPHA_MIN,
         non-finite.
         """
-        p = camera.to_camera(surfels.position())
+        ahead, z, nearness, slope = projected(surfels, camera)
         t_u, t_v, n = (camera.rotate_to_camera(t) for t in surfels.frame())
         s, opacity = surfels.scale(), surfels.opacity()
-
-        ahead = dr.detach((p.z > camera.near) & (p.z > 0))
-        # Divide by harmless numbers where culled: a masked Inf would still poison the adjoint.
-        z = dr.select(ahead, p.z, 1)
-        nearness = dr.rcp(z)
-        slope = mi.Vector2f(p.x, p.y) * nearness
         qn = dr.fma(slope.x, n.x, dr.fma(slope.y, n.y, n.z))
         visible = ahead & dr.detach(
             (dr.abs(qn) > EDGE_ON_COSINE * dr.sqrt(dr.fma(slope.x, slope.x, dr.fma(slope.y, slope.y, 1))))
@@ -133,7 +121,7 @@ class Surfel(Primitive):
         ratio = dr.select(low_pass, 1, ratio)
         z = row[6] * ratio
         valid = (alpha >= ALPHA_MIN) & (z > near)
-        return SurfelSample(alpha, z, ratio, valid, gaussian, clamped, low_pass, delta, u, v)
+        return SurfelSample(alpha, z, valid, ratio, gaussian, clamped, low_pass, delta, u, v)
 
     def adjoint(self) -> FootprintAdjoint:
         """See `Primitive.adjoint`."""
@@ -209,19 +197,6 @@ class Surfel(Primitive):
         u, v = dot2(a_x, a_y, delta), dot2(b_x, b_y, delta)
         inside = dr.minimum(1, SORT_REACH * dr.rsqrt(dr.maximum(dr.fma(u, u, v * v), NORM_FLOOR)))
         return z / dr.maximum(dr.fma(inside, dot2(c_x, c_y, delta), 1), 1 / SORT_DEPTH_RANGE)
-
-    def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
-        """A disc in the tangent plane, with the neighbours' distance as standard deviation."""
-        return {"rotation": rotation, "scale": np.repeat(np.log(spacing)[:, None], 2, axis=1)}
-
-    def like(self, axes: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
-        """In the plane of the two longest axes."""
-        rotation, s = sorted_frame(axes, deviations)
-        return {"rotation": rotation, "scale": np.log(s[:, :2])}
-
-    def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The two tangents, and the standard deviations along them."""
-        return rotation_axes(raw["rotation"])[:, :2], np.exp(raw["scale"])
 
 
 class FootprintAdjoint:
