@@ -93,36 +93,21 @@ def _machine() -> float:
 
 
 def _groups() -> list[float]:
-    """Bytes that the control groups (version 2, else 1) of this process leave, without page cache."""
-    found = []
+    """Bytes that the control groups (version 2) of this process leave, without page cache."""
     try:
         lines = (PROC / "self/cgroup").read_text().splitlines()
     except OSError:
         return []
-    for line in lines:
-        _, controllers, place = line.split(":", 2)
-        if controllers == "":
-            names, root = ("memory.max", "memory.current"), CGROUPS
-        elif "memory" in controllers.split(","):
-            names, root = ("memory.limit_in_bytes", "memory.usage_in_bytes"), CGROUPS / "memory"
-        else:
-            continue
-        inside = root / place.strip("/")
-        for folder in (inside, *inside.parents):
-            if root not in (folder, *folder.parents):
-                break
-            found.append(_left(folder, *names))
-    return found
+    places = [CGROUPS / line.removeprefix("0::/") for line in lines if line.startswith("0::")]
+    groups = (group for place in places for group in (place, *place.parents))
+    return [_left(group) for group in groups if group.is_relative_to(CGROUPS)]
 
 
-def _left(group: Path, limit: str, usage: str) -> float:
+def _left(group: Path) -> float:
     try:
-        text = (group / limit).read_text().strip()
-        if text == "max":
-            return math.inf
-        used = float((group / usage).read_text())
+        limit = float((group / "memory.max").read_text().strip().replace("max", "inf"))
         stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
         cache = sum(float(stat.get(name, 0)) for name in ("active_file", "inactive_file"))
-        return max(float(text) - used + cache, 0)
+        return max(limit - float((group / "memory.current").read_text()) + cache, 0)
     except (OSError, ValueError):
         return math.inf
