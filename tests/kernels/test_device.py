@@ -94,7 +94,7 @@ import mi_refgs, mitsuba as mi, drjit as dr, numpy as np
 mi.set_variant("llvm_ad_rgb")
 from mi_refgs.kernels.device import upload, upload_tensor
 
-def guarded(dtype, *shape):  # copied to the end of pages that none follows: to read beyond it ends the process
+def guarded(dtype, *shape):  # at the end of pages that none follows: to read beyond it ends the process
     values = (np.arange(np.prod(shape)) % 7).astype(dtype)
     size, pages = values.nbytes, -(-values.nbytes // mmap.PAGESIZE)
     memory = mmap.mmap(-1, (pages + 1) * mmap.PAGESIZE)

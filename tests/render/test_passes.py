@@ -69,13 +69,13 @@ def renderer(shading: Shading, samples: int, folder: Path, around: bool = False)
     return TrainedScene(surfels, light, mesh, shading, 1, 0.0, surroundings=beside).renderer(samples=samples)
 
 
-@pytest.mark.parametrize("samples", [1, 16])
-@pytest.mark.parametrize("around", [False, True])
-@pytest.mark.parametrize("name", SHADINGS)
+@pytest.mark.parametrize("case", range(len(SHADINGS)))
 def test_a_frame_in_passes_is_the_whole_frame(
-    name: str, around: bool, samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    case: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    view = renderer(SHADINGS[name], samples, tmp_path, around)
+    """Each shading with one or 16 samples, and every other two of them with surroundings."""
+    name, samples = [*SHADINGS][case], (16, 1)[case % 2]
+    view = renderer(SHADINGS[name], samples, tmp_path, around=case % 4 < 2)
     eye = Camera.from_sensor(mi.load_dict(sensor()))
     whole = dict(leaves(view(eye)))
     monkeypatch.setattr(passes, "PASS_SAMPLES", FEW if samples > 1 else 64)
@@ -86,11 +86,10 @@ def test_a_frame_in_passes_is_the_whole_frame(
         np.testing.assert_allclose(parts[key], value, atol=2e-5, err_msg=key)
 
 
-@pytest.mark.parametrize("samples", [1, 4])
-@pytest.mark.parametrize("name", SHADINGS)
-def test_a_crop_window_is_part_of_the_whole(name: str, samples: int, tmp_path: Path) -> None:
-    """With the random numbers of the whole, and the neighbours beside the window."""
-    view = renderer(SHADINGS[name], samples, tmp_path)
+@pytest.mark.parametrize("case", range(len(SHADINGS)))
+def test_a_crop_window_is_part_of_the_whole(case: int, tmp_path: Path) -> None:
+    """With the random numbers of the whole, and the neighbours beside the window; 1 or 4 samples."""
+    view = renderer([*SHADINGS.values()][case], (1, 4)[case % 2], tmp_path)
     crop = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
     cameras = (Camera.from_sensor(mi.load_dict(sensor(film=film))) for film in ({}, crop))
     whole, part = (dict(leaves(view(camera))) for camera in cameras)

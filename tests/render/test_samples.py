@@ -14,19 +14,18 @@ from mi_refgs.data import dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.evaluate import evaluate
-from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.plugins.aovs import AOV, aov_values
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import supersampled
 from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import (
     HEIGHT,
@@ -60,8 +59,7 @@ def block_means(values: np.ndarray, factor: int) -> np.ndarray:
     return values.reshape(HEIGHT, factor, WIDTH, factor, -1).mean((1, 3))
 
 
-@pytest.mark.parametrize("samples, factor", [(2, 2), (9, 3)])
-@pytest.mark.parametrize("at", ["surfel", "pixel"])
+@pytest.mark.parametrize("samples, factor, at", [(2, 2, "surfel"), (9, 3, "pixel")])
 def test_a_pixel_is_the_mean_of_its_samples(samples: int, factor: int, at: str) -> None:
     """Radiance, terms, normals and alpha as they are; depth and maps by alpha."""
     shading = Shading(at=at, diffuse="irradiance")  # type: ignore[arg-type]
@@ -94,20 +92,17 @@ def test_one_sample_is_the_pixel_centre_and_none_is_refused() -> None:
 
 def test_eval_encodes_the_mean_of_linear_radiance(tmp_path: Path) -> None:
     """PSNR with 2 × 2 samples is that of srgb(mean L / mean A), not of the mean of encoded samples."""
-    data = write_data(tmp_path / "ball")
-    method = methods.load(str(write_method(tmp_path)), "quick", SETTINGS)
-    run = Run(tmp_path / "run")
-    run.create(method, str(data))
-    Trainer(method, dataset.read_dataset(data, "train"), run).train()
-    evaluate(run)
-    raw = TrainedScene.read(run.path).surfels.to_numpy()
+    data, run = write_data(tmp_path / "ball"), Run(tmp_path / "run")
+    run.create(methods.load(str(write_method(tmp_path)), "quick", SETTINGS), str(data))
+    views = dataset.read_dataset(data, "test")
+    raw = raw_channels(200)  # neighbours that differ
     raw["radiance_sh"] = np.random.default_rng(1).normal(scale=10, size=raw["radiance_sh"].shape)
-    raw["scale"] -= 1.0
-    write_ply(run.path / "surfels.ply", Surfels.from_numpy(raw))  # neighbours that differ
+    raw["position"], raw["scale"] = raw["position"] / 2, raw["scale"] - 2
+    made = TrainedScene(Surfels.from_numpy(raw), None, None, Shading("surfel", "radiance"), 1, 0.0)
+    export(made, run.path, views.views[0].camera())
     once, result = evaluate(run), evaluate(run, samples=4)
     assert once["samples"] == 1 and result["samples"] == 4
     assert abs(once["psnr"] - result["psnr"]) > 1e-3
-    made, views = TrainedScene.read(run.path), dataset.read_dataset(data, "test")
     scores, encoded_first = [], []
     for view in (view.load() for view in views.views):
         small = view.camera()
@@ -127,8 +122,7 @@ def test_eval_encodes_the_mean_of_linear_radiance(tmp_path: Path) -> None:
     assert abs(np.mean(encoded_first) - np.mean(scores)) > 1e-3
 
 
-@pytest.mark.parametrize("spp", [4, 9])
-@pytest.mark.parametrize("at, around", [("pixel", False), ("surfel", False), ("pixel", True)])
+@pytest.mark.parametrize("spp, at, around", [(4, "pixel", False), (9, "surfel", False), (4, "pixel", True)])
 def test_aovs_of_several_samples_are_premultiplied_means_divided_once(
     spp: int, at: str, around: bool
 ) -> None:
