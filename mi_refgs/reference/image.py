@@ -42,6 +42,10 @@ class Scene:
     options: Options = field(default_factory=Options)  # but its `diffuse`, which is the one above
     antialias: bool = False  # the mean over each pixel; of all pixels of the camera, and without gradients
     terms: bool = False  # also the terms of the radiance, premultiplied; these give the light no gradient
+    around: dict[str, Array] | None = (
+        None  # M rows of the surroundings, last in `order` (N + M, P); no gradients
+    )
+    background: Array | None = None  # (h, 2h, 3) raw, seen behind both; radiance is log(1 + exp raw)
 
 
 @dataclass
@@ -60,17 +64,32 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
 
     `band` is the relative width of the declared discontinuities.
     """
-    raw = {name: np.asarray(x, np.float64) for name, x in scene.raw.items()}
-    camera = scene.camera
+    tables = [
+        {n: np.asarray(x, np.float64) for n, x in table.items()} for table in (scene.raw, scene.around or {})
+    ]
+    raw, around = tables
+    camera, count = scene.camera, len(raw["position"])
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    blend = Blend.of([raw], camera, scene.order, x, y, scene.rules)
+    blend = Blend.of([table for table in tables if table], camera, scene.order, x, y, scene.rules)
     features_of = Features(scene, raw)
     taps: list[tuple[Array, Array, Array]] = []
     features = features_of(features_of.columns, taps).real
-    sums = blend.sums(features)
+    # Features and alpha are those of the object, the depth is that of everything.
+    weight, depth = blend.weight[:count], np.sum(blend.weight * blend.z, 0)
+    sums = np.concatenate([weight.T @ features, depth[:, None], weight.sum(0)[:, None]], axis=1)
     resolve = Resolve(scene, features_of, x, y, sums)
+    if around:
+        resolve.depth = depth * inverse_alpha(blend.weight.sum(0))
     pixel_taps: list[tuple[Array, Array, Array]] = []
     maps = resolve.named(resolve(sums, pixel_taps).real)
+    if around:
+        colour = harmonics(around["radiance_sh"], unit(around["position"] - camera.to_world[:3, 3]))
+        maps["radiance"] = maps["radiance"] + blend.weight[count:].T @ positive(colour + 0.5)
+        maps |= {"object_alpha": maps["alpha"], "alpha": blend.weight.sum(0)[:, None]}
+        maps["depth"] = resolve.depth[:, None]
+    if scene.background is not None:
+        texels = np.log1p(np.exp(np.asarray(scene.background, np.float64)))
+        maps["background"] = radiance_of(texels, resolve.ray)
 
     image = Image(maps, blend.band(band), blend.shown, taps + pixel_taps)
     if weights is None:
@@ -185,8 +204,7 @@ class Resolve:
 
     def __call__(self, sums: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
         scene, alpha = self.scene, sums[:, -1:]
-        seen = alpha.real > c.COVERAGE_FLOOR
-        inverse = np.where(seen, 1 / np.where(seen, alpha, 1), 0)
+        inverse = inverse_alpha(alpha)
         blended = self.features.blended(sums[:, :-2])
         values = {name: x * inverse for name, x in blended.items() if name != "normal"}
         depth = sums[:, -2:-1] * inverse
@@ -239,6 +257,12 @@ class Resolve:
         return dict(zip(widths, np.split(values, np.cumsum([*widths.values()])[:-1], axis=1), strict=True))
 
 
+def inverse_alpha(alpha: Array) -> Array:
+    """1 / alpha, or 0 below COVERAGE_FLOOR."""
+    seen = alpha.real > c.COVERAGE_FLOOR
+    return np.where(seen, 1 / np.where(seen, alpha, 1), 0)
+
+
 def rays(camera: PinholeCamera, x: Array, y: Array) -> Array:
     """Unit directions (P, 3) in the world through points of the image (P,), in pixels."""
     ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
@@ -258,45 +282,3 @@ def bilinear_map(values: Array, x: Array, y: Array) -> Array:
         return values[clipped]
 
     return (1 - v) * ((1 - u) * at(0, 0) + u * at(1, 0)) + v * ((1 - u) * at(0, 1) + u * at(1, 1))
-
-
-# ---------------- scenes with a background ----------------
-
-
-@dataclass(frozen=True)
-class OpenScene:
-    """`scene` is the object, its `order` (N + M, P) of all rows, those of the surroundings last."""
-
-    scene: Scene
-    around: dict[str, Array]  # raw channels of M rows: geometry and radiance_sh
-    background: Array  # (h, 2h, 3) raw, radiance is log(1 + exp raw)
-
-
-def render_open(open_scene: OpenScene) -> tuple[dict[str, Array], Array]:
-    """Maps (P, …) of the object and of both, and pixels (P,) near a declared discontinuity."""
-    scene, camera = open_scene.scene, open_scene.scene.camera
-    own = {name: np.asarray(values, np.float64) for name, values in scene.raw.items()}
-    other = {name: np.asarray(values, np.float64) for name, values in open_scene.around.items()}
-    count = len(own["position"])
-    x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    blend = Blend.of([own, other], camera, scene.order, x, y, scene.rules)
-
-    features = Features(scene, own)
-    values = features(features.columns, []).real
-    direction = unit(other["position"] - camera.to_world[:3, 3])
-    colour = positive(harmonics(other["radiance_sh"], direction) + 0.5)
-    alpha = blend.weight.sum(0)
-    depth = np.sum(blend.weight * blend.z, 0)
-    share = blend.weight[:count].sum(0)
-    sums = np.concatenate([blend.weight[:count].T @ values, depth[:, None], share[:, None]], axis=1)
-    resolve = Resolve(scene, features, x, y, sums)
-    seen = alpha > c.COVERAGE_FLOOR
-    resolve.depth = np.where(seen, depth / np.where(seen, alpha, 1), 0)
-    maps = resolve.named(resolve(sums, []).real)
-    maps["object_alpha"] = share[:, None]
-    maps["alpha"] = alpha[:, None]
-    maps["depth"] = resolve.depth[:, None]
-    maps["radiance"] = maps["radiance"] + blend.weight[count:].T @ colour
-    texels = np.log1p(np.exp(np.asarray(open_scene.background, np.float64)))
-    maps["background"] = radiance_of(texels, resolve.ray)
-    return maps, blend.band(1e-4)

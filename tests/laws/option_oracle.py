@@ -111,13 +111,13 @@ class Oracle:
         scene = image.Scene(
             own, self.camera, self.pixels, self.order, chosen.at, chosen.reflectance, chosen.diffuse,
             light_of(self.case, values), options=self.options, terms=True, antialias=chosen.antialias,
+            around=around, background=values.get("background", np.full((8, 16, 3), -np.inf)),
         )  # fmt: skip
         if chosen.occlusion and chosen.model.visibility == "mirror":
             scene = replace(scene, visibility=self._visibility)
-        background = values.get("background", np.full((8, 16, 3), -np.inf))
-        maps, band = image.render_open(image.OpenScene(scene, around, background))
+        found = image.render(scene)
         visible = np.ones(len(self.pixels)) if self.visible is None else self.visible
-        return maps | {"visibility": visible[:, None]}, band
+        return found.maps | {"visibility": visible[:, None]}, found.band
 
     def _visibility(self, normal: Array, ray: Array) -> Array:
         """Visibility (P,) of the mirror direction, that of the first image."""

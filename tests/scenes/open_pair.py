@@ -78,7 +78,8 @@ class Pair:
         light = replace(exact.light_of(values["light"]), centre=CENTRE, nearness=self.nearness)
         scene = exact.scene_of(case, pixels, self.order, light)
         others = {name: values[f"surroundings/{name}"] for name in self.around}
-        return oracle.render_open(oracle.OpenScene(scene, others, values["background"]))
+        image = oracle.render(replace(scene, around=others, background=values["background"]))
+        return image.maps, image.band
 
     def frame(self, params: dict[str, Any], eye: Camera | None = None) -> Frame:
         surfels = Surfels({name: params[name] for name in self.case.raw})
