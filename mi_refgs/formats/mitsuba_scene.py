@@ -51,19 +51,17 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
 
     # The scene file
     scene = ElementTree.Element("scene", version="3.0.0")
-    put(scene, "default", "spp", str(SAMPLES))
+    ElementTree.SubElement(scene, "default", name="spp", value=str(SAMPLES))
     integrator = ElementTree.SubElement(scene, "integrator", type="path")
-    put(integrator, "integer", "max_depth", str(MAX_DEPTH))
-    put(integrator, "boolean", "hide_emitters", "true")
-    put(ElementTree.SubElement(scene, "emitter", type="envmap"), "string", "filename", LIGHT)
+    put(integrator, max_depth=MAX_DEPTH, hide_emitters=True)
+    put(ElementTree.SubElement(scene, "emitter", type="envmap"), filename=LIGHT)
     shape = ElementTree.SubElement(scene, "shape", type="ply", id="object")
-    put(shape, "string", "filename", MESH)
+    put(shape, filename=MESH)
     bsdf = ElementTree.SubElement(shape, "bsdf", type="principled")
     for name, file in TEXTURES.items():
         image = ElementTree.SubElement(bsdf, "texture", type="bitmap", name=name)
-        put(image, "string", "filename", file)
-        put(image, "boolean", "raw", str(name != "base_color").lower())
-    put(bsdf, "float", "specular", "0.5")
+        put(image, filename=file, raw=name != "base_color")
+    put(bsdf, specular=0.5)
     for index, shot in enumerate(shot for shot in shots if shot.split == shots[0].split):
         add_sensor(scene, shot.camera, f"sensor_{index}")
     write_xml(target / SCENE, scene)

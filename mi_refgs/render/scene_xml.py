@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,30 +51,18 @@ def write_scene_xml(path: str | Path, files: SceneFiles, shading: Shading, camer
         raise InputError(f"{path}: mesh: there is none to trace; give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
-    put(scene, "default", "spp", "1")
+    ElementTree.SubElement(scene, "default", name="spp", value="1")
     integrator = ElementTree.SubElement(scene, "integrator", type="refgs", id="refgs")
-    put(integrator, "string", "filename", files.ply)
-    put(integrator, "string", "shade_at", shading.at)
-    put(integrator, "string", "reflectance", shading.reflectance)
-    put(integrator, "string", "diffuse", shading.diffuse)
-    put(integrator, "boolean", "occlusion", str(shading.occlusion).lower())
-    for name in shading.chosen():
-        value = getattr(shading, name)
-        put(integrator, "boolean" if isinstance(value, bool) else "integer", name, str(value).lower())
-    if files.mesh is not None:
-        put(integrator, "string", "mesh", files.mesh)
+    put(integrator, filename=files.ply, shade_at=shading.at, reflectance=shading.reflectance)
+    put(integrator, diffuse=shading.diffuse, occlusion=shading.occlusion)
+    put(integrator, **{name: getattr(shading, name) for name in shading.chosen()}, mesh=files.mesh)
     if files.surroundings is not None:
         integrator.append(ElementTree.Comment(" without these two: the object alone, on transparency "))
-        put(integrator, "string", "surroundings", files.surroundings)
-    if isinstance(files.background, str):
-        put(integrator, "string", "background", files.background)
-    elif files.background is not None:
-        put(integrator, "rgb", "background", _numbers(files.background))
+    put(integrator, surroundings=files.surroundings, background=files.background)
     if files.envmap is not None:
         light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
-        put(light, "string", "filename", files.envmap)
-    if files.near_field is not None:
-        put(integrator, "string", "near_field", files.near_field)
+        put(light, filename=files.envmap)
+    put(integrator, near_field=files.near_field)
     for index, camera in enumerate(cameras):
         add_sensor(scene, camera, f"sensor_{index}" if index else "sensor")
     write_xml(path, scene)
@@ -83,7 +71,7 @@ def write_scene_xml(path: str | Path, files: SceneFiles, shading: Shading, camer
 def sensors_of(cameras: Sequence[Camera]) -> list[Any]:
     """Mitsuba sensors of cameras, as a scene.xml has them; raises InputError as `write_scene_xml` does."""
     scene = ElementTree.Element("scene", version="3.0.0")
-    put(scene, "default", "spp", "1")
+    ElementTree.SubElement(scene, "default", name="spp", value="1")
     for index, camera in enumerate(cameras):
         add_sensor(scene, camera, f"sensor_{index}")
     return list(mi.load_string(ElementTree.tostring(scene, encoding="unicode")).sensors())
@@ -95,12 +83,18 @@ def write_xml(path: str | Path, scene: ElementTree.Element) -> None:
     write_bytes(path, f"{ElementTree.tostring(scene, encoding='unicode')}\n".encode())
 
 
-def put(parent: ElementTree.Element, kind: str, name: str, value: str) -> None:
-    """Add a property to an element."""
-    ElementTree.SubElement(parent, kind, name=name, value=value)
+def put(parent: ElementTree.Element, **properties: bool | float | str | Sequence[float] | None) -> None:
+    """Add properties of an element by the types of their values: numbers are a colour, None is left out."""
+    kinds: dict[type, str] = {bool: "boolean", int: "integer", float: "float", str: "string"}
+    for name, value in properties.items():
+        if value is not None:
+            kind = kinds.get(type(value), "rgb")
+            text = _numbers(value) if kind == "rgb" else str(value)  # type: ignore[arg-type]
+            text = text.lower() if kind == "boolean" else text
+            ElementTree.SubElement(parent, kind, name=name, value=text)
 
 
-def _numbers(values: Any) -> str:
+def _numbers(values: Iterable[float]) -> str:
     return ", ".join(repr(float(x)) for x in values)
 
 
@@ -124,19 +118,14 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
         scene.append(ElementTree.Comment(f" the view of {size}, with square pixels "))
 
     sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id=name)
-    put(sensor, "string", "fov_axis", "x")
-    put(sensor, "float", "fov", repr(math.degrees(2 * math.atan(width / (2 * focal)))))
-    put(sensor, "float", "near_clip", repr(max(near, NEAR_CLIP_MIN)))
-    put(sensor, "float", "far_clip", repr(FAR_CLIP))
-    put(sensor, "float", "principal_point_offset_x", repr(0.5 - cx * per_pixel[0] / width))
-    put(sensor, "float", "principal_point_offset_y", repr(0.5 - cy * per_pixel[1] / height))
+    put(sensor, fov_axis="x", fov=math.degrees(2 * math.atan(width / (2 * focal))))
+    put(sensor, near_clip=max(near, NEAR_CLIP_MIN), far_clip=FAR_CLIP)
+    put(sensor, principal_point_offset_x=0.5 - cx * per_pixel[0] / width)
+    put(sensor, principal_point_offset_y=0.5 - cy * per_pixel[1] / height)
     transform = ElementTree.SubElement(sensor, "transform", name="to_world")
     ElementTree.SubElement(transform, "matrix", value=_numbers(to_world.ravel()))
     sampler = ElementTree.SubElement(sensor, "sampler", type="independent")
-    put(sampler, "integer", "sample_count", "$spp")
+    ElementTree.SubElement(sampler, "integer", name="sample_count", value="$spp")
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
-    put(film, "integer", "width", str(width))
-    put(film, "integer", "height", str(height))
-    put(film, "string", "pixel_format", "rgba")
-    put(film, "string", "component_format", "float32")
+    put(film, width=width, height=height, pixel_format="rgba", component_format="float32")
     ElementTree.SubElement(film, "rfilter", type="box")

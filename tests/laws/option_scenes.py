@@ -246,7 +246,7 @@ def _xml(value: dict[str, Any], name: str) -> ElementTree.Element:
         if key == "type":
             continue
         if isinstance(inner, dict) and inner["type"] == "rgb":
-            put(element, "rgb", key, ", ".join(repr(x) for x in inner["value"]))
+            put(element, **{key: inner["value"]})
         elif isinstance(inner, dict):
             element.append(_xml(inner, key))
         elif isinstance(inner, mi.ScalarTransform4f):
@@ -254,6 +254,5 @@ def _xml(value: dict[str, Any], name: str) -> ElementTree.Element:
             numbers = " ".join(repr(float(x)) for x in np.array(inner.matrix).ravel())
             ElementTree.SubElement(transform, "matrix", value=numbers)
         else:
-            tag = {bool: "boolean", int: "integer", float: "float", str: "string"}[type(inner)]
-            put(element, tag, key, str(inner).lower() if tag == "boolean" else str(inner))
+            put(element, **{key: inner})
     return element

@@ -405,15 +405,12 @@ def crop_sensor_of(path: Path, crop: bool) -> None:
     for old in root.findall("sensor"):
         root.remove(old)
     one = ElementTree.SubElement(root, "sensor", type="perspective", id="sensor")
-    put(one, "float", "fov", str(FOV))
-    put(one, "float", "near_clip", str(NEAR))
+    put(one, fov=FOV, near_clip=NEAR)
     transform = ElementTree.SubElement(one, "transform", name="to_world")
     pose = np.array(sensor().world_transform().matrix, np.float64).ravel()
     ElementTree.SubElement(transform, "matrix", value=" ".join(map(repr, map(float, pose))))
     film = ElementTree.SubElement(one, "film", type="hdrfilm")
-    for name, value in {"width": WIDTH, "height": HEIGHT, **(window() if crop else {})}.items():
-        put(film, "integer", name, str(value))
-    put(film, "string", "pixel_format", "rgba")
-    put(film, "string", "component_format", "float32")
+    put(film, width=WIDTH, height=HEIGHT, **(window() if crop else {}))
+    put(film, pixel_format="rgba", component_format="float32")
     ElementTree.SubElement(film, "rfilter", type="box")
     tree.write(path)
