@@ -41,8 +41,7 @@ than an 8-bit step, 1/255. [docs/decisions.md has time and error of other values
 
 LOW_PASS_INV_VARIANCE = 12.0
 """1/pixel²: the screen-space filter is a Gaussian of the variance of a pixel's box, 1/12. The 1/2 of 2DGS
-(§4.2) widens every outline by about a pixel, and a fit then shrinks the surface behind it
-(docs/decisions.md)."""
+(§4.2) widens outlines by about a pixel. [docs/decisions.md]"""
 
 EDGE_ON_COSINE = 1e-4
 """|cos| between a surfel's plane and the ray to its centre below which it is culled: it covers less than
@@ -55,8 +54,7 @@ The fourth powers of such ratios fit float32."""
 
 SORT_REACH = 1.0
 """Standard deviations from its centre up to which a surfel's plane tells its depth in a tile. Near-mirrors
-fitted with 0 (sorted by centres), 1 and 3 reach 26.0, 26.7 and 26.3 dB on test views: with a longer reach
-the order follows every error of a normal."""
+fitted with 0 (sorted by centres), 1 and 3 reach 26.0, 26.7 and 26.3 dB on test views."""
 
 SORT_DEPTH_RANGE = 5.0
 """Factor by which a surfel's depth in a tile may exceed that of its centre in the sort: a plane that turns
@@ -72,15 +70,13 @@ linearised at the margin's border instead of at the centre: far outside the view
 would cover the whole image. [3DGS, released code: 1.3 tan(fov/2)]"""
 
 TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
-"""Rows of (limit of the focal length, (tile width, tile height)), all in pixels: a camera has the tiles of
-the first row whose limit is above its focal length. The pixels of a tile share a list of surfels and its
-order: large tiles give one order to more of the image, and evaluate more surfels that miss a pixel; small
-ones need more lists. [measured, docs/decisions.md]"""
+"""Rows of (limit of the focal length, (tile width, tile height)), pixels: a camera has the tiles of the first
+row whose limit is above its focal length. Large tiles evaluate more surfels that miss a pixel, small ones
+need more lists. [docs/decisions.md]"""
 
 PATCH_EDGE = 8
 """Width and height, in pixels, of the patch that one SIMD vector works on: one tile of 8 × 8, or several
-smaller ones. With AVX-512, each of its 16 lanes has 4 pixels. A vector runs until the longest list of its
-tiles ends, so a patch joins neighbouring tiles, whose lists are alike."""
+smaller neighbours, whose lists are alike: a vector runs until the longest of them ends."""
 
 LANE_PIXELS_PER_AXIS = 2
 """Width and height, in pixels, of the square that a lane composites. It reads each surfel once for all pixels

@@ -18,17 +18,15 @@ from mi_refgs.occlusion.tsdf import TSDF
 
 COMPONENT_KEEP = 0.1
 """Area, relative to the largest connected component, from which a component is an object and not a floater.
-The released Ref-Gaussian code keeps the largest component only, which loses one of two objects that mirror
-each other."""
+The released Ref-Gaussian code keeps the largest only, and loses one of two objects."""
 
 ZERO_NUDGE = 1e-3
 """Distances closer to 0 than this (truncation units; 1/200 voxel) are moved away from it: a corner exactly on
 the surface makes triangles without area."""
 
 FOREIGN_RESOLUTION = 256
-"""Voxels along the bounding box's diagonal that a mesh made elsewhere counts as: about those of a fit, whose
-grid has 128 along the longest side. The number of triangles is no measure: two of them make an exact wall.
-Rays then start 0.8 % of the diagonal off the surface, and walls closer to each other do not occlude."""
+"""Voxels along the bounding box's diagonal that a mesh made elsewhere counts as, about those of a fit: rays
+start 0.8 % of the diagonal off the surface, and walls closer to each other do not occlude."""
 
 FORMATS = ("ply", "obj", "stl", "off")  # file endings that `read_mesh` accepts
 VOXEL_COMMENT = "voxel_size"  # key of the PLY comment with the voxel size of the extraction

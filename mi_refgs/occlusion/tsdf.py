@@ -37,8 +37,7 @@ TRUNCATION_VOXELS = 5.0
 
 UNSEEN_VOTE = 0.1
 """A voxel is inside while it has at most this many sightings per view with a surface before it, so that
-pixels which leak through thin places drill no tunnels; a cavity must be seen by 9 % of the views to stay
-open. Measured on splats with thin places: 12 % of the surface is false at 0.03, 0.5 % at 0.15."""
+pixels which leak through thin places drill no tunnels; 9 % of the views keep a cavity open."""
 
 RESOLUTION_MAX = 1023  # most voxels along one axis: three coordinates share one 32-bit word
 
@@ -101,18 +100,14 @@ def fuse(
     carve: bool = True,
     region: Region | None = None,
 ) -> TSDF:
-    """Fuse depth maps into a signed distance field over `bounds`.
+    """Fuse depth maps into a signed distance field over `bounds`. [Curless and Levoy 1996; weights behind the
+    surface: Bylow et al. 2013]
 
-    `resolution` is the number of voxels along the longest side. Depths (expected camera z, scene units; not
-    premultiplied) and alphas are `mi.Float` or `mi.TensorXf` of height·width values in raster order. The
-    iterables are read once, in step: with generators only one view is in memory. Depth where alpha <
-    ALPHA_SOLID is ignored; `carve`: such pixels are free space (for data with meaningful alpha). Detached;
-    every view runs the same compiled kernel. With a `region`, `bounds` are in its contracted space, and
-    `resolution` voxels are as long as the region is wide.
-
-    Curless and Levoy 1996 (weighted running mean); weight falling behind the surface as in Bylow et al. 2013,
-    so that the far side of thin parts is pushed away less. Raises InputError for an empty box or a resolution
-    that does not fit.
+    `resolution`: voxels along the longest side. Depths (expected camera z, scene units; not premultiplied)
+    and alphas are `mi.Float` or `mi.TensorXf` in raster order, read once: with generators only one view is in
+    memory. Depth where alpha < ALPHA_SOLID is ignored; with `carve`, such pixels are free space. With a
+    `region`, `bounds` are in its contracted space, and `resolution` voxels are as long as the region is wide.
+    Detached. Raises InputError for an empty box or a resolution that does not fit.
     """
     lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
     extent = hi - lo
@@ -259,10 +254,8 @@ def _sample(
 ) -> tuple[Any, Any, Any]:
     """Depth at a pixel position, whether it is a surface, and whether it is certainly background.
 
-    Bilinear where the four texels lie on one surface (they differ by less than `apart`, the truncation); else
-    the nearest texel, because a mean across a depth edge lies on no surface. A silhouette pixel is neither
-    surface nor background unless its nearest texel is solid: carving with half-covered pixels would eat the
-    object's rim."""
+    Bilinear where the four texels differ by less than `apart`, the truncation; else the nearest texel: a mean
+    across a depth edge lies on no surface. A silhouette is no background, or carving would eat the rim."""
     fx, fy = dr.floor(px), dr.floor(py)
     wx, wy = px - fx, py - fy
     x0, y0 = mi.Int32(fx), mi.Int32(fy)

@@ -16,12 +16,9 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Array, Bool, Float, Point2f, Point3f, UInt32, Vector3f
 
 OFFSET_VOXELS = 2.0
-"""Voxels by which a ray's origin leaves the surface along the normal. It must cover the mesh's own error
-(0.4 voxel measured on smooth shapes) and that of the expected depth. Measured on five shapes with points 1
-voxel too deep and normals off by 6°: a quarter of all rays is falsely occluded at 1 voxel, 0.1 % at 1.5 and
-at 2, and what a larger offset loses, contacts, is as small (0.6 % of the rays at 2 voxels where points float
-0.5 voxel above the surface). Along the ray instead, a grazing ray gains no height: 2 voxels, points half a
-voxel too deep, leave 94 % of them occluded."""
+"""Voxels by which a ray's origin leaves the surface along the normal: more than the errors of the mesh (0.4
+voxel on smooth shapes) and of the expected depth. With points 1 voxel too deep, a quarter of the rays is
+falsely occluded at 1 voxel, 0.1 % at 2; offsets along the ray leave grazing rays occluded."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +34,8 @@ class Hit:
 class Occluder:
     """The extracted mesh in a private scene of its own, updated in place.
 
-    It is not part of the user's scene: that scene's geometry must neither be hit here nor be hidden by this
-    mesh. Evaluate results of `visible` before the next `update`: Dr.Jit traces rays when their result is
-    needed.
+    The user's scene must neither be hit here nor be hidden by this mesh. Evaluate results of `visible` before
+    the next `update`: Dr.Jit traces rays when their result is needed.
     """
 
     NAME = "occluder"
@@ -99,11 +95,9 @@ class Occluder:
     ) -> Float:
         """1 where the ray leaves the scene freely, 0 where the mesh blocks it.
 
-        `origin` is in world space; `direction` and `normal` need not be unit. The origin first moves
-        OFFSET_VOXELS off the surface along the normal; without one (or where it is zero) along the ray, which
-        is right for steep rays only. There is no distance threshold. Rays without a finite direction, rays
-        that are not `active`, and all rays while there is no mesh, are visible. Detached: visibility has no
-        derivative."""
+        `direction` and `normal` need not be unit. The origin (world) first moves OFFSET_VOXELS along the
+        normal, or along the ray where there is none, which suits steep rays only. Rays without a finite
+        direction or not `active`, and all rays without a mesh, are visible. Detached."""
         if self.empty:
             return dr.full(mi.Float, 1, max(dr.width(origin), dr.width(direction)))
         with dr.suspend_grad():

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.errors import InputError
 from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, SH_DC, attribute
 from mi_refgs.surfels.primitives import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
@@ -41,10 +41,8 @@ def from_points(
     largest: bound of the scales. The tangents are turned at random about the normal. attributes: those
     beside the geometry (default: all). degree: of spherical harmonics by attribute, 0 by default. initial:
     activated values by attribute, such as `roughness=0.3`; defaults are those of `surfels.attributes`.
-    `colours` fill the constant coefficient of radiance_sh (grey 0.5 by default). Rotations are uniform over
-    SO(3), not over positive components as in the released Ref-Gaussian. Raises InputError for wrong shapes,
-    NaN, unknown attributes, values out of range, and values of attributes that are not chosen or follow from
-    the points.
+    `colours` fill the constant coefficient of radiance_sh (grey 0.5 by default). Raises InputError for wrong
+    shapes, NaN, unknown attributes, values out of range, and values of attributes that are not made of them.
     """
     points = _check("points", points, np.shape(points)[:1])
     count = len(points)
@@ -59,22 +57,15 @@ def from_points(
     raw = {"position": points}
     spacing = neighbour_scale(points) * scale_factor
     if largest is not None:
-        bound = np.asarray(largest)
-        if bound.shape not in ((), (count,)) or not np.all(bound > 0):
-            found = f"{abbreviated(bound)} of shape {bound.shape}"
-            raise InputError(f"surfels: largest: {found}; give one positive bound per point, {(count,)}")
-        spacing = np.minimum(spacing, bound)
+        spacing = np.minimum(spacing, largest)
     raw |= kind.start(spacing, quaternions(normals, count, rng))
-    if fixed := [name for name in initial if name in raw]:
-        given = "points, normals and scale_factor"
-        raise InputError(f"surfels: {fixed[0]}: follows from {given}; change these, or leave it out")
     for name, declared in ATTRIBUTES.items():
         chosen = not declared.geometry if attributes is None else name in attributes
         if name not in raw and (name in kind.widths or chosen):
             width = declared.width((degree or {}).get(name, 0))
-            raw[name] = declared.start(count, width, rng, initial.get(name))
-    if unused := [name for name in initial if name not in raw]:
-        raise InputError(f"surfels: {unused[0]}: not in `attributes`; add it, or leave its value out")
+            raw[name] = declared.start(count, width, rng, initial.pop(name, None))
+    for name in initial:
+        raise InputError(f"surfels: {name}: follows from the points or is not in `attributes`; leave it out")
     if colours is not None and "radiance_sh" in raw:
         raw["radiance_sh"][:, :3] = (_check("colours", colours, (count,)) - 0.5) / SH_DC
     return Surfels.from_numpy({name: raw[name] for name in ATTRIBUTES if name in raw})
