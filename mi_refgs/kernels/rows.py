@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from mi_refgs.types import Float
 
 ACCESS = 8
 """Floats per access: Dr.Jit's LLVM code splits wider ones into these."""
 
 
-def columns_of(array: Any, width: int) -> list[Any]:
+def columns_of(array: Float, width: int) -> list[Float]:
     """Columns (N,) of N · width floats without padding, under AD.
 
     The adjoint is computed in memory of its own and then added to that of `array`. The adjoint of a gather
@@ -25,7 +26,7 @@ def columns_of(array: Any, width: int) -> list[Any]:
 class _Columns(dr.CustomOp):
     """Flat rows → columns."""
 
-    def eval(self, array: Any, width: int) -> list[Any]:
+    def eval(self, array: Float, width: int) -> list[Float]:
         self.width = width
         return self._split(array)
 
@@ -43,7 +44,7 @@ class _Columns(dr.CustomOp):
         """Floats per access: the most that divide a row."""
         return math.gcd(self.width, ACCESS)
 
-    def _split(self, array: Any) -> list[Any]:
+    def _split(self, array: Float) -> list[Float]:
         count, accesses = dr.width(array) // self.width, self.width // self.access
         row = dr.arange(mi.UInt32, count) * accesses
         if self.access == 1:
@@ -51,7 +52,7 @@ class _Columns(dr.CustomOp):
         shape = (self.access, count)
         return [x for i in range(accesses) for x in dr.gather(mi.ArrayXf, array, row + i, shape=shape)]
 
-    def _join(self, columns: list[Any]) -> Any:
+    def _join(self, columns: list[Float]) -> Float:
         if self.width == 1:
             return columns[0]
         size = self.access
@@ -73,7 +74,7 @@ class _Columns(dr.CustomOp):
         return dr.gather(mi.Float, flat, row * len(columns) + (entry - row * self.width))
 
 
-def joined(first: list[Any], second: list[Any]) -> list[Any]:
+def joined(first: list[Float], second: list[Float]) -> list[Float]:
     """Concatenate the arrays of two lists pair by pair, under AD.
 
     The adjoints are arrays of their own, into which no other reader of the inputs writes.
@@ -84,7 +85,7 @@ def joined(first: list[Any], second: list[Any]) -> list[Any]:
 class _Joined(dr.CustomOp):
     """Two lists of arrays → a list of concatenated ones; one kernel per distinct width that is read."""
 
-    def eval(self, first: list[Any], second: list[Any]) -> list[Any]:
+    def eval(self, first: list[Float], second: list[Float]) -> list[Float]:
         self.widths = [[dr.width(array) for array in part] for part in (first, second)]
         return self._join(first, second)
 
@@ -104,7 +105,7 @@ class _Joined(dr.CustomOp):
     def name(self) -> str:
         return "joined"
 
-    def _join(self, first: list[Any], second: list[Any]) -> list[Any]:
+    def _join(self, first: list[Float], second: list[Float]) -> list[Float]:
         out = []
         for a, b, width, other in zip(first, second, *self.widths, strict=True):
             whole = dr.empty(mi.Float, width + other)

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar
 
+from mi_refgs.types import Arrays
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -21,7 +23,7 @@ class Listener(Protocol):
     def call(self, phase: str, function: Callable[[], Any], arguments: Any) -> Any:
         """Call the function, bound to its `arguments`, and return its result."""
 
-    def boundary(self, value: Any, phase: str) -> Any:
+    def boundary(self, value: Arrays, phase: str) -> Arrays:
         """Return the value, with a node of the AD graph that notices derivatives."""
 
 
@@ -55,6 +57,6 @@ def phase(name: str, backward: str | None = None) -> Callable[[Function], Functi
     return decorate
 
 
-def boundary(value: Any, name: str) -> Any:
+def boundary(value: Arrays, name: str) -> Any:
     """The value itself; a backward pass that comes to it enters the phase `name`."""
     return value if _listener is None else _listener.boundary(value, name)

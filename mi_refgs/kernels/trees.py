@@ -8,8 +8,10 @@ from typing import Any
 
 import drjit as dr
 
+from mi_refgs.types import Arrays
 
-def mapped(function: Callable[..., Any], *trees: Any) -> Any:
+
+def mapped(function: Callable[..., Any], *trees: Arrays) -> Arrays:
     """Apply a function to corresponding arrays of trees; None and flags stay."""
     first = trees[0]
     if first is None or isinstance(first, bool):

@@ -28,6 +28,7 @@ import numpy as np
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.splat.camera import Camera
+from mi_refgs.types import Bool, Float, Int32, Point3f, TensorXf, UInt32, Vector3f
 
 ALPHA_SOLID = 0.5
 """Opacity from which a pixel has a surface: half coverage, where a box filter has its silhouette."""
@@ -126,7 +127,7 @@ def fuse(
         return replace(empty, volume=grid.volume().reshape(shape))
 
 
-def _flat(image: Any, camera: Camera) -> Any:
+def _flat(image: Float | TensorXf, camera: Camera) -> Float:
     values = image.array if isinstance(image, mi.TensorXf) else mi.Float(image)
     if dr.width(values) != camera.width * camera.height:
         raise ValueError(f"{dr.width(values)} values for an image of {camera.width}x{camera.height} pixels")
@@ -146,7 +147,7 @@ class _Grid:
         self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in of.origin))
         self.voxel = dr.opaque(mi.Float, of.voxel)
         self.space: _Contracted | None = None
-        self.index: Any = None
+        self.index: UInt32 = None
         if of.region is not None:
             self.space = _Contracted.of(of.region)
             length = dr.norm(mi.Vector3f(self._place()))
@@ -155,7 +156,7 @@ class _Grid:
         self.total, self.weight, self.seen, self.behind = (dr.zeros(mi.Float, count) for _ in range(4))
         dr.eval(self.corner, self.total, self.weight, self.seen, self.behind)
 
-    def integrate(self, depth: Any, alpha: Any, camera: Camera, carve: bool) -> None:
+    def integrate(self, depth: Float, alpha: Float, camera: Camera, carve: bool) -> None:
         """Add one view."""
         width, height = dr.opaque(mi.Int32, camera.width), dr.opaque(mi.Int32, camera.height)
         # Surface depth, or 0 for background; NaN and infinite depths are background too.
@@ -218,24 +219,24 @@ class _Grid:
 class _Contracted:
     """A region's contraction for Dr.Jit; see `data.region.Region`."""
 
-    centre: Any  # mi.Point3f
-    radius: Any  # mi.Float
+    centre: Point3f
+    radius: Float
 
     @staticmethod
     def of(region: Region) -> _Contracted:
         centre = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in region.centre))
         return _Contracted(centre, dr.opaque(mi.Float, region.radius))
 
-    def contract(self, world: Any) -> Any:
+    def contract(self, world: Point3f) -> Point3f:
         offset = (world - self.centre) / self.radius
         inverse = dr.rcp(dr.maximum(dr.norm(offset), 1))
         return mi.Point3f(offset * ((2 - inverse) * inverse))
 
-    def expand(self, place: Any) -> Any:
+    def expand(self, place: Point3f) -> Point3f:
         length = dr.maximum(dr.norm(mi.Vector3f(place)), 1)
         return self.centre + self.radius * mi.Vector3f(place) * dr.rcp(length * (2 - length))
 
-    def stretch(self, place: Any, ray: Any) -> Any:
+    def stretch(self, place: Point3f, ray: Vector3f) -> Float:
         """Depth per unit of contracted distance (see above) at contracted positions, along `ray` per depth.
 
         The contraction shrinks by 1/r² along the offset of length r, and by (2 - 1/r)/r across it.
@@ -250,8 +251,8 @@ class _Contracted:
 
 
 def _sample(
-    surface: Any, px: Any, py: Any, width: Any, height: Any, apart: Any, active: Any
-) -> tuple[Any, Any, Any]:
+    surface: Float, px: Float, py: Float, width: Int32, height: Int32, apart: Float, active: Bool
+) -> tuple[Float, Bool, Bool]:
     """Depth at a pixel position, whether it is a surface, and whether it is certainly background.
 
     Bilinear where the four texels differ by less than `apart`, the truncation; else the nearest texel: a mean

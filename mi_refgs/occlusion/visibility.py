@@ -13,7 +13,7 @@ from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import Surface, VertexColours, VertexSurfels
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Array, Bool, Float, Point2f, Point3f, UInt32, Vector3f
+from mi_refgs.types import Array, Bool, Float, Point2f, Point3f, Scene, UInt32, Vector3f
 
 OFFSET_VOXELS = 2.0
 """Voxels by which a ray's origin leaves the surface along the normal: more than the errors of the mesh (0.4
@@ -42,7 +42,7 @@ class Occluder:
 
     def __init__(self, mesh: Mesh | None = None) -> None:
         self._mesh: Mesh | None = None
-        self._scene: Any = None
+        self._scene: Scene = None
         self._params: Any = None
         self._variant: str | None = None
         self.vertex_surfels: VertexSurfels | None = None  # of this mesh; None also after edits of the surfels

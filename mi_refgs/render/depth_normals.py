@@ -6,21 +6,20 @@ the point that pixel (i, j) sees at depth z.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import ALPHA_MIN, NORM_FLOOR
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
+from mi_refgs.types import Bool, Float, Vector3f
 
 DEPTH_EDGE_COSINE = 0.2
 """Cosine to the viewing ray below which a depth difference is a step between two surfaces, not a slope: its
 normal would bend the rims of both. At 160² and 40° it is a step of 1/20 of the depth."""
 
 
-def normals_from_depth(depth: Any, alpha: Any, camera: Camera) -> tuple[Any, Any]:
+def normals_from_depth(depth: Float, alpha: Float, camera: Camera) -> tuple[Vector3f, Bool]:
     """World normals of a depth map by central differences, facing the camera, and where they are valid.
 
     depth: (H·W) camera depth z, raster order, scene units; alpha: (H·W), read for validity only, no

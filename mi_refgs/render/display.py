@@ -20,7 +20,7 @@ ALPHA_EMPTY = 1e-6
 """Alpha below which a pixel is empty: radiance / A has no meaning, and only the background is seen."""
 
 
-def srgb_from_linear(linear: Any) -> Any:
+def srgb_from_linear(linear: Float) -> Float:
     """sRGB encoding (IEC 61966-2-1) of a linear plane: straight below 0.0031308, else the curve.
 
     Unbounded above 1. The slope is finite everywhere (12.92 at 0).
@@ -30,7 +30,9 @@ def srgb_from_linear(linear: Any) -> Any:
     return dr.select(straight, 12.92 * linear, curve)
 
 
-def display_image(radiance: Iterable[Any], alpha: Any, background: Iterable[Any]) -> list[Any]:
+def display_image(
+    radiance: Iterable[Float], alpha: Float, background: Iterable[Float | float]
+) -> list[Float]:
     """Composite as 8-bit RGBA images do: A srgb(L / A) + (1 - A) background, per plane.
 
     radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6

@@ -14,7 +14,7 @@ from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.kernels.rows import joined
 from mi_refgs.splat import Composited
 from mi_refgs.splat.lanes import CompactedPixels
-from mi_refgs.types import Float
+from mi_refgs.types import Array, Float
 
 OBJECT = "object"
 """Slot of the object's opacity; where it is blended, slots are divided by it."""
@@ -75,7 +75,7 @@ def inverse_alpha(alpha: Float) -> Float:
     return dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
 
 
-def _parts(value: Any) -> list[Float]:
+def _parts(value: Array) -> list[Float]:
     """The components of a value."""
     return [*value] if dr.depth_v(value) > 1 else [value]
 

@@ -18,6 +18,7 @@ from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.kernels.memory import PASS_SAMPLES, require_image
 from mi_refgs.kernels.trees import mapped
 from mi_refgs.splat.camera import Camera
+from mi_refgs.types import Array
 
 Result = TypeVar("Result")
 
@@ -30,7 +31,7 @@ class Band:
     first: tuple[int, int]  # column and row of the band's first pixel in what `camera` sees
     size: tuple[int, int]  # columns and rows of the band
 
-    def kept(self, value: Any) -> Any:
+    def kept(self, value: Array) -> Array:
         """The band's own pixels of an array of values per pixel of `camera`; one of width 1 stays."""
         if dr.width(value) == 1 or self.size == (self.camera.width, self.camera.height):
             return value
@@ -82,14 +83,14 @@ def in_passes(
     for band in found:
         arrays: list[Any] = []
 
-        def kept(value: Any, band: Band = band, arrays: list[Any] = arrays) -> Any:
+        def kept(value: Array, band: Band = band, arrays: list[Any] = arrays) -> Array:
             arrays.append(band.kept(value))
             return arrays[-1]
 
         parts.append(mapped(kept, draw(band.camera)))
         dr.eval(arrays)  # or the samples of all bands would stay in memory
 
-    def stacked(*values: Any) -> Any:
+    def stacked(*values: Array) -> Array:
         if all(dr.width(value) == 1 for value in values):
             return values[0]
         sizes = [band.size[0] * band.size[1] for band in found]

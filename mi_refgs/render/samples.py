@@ -16,7 +16,7 @@ from mi_refgs.kernels.trees import mapped
 from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.splat.camera import Camera
-from mi_refgs.types import Color3f, Float
+from mi_refgs.types import Arrays, Color3f, Float
 
 
 def samples_per_axis(samples: int) -> int:
@@ -48,7 +48,7 @@ def supersampled(
     if not details:
         fine = replace(fine, terms=None, maps={})
 
-    def mean(value: Any) -> Any:
+    def mean(value: Arrays) -> Arrays:
         return mapped(lambda plane: box_mean(plane, camera, factor), value)
 
     alpha = mean(fine.alpha)
@@ -102,11 +102,11 @@ def box_mean(plane: Float, camera: Camera, factor: int) -> Float:
 class _BoxMean(dr.CustomOp):
     """Mean of blocks of pixels, with an adjoint that gathers."""
 
-    def eval(self, plane: Any, width: int, height: int, factor: int) -> Any:
+    def eval(self, plane: Float, width: int, height: int, factor: int) -> Float:
         self.size = width, height, factor
         return self._mean(plane)
 
-    def _mean(self, plane: Any) -> Any:
+    def _mean(self, plane: Float) -> Float:
         width, height, factor = self.size
         sample = dr.arange(mi.UInt32, width * height * factor * factor)
         pixel, part = sample // (factor * factor), sample % (factor * factor)

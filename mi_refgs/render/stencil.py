@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.splat.lanes import CompactedPixels
+from mi_refgs.types import Bool, Float, UInt32
 
 # A step (dx, dy) in pixels, each -1, 0 or 1.
 Step = tuple[int, int]
 
 
 def neighbours(
-    plane: Any, width: int, height: int, steps: Sequence[Step], pixels: CompactedPixels | None = None
-) -> list[Any]:
+    plane: Float, width: int, height: int, steps: Sequence[Step], pixels: CompactedPixels | None = None
+) -> list[Float]:
     """The plane (mi.Float, raster order) shifted by each step: out_k(x, y) = plane(x + dx_k, y + dy_k).
 
     Pixels outside repeat the border. Steps are (dx, dy) with entries in {-1, 0, 1}. A plane of compacted
@@ -32,11 +32,11 @@ def neighbours(
 
 
 class _Neighbours(dr.CustomOp):
-    def eval(self, plane: Any, width: int, height: int, steps: tuple[Step, ...]) -> list[Any]:
+    def eval(self, plane: Float, width: int, height: int, steps: tuple[Step, ...]) -> list[Float]:
         self.width, self.height, self.steps = width, height, steps
         return self._shift(plane)
 
-    def _shift(self, plane: Any) -> list[Any]:
+    def _shift(self, plane: Float) -> list[Float]:
         dr.eval(plane)
         x, y = _pixel(self.width, self.height)
         return [
@@ -63,19 +63,19 @@ class _Neighbours(dr.CustomOp):
         return "neighbours"
 
 
-def _pixel(width: int, height: int) -> tuple[Any, Any]:
+def _pixel(width: int, height: int) -> tuple[UInt32, UInt32]:
     index = dr.arange(mi.UInt32, width * height)
     return index % width, index // width
 
 
-def _moved(place: Any, step: int, size: int) -> Any:
+def _moved(place: UInt32, step: int, size: int) -> UInt32:
     """Place + step along one axis, clamped to the image."""
     if step > 0:
         return dr.minimum(place + 1, size - 1)
     return dr.select(place > 0, place - 1, 0) if step < 0 else place
 
 
-def _readers(place: Any, step: int, size: int) -> list[tuple[Any, Any]]:
+def _readers(place: UInt32, step: int, size: int) -> list[tuple[UInt32, Bool]]:
     """Places along one axis that read `place` when moved by step, each with the mask where it does."""
     if step == 0:
         return [(place, mi.Bool(True))]

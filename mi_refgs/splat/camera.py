@@ -13,7 +13,7 @@ import numpy as np
 
 from mi_refgs.constants import RIGID_TOLERANCE, tile_size
 from mi_refgs.errors import InputError
-from mi_refgs.types import Float, Point2f, Point3f, UInt32, Vector3f
+from mi_refgs.types import Float, Point2f, Point3f, Sensor, UInt32, Vector3f
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class Camera:
         return Camera.from_pose(width, height, focal, focal, width / 2, height / 2, pose, near)
 
     @staticmethod
-    def from_sensor(sensor: Any) -> Camera:
+    def from_sensor(sensor: Sensor) -> Camera:
         """Camera of a Mitsuba `perspective` sensor, with its crop window and principal-point offset.
 
         It has no derivatives unless it is `attached`. Raises InputError for every other sensor.
@@ -167,7 +167,7 @@ class Camera:
         size = int(sensor.film().size()[0]), int(sensor.film().size()[1])
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
-    def attached(self, sensor: Any) -> Camera:
+    def attached(self, sensor: Sensor) -> Camera:
         """The camera with derivatives of its sensor's `to_world` and `x_fov`, where gradients are enabled.
 
         A change of `to_world` counts as that of the rigid matrix nearest to it: scale and shear have no

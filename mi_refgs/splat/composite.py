@@ -35,7 +35,7 @@ from mi_refgs.splat.lanes import CompactedPixels, Lanes, advance, any_of, walk
 from mi_refgs.splat.rows import PackedRows
 from mi_refgs.splat.tiles import TileLists
 from mi_refgs.surfels.primitives import Footprints
-from mi_refgs.types import Float
+from mi_refgs.types import Bool, Float, UInt32
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def _forward(
 ) -> tuple[list[Float], list[list[Float]]]:
     """Transmittance and the first `maps` maps, per pixel of the lanes."""
 
-    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+    def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row = lists.rows.fetch(surfel, some)
         after = []
         for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
@@ -120,7 +120,7 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
     ]
     δrows = PackedRows.zeros(lists.rows.count, lists.rows.width)
 
-    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+    def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row = lists.rows.fetch(surfel, some)
         after, weights = [], []
         geometry = lists.primitive.adjoint()
@@ -156,7 +156,7 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
 def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:
     """Tangents of the maps, per pixel of the lanes, for tangents of the rows."""
 
-    def step(surfel: Any, some: Any, active: Any, *state: Any) -> Any:
+    def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row, drow = lists.rows.fetch(surfel, some), drows.fetch(surfel, some)
         after = []
         for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):

@@ -16,6 +16,7 @@ patches, then tiles of the patch, then squares of the tile, each row by row.
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -27,7 +28,8 @@ from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PATCH_EDGE, TRANSMITTANCE_M
 from mi_refgs.kernels.trees import mapped
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
-from mi_refgs.types import Bool, Float, Point2f, UInt32
+from mi_refgs.surfels.primitives import FootprintSample
+from mi_refgs.types import Array, Arrays, Bool, Float, Point2f, UInt32
 
 SIDE = LANE_PIXELS_PER_AXIS
 LANE_PIXELS = SIDE**2
@@ -176,11 +178,11 @@ class CompactedPixels:
         there = dr.gather(mi.Bool, self.there, raster)
         return dr.gather(mi.Float, values, dr.gather(mi.UInt32, self.index, raster, there), there)
 
-    def to_raster(self, values: Any) -> Any:
+    def to_raster(self, values: Arrays) -> Arrays:
         """Arrays (P,), and what contains them, as ones (H·W,), 0 where there is nothing; constants stay."""
         dr.eval(values)
 
-        def raster(value: Any) -> Any:
+        def raster(value: Array) -> Array:
             return value if dr.width(value) == 1 else dr.gather(type(value), value, self.index, self.there)
 
         return mapped(raster, values)
@@ -191,7 +193,7 @@ def any_of(flags: list[Bool]) -> Bool:
     return reduce(operator.or_, flags)
 
 
-def advance(sample: Any, active: Bool, transmittance: Float) -> tuple[Float, Float, Bool]:
+def advance(sample: FootprintSample, active: Bool, transmittance: Float) -> tuple[Float, Float, Bool]:
     """Weight of a footprint's sample, the transmittance behind it, and whether the pixel goes on."""
     hit = active & sample.valid
     after = transmittance * (1 - sample.alpha)
@@ -201,7 +203,9 @@ def advance(sample: Any, active: Bool, transmittance: Float) -> tuple[Float, Flo
     return weight, dr.select(hit, after, transmittance), active & ~ends
 
 
-def walk(lists: TileLists, lanes: Lanes, step: Any, start: list[tuple[Any, ...]], label: str) -> list[Any]:
+def walk(
+    lists: TileLists, lanes: Lanes, step: Callable[..., Any], start: list[tuple[Any, ...]], label: str
+) -> list[Any]:
     """Visit the surfels of each lane's tile in order, until the lane's last pixel has ended.
 
     `start` has the state of each pixel of a lane; its first entry says whether the pixel goes on. `step` maps
@@ -209,13 +213,13 @@ def walk(lists: TileLists, lanes: Lanes, step: Any, start: list[tuple[Any, ...]]
     `start`. Returns the last states, one list per quantity.
     """
 
-    def surfel_at(pair: Any, some: Any) -> Any:
+    def surfel_at(pair: UInt32, some: Bool) -> UInt32:
         return dr.gather(mi.UInt32, lists.surfel_from_pair, pair, some & (pair < lanes.end))
 
-    def condition(pair: Any, surfel: Any, active: Any, *state: Any) -> Any:
+    def condition(pair: UInt32, surfel: UInt32, active: list[Bool], *state: list[Any]) -> Bool:
         return any_of(active) & (pair < lanes.end)
 
-    def body(pair: Any, surfel: Any, active: Any, *state: Any) -> Any:
+    def body(pair: UInt32, surfel: UInt32, active: list[Bool], *state: list[Any]) -> Any:
         goes_on = any_of(active)
         # The next surfel is read while this one is worked on: its row waits for nothing then.
         following = surfel_at(pair + 1, goes_on)

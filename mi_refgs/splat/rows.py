@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.kernels.rows import ACCESS
-from mi_refgs.types import Float
+from mi_refgs.types import Bool, Float, UInt32
 
 COPIES_BYTES = 1 << 30
 """Largest memory of the copies per thread that `PackedRows.add` makes; above it, additions are atomic. The
@@ -35,7 +35,7 @@ class PackedRows:
         return PackedRows(dr.zeros(mi.Float, count * _padded(width)), count, width)
 
     @staticmethod
-    def pack(columns: list[Any]) -> PackedRows:
+    def pack(columns: list[Float]) -> PackedRows:
         """Pack columns (N,)."""
         count, width = dr.width(columns[0]), len(columns)
         rows = PackedRows(dr.empty(mi.Float, count * _padded(width)), count, width)
@@ -45,18 +45,18 @@ class PackedRows:
             dr.scatter(rows.data, group, place, mode=dr.ReduceMode.NoConflicts)
         return rows
 
-    def columns(self) -> list[Any]:
+    def columns(self) -> list[Float]:
         """Columns (N,)."""
         return self.fetch(dr.arange(mi.UInt32, self.count))[: self.width]
 
-    def fetch(self, row: Any, active: Any = True) -> list[Any]:
+    def fetch(self, row: UInt32, active: Bool = True) -> list[Float]:
         """Values of rows, one array per column, then per column of the padding."""
         shape = (ACCESS, dr.width(row))
         places = [row * self.accesses + i for i in range(self.accesses)]
         groups = [dr.gather(mi.ArrayXf, self.data, place, active, shape=shape) for place in places]
         return [value for group in groups for value in group]
 
-    def add(self, row: Any, values: list[Any], active: Any) -> None:
+    def add(self, row: UInt32, values: list[Float], active: Bool) -> None:
         """Add values, one array per column, to rows.
 
         On the CPU each thread has a copy until the rows are read, if all copies fit into COPIES_BYTES.
@@ -67,7 +67,7 @@ class PackedRows:
         for place, group in self._groups(row, values):
             dr.scatter_add(self.data, group, place, active, mode=mode)
 
-    def _groups(self, row: Any, values: list[Any]) -> list[tuple[Any, Any]]:
+    def _groups(self, row: UInt32, values: list[Float]) -> list[tuple[UInt32, Any]]:
         padded = values + [mi.Float(0)] * (self.accesses * ACCESS - len(values))
         groups = [padded[i : i + ACCESS] for i in range(0, len(padded), ACCESS)]
         return [(row * self.accesses + i, mi.ArrayXf(group)) for i, group in enumerate(groups)]

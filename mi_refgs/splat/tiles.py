@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +15,7 @@ from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.rows import PackedRows
 from mi_refgs.surfels.primitives import Footprints, Primitive
-from mi_refgs.types import Float, UInt32
+from mi_refgs.types import Bool, Float, Int32, UInt32, UInt64
 
 MAX_PAIR_BITS = 27
 """Log₂ of the largest number of surfel-tile pairs: 40 bytes each, 5 GB in all."""
@@ -59,7 +58,7 @@ def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Floa
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     rows = PackedRows.pack([*footprints.columns, *features])
     tile_size, primitive = mi.Vector2f(*camera.tile), footprints.primitive
-    found: list[tuple[Any, Any]] = []
+    found: list[tuple[UInt64, Float]] = []
     count = 0
     for surfel, tile_x, tile_y in _candidates(footprints, camera):
         row = rows.fetch(surfel)
@@ -88,7 +87,7 @@ def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Floa
 
 
 @phase("sort")
-def _sorted(pairs: Any, depth: Any, tiles: int) -> tuple[Any, Any]:
+def _sorted(pairs: UInt64, depth: Float, tiles: int) -> tuple[UInt32, UInt32]:
     """Tiles and surfels of pairs (tile, surfel), sorted by tile, then by depth."""
     nearest_first = _nearest_first(depth)
     pairs = _sorted_by(dr.gather(mi.UInt64, pairs, nearest_first), 0, (tiles - 1).bit_length())
@@ -113,31 +112,31 @@ def _nearest_first(depth: Float) -> UInt32:
     return _lower(entries)
 
 
-def _join(upper: Any, lower: Any) -> Any:
+def _join(upper: UInt32, lower: UInt32) -> UInt64:
     """Join two mi.UInt32 to one mi.UInt64, for half the random reads of two arrays."""
     return mi.UInt64(upper) << 32 | mi.UInt64(lower)
 
 
-def _upper(joined: Any) -> Any:
+def _upper(joined: UInt64) -> UInt32:
     return mi.UInt32(joined >> 32)
 
 
-def _lower(joined: Any) -> Any:
+def _lower(joined: UInt64) -> UInt32:
     return mi.UInt32(joined & 0xFFFFFFFF)
 
 
-def _sorted_by(joined: Any, shift: int, bits: int) -> Any:
+def _sorted_by(joined: UInt64, shift: int, bits: int) -> UInt64:
     """Sort by some bits of the upper half: one pass of a stable counting sort."""
     digit = (_upper(joined) >> shift) & ((1 << bits) - 1)
     dr.eval(joined, digit)
     return dr.gather(mi.UInt64, joined, dr.detail.block_mkperm(digit, dr.width(digit), 1 << bits))
 
 
-def _runs(tile: Any, tiles: int) -> tuple[Any, Any]:
+def _runs(tile: UInt32, tiles: int) -> tuple[UInt32, UInt32]:
     """First pair (tiles,), and one past the last pair (tiles,), of each tile among sorted tiles (M,)."""
     pairs, wanted = dr.opaque(mi.UInt32, dr.width(tile)), dr.arange(mi.UInt32, tiles + 1)
 
-    def before(place: Any) -> Any:
+    def before(place: UInt32) -> Bool:
         inside = place < pairs
         return inside & (dr.gather(mi.UInt32, tile, place, inside) < wanted)
 
@@ -148,7 +147,7 @@ def _runs(tile: Any, tiles: int) -> tuple[Any, Any]:
     return dr.gather(mi.UInt32, edges, first), dr.gather(mi.UInt32, edges, first + 1)
 
 
-def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[Any, Any, Any]]:
+def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[UInt32, UInt32, UInt32]]:
     """Yield surfel, tile column and tile row of every tile in footprints' rectangles, CHUNK by CHUNK."""
     axes = range(2)
     first = [mi.Int32((footprints.first[k] + camera.tile_offset[k]) // camera.tile[k]) for k in axes]
@@ -171,7 +170,9 @@ def _candidates(footprints: Footprints, camera: Camera) -> Iterator[tuple[Any, A
         yield _part(first, span, count, end, begin, stop)
 
 
-def _part(first: list[Any], span: Any, count: Any, end: Any, begin: int, stop: int) -> tuple[Any, Any, Any]:
+def _part(
+    first: list[Int32], span: UInt32, count: UInt32, end: UInt64, begin: int, stop: int
+) -> tuple[UInt32, UInt32, UInt32]:
     """Candidates `begin` to `stop`, of whole surfels; each has `count`, and `end` with all before it."""
     pairs, offset = stop - begin, dr.opaque(mi.UInt64, begin)
     start = end - count - offset  # before the part it wraps round, to numbers outside the part too

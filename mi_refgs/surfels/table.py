@@ -25,7 +25,7 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.kernels.rows import columns_of
 from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
 from mi_refgs.surfels.primitives import Primitive, primitive_of
-from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, Vector3f
+from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, UInt32, Vector3f
 
 QUATERNION_FLOOR = 1e-12
 """Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is useless."""
@@ -41,14 +41,14 @@ LOGIT_LIMIT = 40.0
 """1 / (1 + e^-40) is 1 in float32, and e^40 squared is finite in float32 (the derivative needs it)."""
 
 
-def sigmoid(x: Any) -> Any:
+def sigmoid(x: Float) -> Float:
     """Logistic sigmoid of a Dr.Jit array, finite with a finite gradient for every finite x (logit limit)."""
     if dr.width(x) == 0:  # Dr.Jit refuses arithmetic between an empty array and a literal
         return x
     return dr.rcp(1.0 + dr.exp(-dr.clip(x, -LOGIT_LIMIT, LOGIT_LIMIT)))
 
 
-def _exp(x: Any) -> Any:
+def _exp(x: Float) -> Float:
     return dr.exp(dr.clip(x, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)) if dr.width(x) else x
 
 
@@ -229,7 +229,7 @@ class Surfels:
 
         # Squares of all four on the diagonal, no 1: rounding of |q| then changes lengths, by 1e-7, and no
         # direction, on which the far end of a needle depends.
-        def entry(a: Any, b: Any, c: Any, d: Any) -> Any:
+        def entry(a: Float, b: Float, c: Float, d: Float) -> Float:
             return dr.fma(a, b, c * d)
 
         t_u = entry(w, w, x, x) - entry(y, y, z, z), 2 * entry(x, y, z, w), 2 * entry(x, z, -y, w)
@@ -239,7 +239,7 @@ class Surfels:
 
     # ---------------- copies ----------------
 
-    def gather(self, parent: Any) -> Surfels:
+    def gather(self, parent: UInt32) -> Surfels:
         """Copies, detached: surfel i of the result is surfel parent[i] (mi.UInt32)."""
         raw = {name: gather_rows(tensor, parent) for name, tensor in self.raw.items()}
         return Surfels(raw, self.screened)
@@ -265,7 +265,7 @@ def _limit(name: str) -> float:
     return math.inf if attribute(name).bounded else RAW_LIMIT
 
 
-def gather_rows(tensor: Any, parent: Any) -> Any:
+def gather_rows(tensor: TensorXf, parent: UInt32) -> TensorXf:
     """Rows parent (mi.UInt32, width M) of an (N, D) tensor as a detached, evaluated (M, D) tensor."""
     rows, width = len(parent), int(tensor.shape[1])
     if rows == 0:

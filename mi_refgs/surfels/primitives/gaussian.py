@@ -20,16 +20,17 @@ needles and pancakes keep their digits in float32.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS, GAUSSIAN_SLOPE_MARGIN, SIZE_RANGE
 from mi_refgs.surfels.primitives.primitive import (
+    Camera,
     Footprints,
     FootprintSample,
     Oriented,
+    Surfels,
     cutoff_radius_squared,
     dot2,
     projected,
@@ -68,7 +69,7 @@ class Gaussian(Oriented):
     rows_as = {"surfel": _as_surfel}  # noqa: RUF012
     first_order = True
 
-    def project(self, surfels: Any, camera: Any) -> Footprints:
+    def project(self, surfels: Surfels, camera: Camera) -> Footprints:
         """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
@@ -127,7 +128,7 @@ class Gaussian(Oriented):
         dalpha = drow[6] * sample.gaussian - sample.alpha * dr.fma(sample.u, du, sample.v * dv)
         return dr.select(sample.clamped, 0, dalpha), drow[3]
 
-    def normal(self, surfels: Any) -> Vector3f:
+    def normal(self, surfels: Surfels) -> Vector3f:
         """The shortest axis, the third of equal ones; which one it is has no derivative. [3DGS-DR, §3.2]"""
         first, second, third = surfels.frame()
         s = dr.detach(surfels.scale())
@@ -144,7 +145,7 @@ class Gaussian(Oriented):
         on_x = dr.clip(-near_x * a_x * a_y / dr.fma(a_y, a_y, b * b), low.y, high.y)
         on_y = dr.clip(-near_y * a_y / a_x, low.x, high.x)
 
-        def inside(x: Any, y: Any) -> Any:
+        def inside(x: Float, y: Float) -> Bool:
             u = dot2(a_x, a_y, mi.Vector2f(x, y))
             return dr.fma(u, u, dr.square(b * y)) <= r2
 
@@ -155,7 +156,7 @@ class Gaussian(Oriented):
         return row[3]
 
 
-def _near_image(slope: Any, camera: Any) -> Any:
+def _near_image(slope: Vector2f, camera: Camera) -> Vector2f:
     """Slopes clamped to GAUSSIAN_SLOPE_MARGIN around the image, without gradient beyond.
 
     A crop window has the borders of its film, or Gaussians would change with the window.

@@ -23,6 +23,9 @@ from mi_refgs.kernels.rows import joined
 from mi_refgs.registry import Registry
 from mi_refgs.types import Bool, Float, Int32, Point2f, Vector2f, Vector3f
 
+Surfels = Any  # surfels.table.Surfels, which imports this module
+Camera = Any  # splat.camera.Camera, which does too
+
 
 @dataclass(frozen=True)
 class Footprints:
@@ -86,7 +89,7 @@ class Primitive(ABC):
     # ---------------- footprints, under AD ----------------
 
     @abstractmethod
-    def project(self, surfels: Any, camera: Any) -> Footprints:
+    def project(self, surfels: Surfels, camera: Camera) -> Footprints:
         """Footprints of all surfels in a camera.
 
         The rectangles have no derivative. Culled surfels cover no pixel and get zero gradient.
@@ -105,7 +108,7 @@ class Primitive(ABC):
         """Tangents of α and z for tangents of the columns."""
 
     @abstractmethod
-    def normal(self, surfels: Any) -> Vector3f:
+    def normal(self, surfels: Surfels) -> Vector3f:
         """Unit normals in the world, not yet turned towards a camera."""
 
     # ---------------- tile lists, without derivatives ----------------
@@ -140,7 +143,7 @@ class Primitive(ABC):
         rotation, s = sorted_frame(axes, deviations)
         return self.start(np.sqrt(s[:, 0] * s[:, 1]), rotation)
 
-    def resize(self, raw: dict[str, np.ndarray], rows: Any, factor: float) -> None:
+    def resize(self, raw: dict[str, np.ndarray], rows: np.ndarray, factor: float) -> None:
         """Multiply the standard deviations of some primitives by a factor, in place."""
         for name in self.sizes:
             raw[name][rows] += np.float32(np.log(factor))
@@ -235,7 +238,7 @@ def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
 # ---------------- what all primitives share ----------------
 
 
-def projected(surfels: Any, camera: Any) -> tuple[Bool, Float, Float, Vector2f]:
+def projected(surfels: Surfels, camera: Camera) -> tuple[Bool, Float, Float, Vector2f]:
     """Which centres lie beyond the near plane, their depth z, 1 / z, and (x, y) / z in the camera's frame.
 
     Depths of the others are 1: a masked Inf would still poison the adjoint.
@@ -258,7 +261,7 @@ def dot2(x: Float, y: Float, delta: Vector2f) -> Float:
 
 
 def rectangle(
-    centre: Vector2f, low: Vector2f, high: Vector2f, visible: Bool, camera: Any
+    centre: Vector2f, low: Vector2f, high: Vector2f, visible: Bool, camera: Camera
 ) -> tuple[tuple[Int32, Int32], tuple[Int32, Int32]]:
     """First and last pixel column and row of centre + `low` to centre + `high`, pixels.
 

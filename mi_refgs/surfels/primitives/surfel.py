@@ -21,7 +21,6 @@ intersection may be anywhere along the ray).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -37,9 +36,11 @@ from mi_refgs.constants import (
     SORT_REACH,
 )
 from mi_refgs.surfels.primitives.primitive import (
+    Camera,
     Footprints,
     FootprintSample,
     Oriented,
+    Surfels,
     cutoff_radius_squared,
     dot2,
     projected,
@@ -68,7 +69,7 @@ class Surfel(Oriented):
     widths = {"position": 3, "rotation": 4, "scale": 2, "opacity": 1}  # noqa: RUF012
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
 
-    def project(self, surfels: Any, camera: Any) -> Footprints:
+    def project(self, surfels: Surfels, camera: Camera) -> Footprints:
         """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
 
         Culled: centre not beyond the near plane, edge-on by EDGE_ON_COSINE, opacity below ALPHA_MIN,
@@ -135,7 +136,7 @@ class Surfel(Oriented):
         delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
         ddelta = mi.Vector2f(-drow[7], -drow[8])
 
-        def tangent(i: int) -> Any:
+        def tangent(i: int) -> Float:
             """Tangent of the linear form in columns i and i + 1."""
             return dot2(drow[i], drow[i + 1], delta) + dot2(row[i], row[i + 1], ddelta)
 
@@ -146,7 +147,7 @@ class Surfel(Oriented):
         dalpha = drow[9] * sample.gaussian - 0.5 * sample.alpha * drho
         return dr.select(sample.clamped, 0, dalpha), dz
 
-    def normal(self, surfels: Any) -> Vector3f:
+    def normal(self, surfels: Surfels) -> Vector3f:
         """The third axis."""
         return surfels.frame()[2]
 
@@ -174,7 +175,7 @@ class Surfel(Oriented):
         on_x = dr.clip(-dr.fma(xy, near_x, along_y) / dr.select(ellipse, yy, 1), low.y, high.y)
         on_y = dr.clip(-dr.fma(xy, near_y, along_x) / dr.select(ellipse, xx, 1), low.x, high.x)
 
-        def inside(x: Any, y: Any) -> Any:
+        def inside(x: Float, y: Float) -> Bool:
             delta = mi.Vector2f(x, y)
             u, v = dot2(a_x, a_y, delta), dot2(b_x, b_y, delta)
             return dr.fma(u, u, v * v) <= r2 * dr.square(1 + dot2(c_x, c_y, delta))
@@ -241,7 +242,7 @@ class FootprintAdjoint:
         return [*a[1:], *b[1:], *c[1:], self.depth, *δcentre, self.opacity]
 
 
-def _moments(total: list[Any], x: Any, delta: Any) -> list[Any]:
+def _moments(total: list[Float], x: Float, delta: Vector2f) -> list[Float]:
     return [total[0] + x, dr.fma(x, delta.x, total[1]), dr.fma(x, delta.y, total[2])]
 
 
