@@ -377,9 +377,7 @@ def _read_checkpoint(path: Path) -> None:
 def _models(folder: Path) -> list[bytes]:
     (folder / "surfels.ply").write_bytes(_surfel_files(folder)[0])
     write_mesh(folder / "mesh.ply", Mesh(CUBE, TRIANGLES, 0.1))
-    accuracy = {"dominant": False, "multiscatter": False, "visibility_rays": 1, "traced_bounces": 0}
     shading = {"at": "pixel", "reflectance": "radiance", "diffuse": "sh", "occlusion": False}
-    shading["accuracy"] = accuracy
     return [json.dumps({"iteration": 3, "seconds": 1.5, "surfels": 7, "shading": shading}).encode()]
 
 

@@ -62,18 +62,6 @@ EXIT_CODES = {
 }
 """130, 141 and 143 are the codes of shells for a program that a signal ended: 128 + its number."""
 
-RENAMED: dict[str, dict[str, str]] = {
-    "capture": {"--camera": "--camera-model"},
-    "compare": {"--variants": "--methods"},
-    "dataset": {"--object": "--shapes", "--spp": "--samples"},
-    "import": {"--transforms": "--camera"},
-    "profile": {"--variant": "--method"},
-    "relight": {"--rotate": "--azimuth"},
-    "render": {"--spp": "--samples"},
-    "train": {"--variant": "--method", "--view": "--watch"},
-}
-"""Command → old option → new option: old names work for one release."""
-
 
 def overview() -> str:
     """Return what `refgs --help` prints."""
@@ -106,7 +94,7 @@ def parse(argv: Sequence[str]) -> Any:
     """
     name, *options = argv
     kind, summary = command_class(name)
-    return run_tyro(kind, [*_current(name, options)], name, f"{summary[0].upper()}{summary[1:]}.")
+    return run_tyro(kind, options, name, f"{summary[0].upper()}{summary[1:]}.")
 
 
 def run_tyro(kind: Any, options: list[str], name: str, summary: str) -> Any:
@@ -143,23 +131,6 @@ def _sentence(box: str) -> str:
     if match := re.match(r"Error parsing (.+?): .*?\[(.*?)\]", text):
         return f"{match[1].split('/')[-1]}: {match[2]}: no such value"
     return text.removesuffix(".").replace("(required)", "").strip()
-
-
-def _current(name: str, options: Sequence[str]) -> Iterator[str]:
-    """Replace old names of options, and old forms of two, with a warning."""
-    for text, following in zip(options, [*options, "--"][1:], strict=True):
-        option, equals, value = text.partition("=")
-        new = RENAMED.get(name, {}).get(option)
-        if new is not None:
-            print(f"refgs: warning: {option} is now {new}; the old name will be removed", file=sys.stderr)
-        if new == "--watch":  # --view [PORT]
-            yield new
-            yield from ["--port", value] if equals else ["--port"] if following.isdigit() else []
-        elif (name, text) == ("compare", "--cluster") and following.startswith("-"):
-            print("refgs: warning: --cluster is now --cluster local", file=sys.stderr)
-            yield from (text, "local")
-        else:
-            yield text if new is None else f"{new}{equals}{value}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -119,7 +119,6 @@ def evaluate(
         "antialias": fitted.shading.antialias,
         "ms_per_frame": metrics.frame_milliseconds([timed], cameras, views)[0],
         "method": method.name,
-        "variant": method.name,  # name of this key in version 0.1
         "preset": method.preset,
         "dataset": str(views.path),
         "test_views": len(measured.per_view),

@@ -15,7 +15,6 @@ from mi_refgs.fitting import losses
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.targets import Target
 from mi_refgs.methods.method import LossWeight, Method
-from mi_refgs.methods.read import RENAMED
 from mi_refgs.registry import Registry
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed
@@ -74,7 +73,7 @@ class Loss:
 def _check_name(loss: Loss) -> None:
     """Raise InputError for a name that a method file cannot weigh, or that means something else there."""
     bare = re.fullmatch("[A-Za-z0-9_-]+", loss.name)
-    if not bare or loss.name == "ssim" or f"loss.{loss.name}" in RENAMED:
+    if not bare or loss.name == "ssim":
         raise InputError(
             f"loss: '{loss.name}' is in use in [loss], or has characters besides letters, digits, _ and -; "
             "choose another name"

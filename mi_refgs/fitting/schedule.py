@@ -156,10 +156,8 @@ class FitSetup:
 
     def _far(self, group: Group) -> Group:
         """The rates of the background's positions: the farther a surface, the less is known of its place."""
-        background, region = self.method.surroundings, self.data.region
-        assert background is not None and region is not None and group.final is not None
-        rate, final = background.reach * group.rate, background.reach * group.final
-        return replace(group, rate=rate, final=final, centre=region.centre)
+        assert self.data.region is not None
+        return replace(group, centre=self.data.region.centre)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every parameter but those per view, without the first axis."""

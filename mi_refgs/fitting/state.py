@@ -236,9 +236,7 @@ class FitState:
 
 def decisions_of(state: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     """The decisions about components of the method in a checkpoint."""
-    rows: list[dict[str, Any]] = json.loads(state["decisions"].tobytes()) if "decisions" in state else []
-    # "term": the key of version 0.1
-    return [{"component": row.pop("term")} | row if "term" in row else row for row in rows]
+    return json.loads(state["decisions"].tobytes()) if "decisions" in state else []
 
 
 def _occluder_of(state: Mapping[str, np.ndarray]) -> Occluder:

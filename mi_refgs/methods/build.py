@@ -5,83 +5,119 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from collections.abc import Mapping
 from dataclasses import MISSING
 from typing import Any, Literal
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.methods.ranges import require_in_range
+from mi_refgs.methods.ranges import Metadata, require_allowed
 from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.registry import Registry
 from mi_refgs.shade.options import NOT_A_SETTING
 
 FLAT = {"flat": True}  # metadata of a dataclass's field that is one too, with keys in the same table
 
 
-def settings(kind: Any) -> dict[str, Any]:
-    """Keys of a dataclass in a file, with their types; those of FLAT fields are keys of the same table."""
+def by_name(registry: Registry[Any]) -> Metadata:
+    """Metadata of a field `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME."""
+    return {"by_name": registry}
+
+
+def by_kind(registry: Registry[Any], default: str) -> Metadata:
+    """Metadata of a field whose table becomes the registered dataclass that its key `kind` names."""
+    return {"by_kind": (registry, default)}
+
+
+def settings(kind: Any) -> dict[str, tuple[Any, Mapping[str, Any]]]:
+    """Keys of a dataclass in a file, with types and metadata; FLAT fields have theirs in the same table."""
     hints = typing.get_type_hints(kind)
-    found: dict[str, Any] = {}
+    found: dict[str, tuple[Any, Mapping[str, Any]]] = {}
     for field in dataclasses.fields(kind):
         if field.metadata == FLAT:
             found |= settings(hints[field.name])
         elif field.metadata != NOT_A_SETTING:
-            found[field.name] = hints[field.name]
+            found[field.name] = hints[field.name], field.metadata
     return found
 
 
-def build(kind: Any, value: Any, where: str) -> Any:
-    """Convert plain TOML data to `kind`; raises InputError that begins with `where`, a file and a key."""
+def build(
+    kind: Any, value: Any, key: str = "", metadata: Mapping[str, Any] = types.MappingProxyType({})
+) -> Any:
+    """Convert plain TOML data to `kind`; raises InputError with the dotted key of what is wrong."""
+    if "by_name" in metadata:
+        find = metadata["by_name"].find
+        tables = _converted(dict[str, Any], value, key)
+        return {name: build(find(name, key), table, f"{key}.{name}") for name, table in tables.items()}
+    if "by_kind" in metadata:
+        registry, default = metadata["by_kind"]
+        table = _converted(dict[str, Any], value, key)
+        chosen = registry.find(table.pop("kind", default), f"{key}.kind")
+        return build(chosen, table, key)
+    built = _converted(kind, value, key)
+    require_allowed(built, metadata, key)
+    return built
+
+
+def _converted(kind: Any, value: Any, key: str) -> Any:
+    def wrong(wanted: str, remedy: str) -> InputError:
+        return InputError(f"expected {wanted}, found {abbreviated(value)}", field=key or None, remedy=remedy)
+
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
-        return _build_dataclass(kind, value, where)
+        if not isinstance(value, dict):
+            raise wrong("a table", "the files of variants/ show the form")
+        return _build_dataclass(kind, value, key)
     if origin in (types.UnionType, typing.Union):
-        return build(next(option for option in arguments if option is not type(None)), value, where)
+        return _converted(next(option for option in arguments if option is not type(None)), value, key)
     if origin is dict:
         if not isinstance(value, dict):
-            raise InputError(f"{where}: expected a table, found {abbreviated(value)}; write it as [name]")
-        return {key: build(arguments[1], inner, f"{where}.{key}") for key, inner in value.items()}
+            raise wrong("a table", "write it as [name]")
+        return {name: _converted(arguments[1], inner, f"{key}.{name}") for name, inner in value.items()}
     if origin is tuple:
         if not isinstance(value, list):
-            raise InputError(f"{where}: expected a list, found {abbreviated(value)}; write it in brackets")
-        return tuple(build(arguments[0], inner, where) for inner in value)
+            raise wrong("a list", "write it in brackets")
+        return tuple(_converted(arguments[0], inner, key) for inner in value)
     if origin is Literal:
         if not isinstance(value, str) or value not in arguments:
-            known = ", ".join(map(str, arguments))
-            raise InputError(f"{where}: {abbreviated(value)} is not allowed; use one of {known}")
-        return value
-    if kind is Any:
+            known = " or ".join(map(str, arguments))
+            raise InputError(f"{abbreviated(value)} is not allowed", field=key, remedy=f"use {known}")
         return value
     if type(value) in (int, float) and not abs(value) <= MAX_NUMBER:
-        raise InputError(f"{where}: {abbreviated(value)} is out of range; correct the value")
+        raise InputError(f"{abbreviated(value)} is out of range", field=key, remedy="correct the value")
     if kind is float and type(value) is int:
         return float(value)
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise InputError(f"{where}: expected {kind.__name__}, found {abbreviated(value)}; correct the value")
+    if kind is not Any and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
+        raise wrong(kind.__name__, "correct the value")
     return value
 
 
-def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
-    if not isinstance(value, dict):
-        found = f"expected a table, found {abbreviated(value)}"
-        raise InputError(f"{where}: {found}; the files of variants/ show the form")
-    known, hints = settings(kind), typing.get_type_hints(kind)
-    for key in value:
-        if key not in known:
-            raise InputError(f"{where}: unknown key '{key}'; use one of {', '.join(known)}")
+def _build_dataclass(kind: Any, table: dict[str, Any], key: str) -> Any:
+    known = settings(kind)
+    for name in table:
+        if name not in known:
+            raise InputError(
+                f"unknown key '{name}'", field=key or None, remedy=f"use one of {', '.join(known)}"
+            )
     for field in dataclasses.fields(kind):
-        if field.default is field.default_factory is MISSING and field.name not in value:
-            raise InputError(f"{where}: missing key '{field.name}'; add it")
-    built = {key: build(known[key], inner, f"{where}: {key}") for key, inner in value.items()}
+        if field.default is field.default_factory is MISSING and field.name not in table:
+            raise InputError(f"missing key '{field.name}'", field=key or None, remedy="add it")
+    below = f"{key}." if key else ""
+    built = {
+        name: build(known[name][0], inner, f"{below}{name}", known[name][1]) for name, inner in table.items()
+    }
     try:
         for field in dataclasses.fields(kind):
             if field.metadata == FLAT:
-                inner = hints[field.name]
-                built[field.name] = inner(**{key: built.pop(key) for key in settings(inner) if key in built})
-        made = kind(**built)
-    except (InputError, ValueError) as error:
-        raise InputError(f"{where}: {error}") from error
-    require_in_range(made, where)
-    return made
+                inner = typing.get_type_hints(kind)[field.name]
+                built[field.name] = inner(
+                    **{name: built.pop(name) for name in settings(inner) if name in built}
+                )
+        return kind(**built)
+    except InputError as error:
+        raise error.at(field=key or None) from error
+    except ValueError as error:
+        raise InputError(str(error), field=key or None) from error
 
 
 def plain(value: Any) -> Any:
@@ -90,6 +126,8 @@ def plain(value: Any) -> Any:
         found: dict[str, Any] = {}
         for field in dataclasses.fields(value):
             inner = plain(getattr(value, field.name))
+            if "by_kind" in field.metadata and inner is not None:
+                inner = {"kind": getattr(value, field.name).name} | inner
             if field.metadata == FLAT:
                 found |= inner
             elif field.metadata != NOT_A_SETTING and inner is not None:
@@ -101,7 +139,7 @@ def plain(value: Any) -> Any:
 
 
 def scaled(value: Any, factor: float) -> Any:
-    """Scale windows exactly, and fields whose metadata is ITERATIONS to whole numbers of at least 1."""
+    """Scale windows exactly, and fields whose metadata has ITERATIONS to whole numbers of at least 1."""
     if isinstance(value, dict):
         return {name: scaled(inner, factor) for name, inner in value.items()}
     if isinstance(value, tuple):

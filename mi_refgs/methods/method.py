@@ -7,14 +7,19 @@ every window, stage and interval is scaled with it (`methods.read`).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from mi_refgs.constants import PATCH_EDGE
+from mi_refgs.errors import InputError
 from mi_refgs.methods.build import FLAT
+from mi_refgs.methods.ranges import allowed, at_least, between, more_than
 from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.surfels.attributes import MAX_SH_DEGREE, attribute
+from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, attribute
 from mi_refgs.surfels.primitives import PRIMITIVES
 
 # Names among the parameters of a fit, beside the attributes of the surfels:
@@ -25,6 +30,7 @@ PER_VIEW = (GAIN, POSE)  # parameters with a row per training view, which a fit 
 AROUND = "surroundings/"  # prefix of the background Gaussians' attributes
 APART = (LIGHT, BACKGROUND, *PER_VIEW)  # parameters that are not attributes of surfels
 AT_ONCE = Window(0, 3, 1)  # one SH degree more in each of the first three iterations
+LEAST_CROP = 64 * 64  # pixels; SSIM compares windows of 11 × 11
 MESH_WINDOW = Window(20_000, 50_000, 2_000)  # that of the released Ref-Gaussian code on synthetic scenes
 
 
@@ -47,11 +53,15 @@ class SurfelOptions:
     primitive: str = "surfel"  # what is splatted
     # Attributes beside the geometry of the primitive.
     attributes: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
-    count: int = 20_000  # initial surfels
-    max_count: int = 40_000  # densification stops here, times `capacity`
-    capacity: float = 1.0  # factor of `max_count`; a component that raises it fills the room at once
-    inside: float = 0.0  # fraction of initial surfels in the visual hull's volume; the others on its surface
-    degree: dict[str, int] = field(default_factory=dict)  # SH degree by attribute; else 3
+    count: int = field(default=20_000, metadata=at_least(1))  # initial surfels
+    # Densification stops at this number, times `capacity`.
+    max_count: int = field(default=40_000, metadata=at_least(1))
+    # Factor of `max_count`; a component that raises it fills the room at once.
+    capacity: float = field(default=1.0, metadata=more_than(0))
+    # Fraction of the initial surfels in the visual hull's volume; the others are on its surface.
+    inside: float = field(default=0.0, metadata=between(0, 1))
+    # SH degree by attribute; else 3.
+    degree: dict[str, int] = field(default_factory=dict, metadata=between(0, MAX_SH_DEGREE))
     sh_raise: Window = AT_ONCE  # one SH degree of radiance_sh more at each event
     initial: dict[str, float] = field(default_factory=dict)  # activated, by attribute; else its own default
     from_images: tuple[Literal["albedo"], ...] = ()  # attributes that start with the hue of the images
@@ -87,17 +97,18 @@ class SurroundingsOptions:
     """
 
     primitive: str = "gaussian"  # what is splatted: needs no normals, and a surfel is a flat Gaussian
-    count: int = 20_000  # initial surfels
-    max_count: int = 40_000  # densification stops where both together have as many as both may
-    share: float = 0.75  # fraction of these that may be the background's: it has most of the pixels
-    degree: int = 2  # of radiance_sh
-    scattered: float = 0.5  # fraction of the initial surfels anywhere; the others at sparse points
-    opacity: float = 0.1  # initial, of object and background: a cloud of 0.3 closes before the object forms
-    size: float = 0.1  # largest initial size, in distances from the region's centre
-    prune_extent: float = 0.5  # distances from the region's centre; larger surfels are removed
-    reach: float = 1.0  # factor of the positions' learning rates, which grow with distance from the region
-    height: int = 32  # texels of the environment; width is twice that
-    rate: float = 0.01  # Adam learning rate of the environment's texels
+    count: int = field(default=20_000, metadata=at_least(1))  # initial surfels
+    # Densification stops where both together have as many as both may.
+    max_count: int = field(default=40_000, metadata=at_least(1))
+    degree: int = field(default=2, metadata=between(0, MAX_SH_DEGREE))  # of radiance_sh
+
+    share: ClassVar = 0.75  # fraction of all surfels that may be the background's: it has most of the pixels
+    scattered: ClassVar = 0.5  # fraction of the initial surfels anywhere; the others at sparse points
+    opacity: ClassVar = 0.1  # initial, of both: a cloud of 0.3 closes before the object forms
+    size: ClassVar = 0.1  # largest initial size, in distances from the region's centre
+    prune_extent: ClassVar = 0.5  # distances from the region's centre; larger surfels are removed
+    height: ClassVar = 32  # texels of the environment; width is twice that
+    rate: ClassVar = 0.01  # Adam learning rate of the environment's texels
 
     def limits(self, most: int) -> tuple[int, int]:
         """Largest numbers of surfels of an object that alone may have `most`, and of its background."""
@@ -115,9 +126,11 @@ class SurroundingsOptions:
 class LightOptions:
     """The learnable lat-long environment map; without this table there is no light."""
 
-    height: int = 64  # texels; width is twice that
+    # Texels; width is twice that.
+    height: int = field(default=64, metadata=allowed(is_height, f"a multiple of 4 from {MIN_HEIGHT}"))
     radiance: float = 0.5  # initial, everywhere
-    every: int = 1  # iterations that share one prefiltered light, which then receives all their gradients
+    # Iterations that share one prefiltered light, which then receives all their gradients.
+    every: int = field(default=1, metadata=at_least(1))
     # Iterations at which the background is rendered for the loss `photographed`; absent: never.
     photographed: Window | None = None
 
@@ -128,9 +141,10 @@ class Stage:
 
     until: int = field(metadata=ITERATIONS)  # last iteration of the stage
     shading: ShadingOptions = field(default_factory=ShadingOptions, metadata=FLAT)
-    samples: int = 1  # per pixel, k × k, in the steps of a fit
+    samples: int = field(default=1, metadata=at_least(1))  # per pixel, k × k, in the steps of a fit
     restart: tuple[str, ...] = ()  # attributes, and `light`, reset to initial values when the stage begins
-    rates: dict[str, float] = field(default_factory=dict)  # factors of rates, by attribute or `light`
+    # Factors of rates, by attribute or `light`.
+    rates: dict[str, float] = field(default_factory=dict, metadata=at_least(0))
 
 
 @dataclass(frozen=True)
@@ -155,7 +169,8 @@ class Refine:
     """Adaptive density control [3DGS §5.2; Ref-Gaussian §3.4], by error [Rota Bulò et al. 2024]."""
 
     densify: Window | None = None  # splits surfels; absent: never
-    grow: float = 0.25  # fraction of the surfels, those with the largest error, that an event splits at most
+    # Fraction of the surfels, those with the largest error, that an event splits at most.
+    grow: float = field(default=0.25, metadata=at_least(0))
     prune_opacity: float = 0.05  # surfels of less opacity are removed
     prune_extent: float = 0.1  # scene extents; larger surfels are removed
     prune_weight: float = 0.01  # share of all blending weight; the surfels of the least per tile are removed
@@ -182,8 +197,9 @@ class Rates:
     rest: dict[str, float] = field(default_factory=dict)  # factors for SH degrees above 0; else their own
     light: float = 0.01  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
-    position_final: float = 1.6e-6  # of positions, at 0.6 of the iterations
     decay: float = 1.0  # log-linear factor of all other rates at the last iteration
+
+    position_final: ClassVar = 1.6e-6  # of positions, at 0.6 of the iterations
 
     def of(self, name: str) -> float:
         """Learning rate of an attribute."""
@@ -206,10 +222,10 @@ class LossWeight:
     Losses on material maps apply to deferred stages only: forward shading blends no materials.
     """
 
-    weight: float  # factor in the sum of losses
-    start: int = field(default=0, metadata=ITERATIONS)  # iterations without the loss
-    rise: int = field(default=0, metadata=ITERATIONS)  # then its weight rises linearly from 0
-    until: int | None = field(default=None, metadata=ITERATIONS)  # last iteration with the loss
+    weight: float = field(metadata=at_least(0))  # factor in the sum of losses
+    start: int = field(default=0, metadata=ITERATIONS | at_least(0))  # iterations without the loss
+    rise: int = field(default=0, metadata=ITERATIONS | at_least(0))  # then its weight rises linearly from 0
+    until: int | None = field(default=None, metadata=ITERATIONS | at_least(0))  # last iteration with the loss
 
     def at(self, iteration: int) -> float:
         """The weight in this (1-based) iteration."""
@@ -235,7 +251,8 @@ class ExposureOptions:
     gains: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
     after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
     worth: float = 1.0  # dB gained on pixels of the training views that the gains were not fitted to
-    rate: float = 3e-3  # learning rate of log gains, per step; a tenth of it at the end
+    # Learning rate of log gains, per step; a tenth of it at the end.
+    rate: float = field(default=3e-3, metadata=at_least(0))
 
 
 @dataclass(frozen=True)
@@ -245,7 +262,8 @@ class CameraOptions:
     corrections: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
     after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
     worth: float = 0.6  # dB gained on pixels of the training views that the poses were not registered with
-    rate: float = 3e-3  # learning rate, radians per step; 3 % of it at the end
+    # Learning rate, radians per step; 3 % of it at the end.
+    rate: float = field(default=3e-3, metadata=at_least(0))
 
 
 @dataclass(frozen=True)
@@ -253,7 +271,7 @@ class CoarseImages:
     """Downscaled images for the iterations up to `until`; the table that ends first applies."""
 
     until: int = field(metadata=ITERATIONS)  # iterations
-    block: int = 2  # pixels along a side of the squares that are averaged into one
+    block: int = field(default=2, metadata=at_least(2))  # pixels along a side that are averaged into one
     least: int = 0  # pixels that are left at least: smaller images are not averaged
 
     def applies(self, pixels: int) -> bool:
@@ -267,9 +285,11 @@ class DataOptions:
 
     images: Literal["png", "exr"] = "png"  # 8-bit sRGB or linear radiance
     background: Literal["white", "black"] = "white"  # behind images with alpha
-    downscale: int | None = None  # pixels of a file per pixel, along a side; absent: as the preset allows
+    # Pixels of a file per pixel, along a side; absent: as the preset allows.
+    downscale: int | None = field(default=None, metadata=at_least(1))
     coarse: tuple[CoarseImages, ...] = ()  # downscaled images at the start of a fit
-    crop: int | None = None  # pixels that a step renders at most, of a larger image; absent: all of it
+    # Pixels that a step renders at most, of a larger image; absent: all of it.
+    crop: int | None = field(default=None, metadata=at_least(LEAST_CROP))
 
     def block_at(self, iteration: int, pixels: int) -> int:
         """Pixels along a side that a (1-based) iteration averages into one, in an image of so many pixels; 1:
@@ -296,7 +316,7 @@ class MethodComponent:
     """An optional component of a method, as changes of its file, and when a fit tries it."""
 
     after: int = field(metadata=ITERATIONS)  # iterations before it is tried
-    trial: int = field(metadata=ITERATIONS)  # iterations with and without it that are compared
+    trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations with and without it that are compared
     change: dict[str, Any] = field(default_factory=dict)  # tables merged over the method's
     drop: tuple[str, ...] = ()  # keys removed before that, where they exist
     needs: tuple[str, ...] = ()  # components that must be in use
@@ -313,8 +333,9 @@ class Selection:
     """
 
     component: dict[str, MethodComponent]  # by name
-    surfels: int | None = None  # largest number before any trial, of a preset that allows more
-    holdout: int = 8  # every so many training views validate
+    # Largest number of surfels before any trial, of a preset that allows more.
+    surfels: int | None = field(default=None, metadata=at_least(1))
+    holdout: int = field(default=8, metadata=at_least(2))  # every so many training views validate
     gain: float = 0.02  # dB
     gain_per_doubling: float = 0.25  # dB per doubling of the time per step: at the end the gain is larger
     gain_per_mb: float = 0.001  # dB per MB of parameters and their moments
@@ -329,14 +350,15 @@ class Selection:
 class MetalTrial:
     """Choice between metal and dielectric at the start, by a trial of both (`fitting.metal_trial`)."""
 
-    until: int = field(metadata=ITERATIONS)  # last iteration with every surfel metal, or none
+    until: int = field(metadata=ITERATIONS | at_least(1))  # last iteration with every surfel metal, or none
 
 
 @dataclass(frozen=True)
 class Method:
     """All settings of a fit; the resolved copy is saved with the run."""
 
-    iterations: int = field(metadata=ITERATIONS)  # of the fit, in which all others of the file count
+    # Of the fit, in which all others of the file count.
+    iterations: int = field(metadata=ITERATIONS | at_least(1))
     stage: dict[str, Stage]  # by name
     about: About = About()
     surfels: SurfelOptions = SurfelOptions()
@@ -362,10 +384,44 @@ class Method:
     assignments: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError("iterations: less than 1; give how many to run")
         if not self.stage:
-            raise ValueError("stage: expected at least one named table; add one")
+            raise InputError("expected at least one named table", field="stage", remedy="add one")
+
+    def check(self) -> None:
+        """Raise InputError for an unknown name, and for a stage or an event without what it needs."""
+        surfels, stages, losses = self.surfels, self.stages(), self.loss
+        if "ssim" in losses and losses["ssim"].weight > 1:  # the rest, 1 - ssim, is the weight of L1
+            what = f"{losses['ssim'].weight} is out of range"
+            raise InputError(what, field="loss.ssim.weight", remedy="give a number from 0 to 1")
+        for key, table in (("surfels", surfels), ("surroundings", self.surroundings)):
+            if table is not None:
+                PRIMITIVES.find(table.primitive, f"{key}.primitive")
+
+        # Names of attributes, and of other parameters.
+        attributes = {*surfels.names}
+        others = {LIGHT} if self.light is not None else set()
+        harmonics = {name for name, one in ATTRIBUTES.items() if one.harmonics}
+        bounded = {name for name in attributes & {*ATTRIBUTES} if ATTRIBUTES[name].activation == "sigmoid"}
+        no_geometry = {name for name, one in ATTRIBUTES.items() if not one.geometry}
+        _require_known("surfels.attributes", surfels.attributes, no_geometry)
+        _require_known("surfels.initial", surfels.initial, attributes)
+        _require_known("surfels.degree", surfels.degree, harmonics)
+        _require_known("surfels.from_images", surfels.from_images, {*surfels.attributes})
+        _require_known("rates.attribute", self.rates.attribute, {*ATTRIBUTES})
+        _require_known("rates.rest", self.rates.rest, harmonics)
+        _require_known("refine.reset_raise", self.refine.reset_raise, bounded)
+        for name, stage in stages:
+            _require_known(f"stage.{name}.restart", stage.restart, {*surfels.attributes} | others)
+            _require_known(f"stage.{name}.rates", stage.rates, attributes | others)
+            try:
+                shading = Shading.resolve(stage.shading, self.mesh is not None)
+                shading.require_inputs(attributes, self.light is not None)
+            except InputError as error:
+                raise error.at(field=f"stage.{name}") from error
+        for key, used in (("refine.propagate", self.refine.propagate), ("metal_trial", self.metal_trial)):
+            if used is not None and "metallic" not in attributes:
+                what = "there is no attribute 'metallic'"
+                raise InputError(what, field=key, remedy="add it, or drop this")
 
     def downscaled(self, factor: int | None) -> Method:
         """The method with this `data.downscale`."""
@@ -378,3 +434,10 @@ class Method:
     def stage_at(self, iteration: int) -> tuple[str, Stage]:
         """The stage that contains a (1-based) iteration."""
         return next((item for item in self.stages() if iteration <= item[1].until), self.stages()[-1])
+
+
+def _require_known(key: str, names: Iterable[str], known: set[str]) -> None:
+    """Raise InputError for the first name that is not known."""
+    if unknown := [name for name in names if name not in known]:
+        some = ", ".join(name for name in (*ATTRIBUTES, *{*known} - {*ATTRIBUTES}) if name in known)
+        raise InputError(f"'{unknown[0]}' is unknown", field=key, remedy=f"use some of {some or 'none'}")

@@ -1,10 +1,9 @@
-"""Ranges of settings, declared at their fields: `field(default=0.25, metadata=at_least(0))`."""
+"""Metadata of settings, declared at their fields: `field(default=0.25, metadata=at_least(0))`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from mi_refgs.errors import InputError
@@ -12,17 +11,9 @@ from mi_refgs.errors import InputError
 Metadata = dict[str, Any]  # of a dataclass's field
 
 
-@dataclass(frozen=True)
-class Range:
-    """Values that a setting may have."""
-
-    allows: Callable[[Any], bool]
-    wanted: str  # for messages: "give 0 or more"
-
-
 def allowed(allows: Callable[[Any], bool], wanted: str) -> Metadata:
-    """Metadata of a field whose value must pass a test; None, "not set", always does."""
-    return {"range": Range(allows, wanted)}
+    """Metadata of a field whose value must pass a test, or be None; `wanted` completes "give …"."""
+    return {"allowed": (allows, wanted)}
 
 
 def at_least(low: float) -> Metadata:
@@ -45,16 +36,12 @@ def inside(low: float, high: float) -> Metadata:
     return allowed(lambda value: low < value < high, f"a number between {low:g} and {high:g}")
 
 
-def require_in_range(settings: Any, where: str) -> None:
-    """Raise InputError for a field of a dataclass whose value is out of its range.
-
-    The values of a dictionary or a tuple are tested one by one.
-    """
-    for field in fields(settings):
-        limit, value = field.metadata.get("range"), getattr(settings, field.name)
-        if limit is None or value is None:
-            continue
-        values = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else [value]
-        for one in values:
-            if not limit.allows(one):
-                raise InputError(f"{where}: {field.name}: {one} is out of range; give {limit.wanted}")
+def require_allowed(value: Any, metadata: Mapping[str, Any], key: str) -> None:
+    """Raise InputError for a value that its field does not allow; those of dicts and tuples one by one."""
+    if "allowed" not in metadata or value is None:
+        return
+    allows, wanted = metadata["allowed"]
+    values = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else [value]
+    for one in values:
+        if not allows(one):
+            raise InputError(f"{one} is out of range", field=key, remedy=f"give {wanted}")

@@ -78,12 +78,8 @@ class Shading(ShadingOptions):
 
     @staticmethod
     def from_json(note: Mapping[str, Any]) -> Shading:
-        """Read what `dataclasses.asdict` has written; raises InputError, or TypeError for an unknown key.
-
-        Files of version 0.1 have a table `accuracy` of the options that are now beside it.
-        """
-        options = dict(note)
-        return Shading(**options.pop("accuracy", {}), **options)
+        """Read what `dataclasses.asdict` has written; raises InputError, or TypeError for an unknown key."""
+        return Shading(**note)
 
     @staticmethod
     def default_reflectance(attributes: Collection[str]) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refgs.cli import RENAMED, demo, main, parse
+from mi_refgs.cli import demo, main
 from mi_refgs.fitting.runner import load_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr
@@ -52,22 +52,6 @@ def test_overview_lists_commands_and_exit_codes(argv: list[str], capsys: pytest.
     text = capsys.readouterr().out
     assert all(f"\n  {name} " in text for name in command_names())
     assert "exit codes:" in text and "bad input" in text
-
-
-def test_old_names_of_options_work_with_a_warning(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """For one release."""
-    assert main(["profile", str(data), "--variant=none"]) == 2
-    said = capsys.readouterr().err
-    assert "--variant is now --method" in said and "--method: none: no such method" in said
-    for command, renamed in RENAMED.items():
-        options = {*command_options(command)}
-        assert {*renamed.values()} <= options and not {*renamed} & options
-    for old in (["--view", "8099"], ["--view=8099"]):
-        train = parse(["train", "data", "-o", "run", *old])
-        assert train.watch and train.port == 8099
-    assert parse(["train", "data", "-o", "run", "--view", "--resume"]).watch and parse(["doctor"])
-    assert parse(["compare", "data", "--cluster", "-o", "out"]).cluster == "local"
-    assert parse(["compare", "data", "--cluster", "local", "-o", "out"]).cluster == "local"
 
 
 def test_help_lists_purposes_and_presets(capsys: pytest.CaptureFixture[str]) -> None:

@@ -82,7 +82,7 @@ def test_evaluate_writes_every_metric_sheet_and_render(run: Run) -> None:
     assert result.keys() >= set(KEYS)
     written = json.loads((run.path / "metrics.json").read_text())
     assert written == json.loads(json.dumps(result, allow_nan=False))
-    assert result["iterations"] == 6 and result["variant"] == "tiny" and result["preset"] == "quick"
+    assert result["iterations"] == 6 and result["method"] == "tiny" and result["preset"] == "quick"
     assert 0 < result["ms_per_frame"] and result["train_seconds"] > 0
     assert 0 <= result["normal_mae_deg_full"] < result["normal_mae_deg"] <= 180
     for key in ("flip", "lpips", "normal", "env", "albedo", "roughness", "metallic", "surface", "concave"):

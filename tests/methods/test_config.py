@@ -20,12 +20,13 @@ from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import refine
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.build import scaled
-from mi_refgs.methods.method import LOSS_WEIGHTS
+from mi_refgs.methods.build import build, by_kind, by_name, plain, scaled
+from mi_refgs.methods.ranges import at_least
 from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.registry import Registry
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import ROOT, refused
+from tests.helpers import refused
 from tests.scenes.highlight import ball
 
 
@@ -113,7 +114,7 @@ def test_every_number_of_iterations_is_declared() -> None:
         hints = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) and kind is not Window else {}
         for field in dataclasses.fields(kind) if hints else ():
             counts = field.name in names or field.name.endswith(("_start", "_rise", "_until"))
-            assert (field.metadata == ITERATIONS) == counts, f"{kind.__name__}.{field.name}"
+            assert (ITERATIONS.items() <= field.metadata.items()) == counts, f"{kind.__name__}.{field.name}"
         waiting += [part for hint in hints.values() for part in (hint, *typing.get_args(hint))]
         waiting += [] if hints else typing.get_args(kind)
 
@@ -236,7 +237,7 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (f"{STAGE}[loss.smooth]\nend = 1", ["loss.smooth", "unknown key 'end'"]),
+        (f"{STAGE}[loss.smooth]\nend = 1", ["loss.smooth: unknown key 'end'"]),
         (f"{STAGE}[loss]\nsmooth = true", ["loss.smooth: expected a table", "True"]),
         ("iterations = 10\n[stage.a]\nuntil = 'x'", ["until", "expected int"]),
         (f"{STAGE}at = 'voxel'", ["'voxel' is not allowed", "surfel"]),
@@ -245,17 +246,13 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
         ("iterations = [", ["not valid TOML"]),
         (
             f"{STAGE}[refine]\nreset = {{start = 0, until = 9, every = 0}}",
-            ["refine: reset", "'every' above 0"],
+            ["refine.reset", "'every' above 0"],
         ),
         (f"{STAGE}[data]\ncoarse = [{{until = 5, block = 1}}]", ["data.coarse.block: 1", "2 or more"]),
-        (f"{STAGE}[data]\ncrop = 4000", ["data.crop: 4000", "4096 or more"]),
-        (
-            f"{STAGE}[surfels]\nchannels = ['albedo']\nattributes = ['tint']",
-            ["surfels.channels: is called surfels.attributes now", "remove surfels.channels"],
-        ),
+        (f"{STAGE}[data]\ncrop = 4000", ["data.crop: 4000", "4,096 or more"]),
         (f"{STAGE}[light]\nevery = 0", ["light.every: 0", "1 or more"]),
         (f"{STAGE}[cameras]\nrate = -1", ["cameras.rate: -1", "0 or more"]),
-        (f"{STAGE}[cameras]\ncorrections = 'maybe'", ["cameras: corrections: 'maybe'", "judged, on, off"]),
+        (f"{STAGE}[cameras]\ncorrections = 'maybe'", ["cameras.corrections: 'maybe'", "judged or on or off"]),
     ],
 )
 def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> None:
@@ -337,20 +334,20 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
             methods.for_purpose(word)
 
 
-SURROUNDINGS = dict(count=0, degree=4, scattered=1.5, size=0, prune_extent=-1, reach=0, height=10)
+SURROUNDINGS = dict(count=0, degree=4, max_count=-1)
 """Values out of range."""
 
 
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("stage.deferred.rates.tint=2.0", "rates: there is no 'tint'"),
-        ("stage.deferred.rates.metallic=-1.0", "metallic: -1.0 is out of range"),
+        ("stage.deferred.rates.tint=2.0", "stage.deferred.rates: 'tint' is unknown"),
+        ("stage.deferred.rates.metallic=-1.0", "stage.deferred.rates: -1.0 is out of range"),
         ("stage.deferred.rates.light=nan", "out of range"),
         ("surfels.from_images=['metallic']", "metallic"),
         ("surfels.attributes=['metallic', 'roughness']", "albedo"),
         ("refine.grow=-0.1", r"refine\.grow: -0\.1"),
-        ("loss.ssim=1.5", r"loss\.ssim\.weight: 1.5 is out of range; give a fraction from 0 to 1"),
+        ("loss.ssim=1.5", r"loss\.ssim\.weight: 1.5 is out of range; give a number from 0 to 1"),
         ("loss.normal=-0.1", r"loss\.normal\.weight: -0.1 is out of range; give 0 or more"),
         *((f"loss.normal.{key}=-5", rf"loss\.normal\.{key}: -5") for key in ("start", "rise", "until")),
         ("losses.ssim=1", "--set: unknown key 'losses'"),
@@ -365,70 +362,6 @@ SURROUNDINGS = dict(count=0, degree=4, scattered=1.5, size=0, prune_extent=-1, r
 def test_bad_settings_are_named(assignment: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         methods.load("relighting", "quick", [assignment])
-
-
-def test_keys_of_version_0_1_are_read(tmp_path: Path) -> None:
-    """Each key of `read.RENAMED`: in the config.toml of a run, in `drop`, in assignments and in own files."""
-    now = methods.load("auto", "quick", ["select.component.surfels_2x.trial=9"], ["surfels_2x"])
-    old = methods.dump(now).replace("[select.component", "[select.term")
-    old = old.replace("components =", "terms =").replace('\nname = "auto"', '\nvariant = "auto"', 1)
-    old = old.replace("attributes =", "channels =").replace("[rates.attribute]", "[rates.channel]")
-    keys = "[select.term.surfels_2x]", "terms = [", 'variant = "auto"', "[rates.channel]", "\nchannels ="
-    assert all(key in old for key in keys)
-    (tmp_path / "config.toml").write_text(old)
-    assert methods.load_resolved(tmp_path / "config.toml") == now
-    changed = methods.load("auto", "quick", ["select.term.surfels_2x.trial=9"], ["surfels_2x"])
-    assert dataclasses.replace(changed, assignments=now.assignments) == now
-    (tmp_path / "own.toml").write_text('extends = "auto"\ndrop = ["select.term.surfels_4x"]\n')
-    select = methods.load(str(tmp_path / "own.toml")).select
-    assert select is not None and "surfels_4x" not in select.component
-    (tmp_path / "own.toml").write_text(
-        'extends = "ref_gaussian"\ndrop = ["rates.channel.scale"]\n[surfels]\nfrom_pictures = ["albedo"]\n'
-        "[loss]\nnormal_rise = 600\n[loss.registered.rough]\nweight = 0.5\n"
-    )
-    stored = methods.load_resolved(ROOT / "tests/runs/run_of_0_1/object/config.toml")
-    assert stored.loss == LOSS_WEIGHTS
-    own = methods.load(str(tmp_path / "own.toml"), "quick", ["loss.registered.rough.until=9"])
-    assert own.surfels.from_images == ("albedo",) and "scale" not in own.rates.attribute
-    assert own.loss["normal"] == methods.LossWeight(0.2, rise=200)
-    assert own.loss["rough"] == methods.LossWeight(0.5, until=9)
-
-
-@pytest.mark.parametrize(
-    ("assignment", "today"),
-    [
-        ("loss={normal=0.1}", "loss={normal={weight=0.1}}"),
-        ("loss={normal=0.1, normal_rise=9}", "loss={normal={weight=0.1, rise=9}}"),
-        ("loss.registered={rough=0.5}", "loss.rough={weight=0.5}"),
-        ("loss.registered.rough=0.5", "loss.rough={weight=0.5}"),
-        ("rates={channel={scale=0.1}}", "rates={attribute={scale=0.1}}"),
-        (
-            "surfels={count=9, channels=['albedo','radiance_sh','metallic','roughness','indirect_sh']}",
-            "surfels={count=9, attributes=['albedo','radiance_sh','metallic','roughness','indirect_sh']}",
-        ),
-        (
-            "select.term.surfels_2x.change.loss.normal=0.7",
-            "select.component.surfels_2x.change.loss.normal.weight=0.7",
-        ),
-        (
-            "select.component.surfels_2x.change={rates={channel={scale=0.1}}}",
-            "select.component.surfels_2x.change={rates={attribute={scale=0.1}}}",
-        ),
-        (
-            "select.component.surfels_2x.change.rates.channel.scale=0.1",
-            "select.component.surfels_2x.change.rates.attribute.scale=0.1",
-        ),
-    ],
-)
-def test_assigned_tables_may_have_earlier_keys(assignment: str, today: str) -> None:
-    old, new = (methods.load("auto", "quick", [text]) for text in (assignment, today))
-    assert dataclasses.replace(old, assignments=new.assignments) == new
-
-
-def test_a_weight_under_the_earlier_key_registered_may_be_a_number(tmp_path: Path) -> None:
-    (tmp_path / "own.toml").write_text('extends = "ref_gaussian"\n[loss.registered]\nrough = 0.5\n')
-    loss = methods.load(str(tmp_path / "own.toml")).loss
-    assert loss == methods.load("ref_gaussian").loss | {"rough": methods.LossWeight(0.5)}
 
 
 @pytest.mark.parametrize("change", [".loss.normal=0.7", "={loss={normal=0.7}}"])
@@ -496,3 +429,46 @@ def test_a_stage_sets_every_shading_option() -> None:
     for wrong in ("visibility_rays=0", "occlusion=true", "dominant=1"):
         with pytest.raises(InputError, match=wrong.partition("=")[0]):
             methods.load("ref_gaussian", "quick", [f"stage.deferred.{wrong}"])
+
+
+@dataclasses.dataclass(frozen=True)
+class Lamp:
+    """A kind of thing, of which another one has no `height`."""
+
+    name: typing.ClassVar = "lamp"
+    height: int = dataclasses.field(default=4, metadata=ITERATIONS | at_least(2))
+
+
+@dataclasses.dataclass(frozen=True)
+class Bulb:
+    name: typing.ClassVar = "bulb"
+    on: Window = methods.method.AT_ONCE
+
+
+KINDS = Registry[Any]("kind")
+KINDS.register(Lamp)
+KINDS.register(Bulb)
+
+
+@dataclasses.dataclass(frozen=True)
+class House:
+    """Values that a registry builds: a table of each name, and a table of one kind."""
+
+    room: dict[str, Any] = dataclasses.field(default_factory=dict, metadata=by_name(KINDS))
+    hall: Any = dataclasses.field(default=None, metadata=by_kind(KINDS, "lamp"))
+
+
+def test_a_registry_builds_tables() -> None:
+    table = {"room": {"lamp": {"height": 8}, "bulb": {}}, "hall": {"kind": "bulb"}}
+    house = build(House, table)
+    assert house == House({"lamp": Lamp(8), "bulb": Bulb()}, Bulb())
+    assert build(House, plain(house)) == house
+    half = Bulb(Window(0, 1.5, 0.5))
+    assert scaled(house, 0.5) == House({"lamp": Lamp(4), "bulb": half}, half)
+    assert build(House, {"hall": {}}).hall == Lamp()
+    refused(lambda: build(House, {"room": {"tv": {}}}), "room: 'tv' is unknown; use lamp or bulb")
+    refused(lambda: build(House, {"hall": {"kind": "tv"}}), "hall.kind: 'tv' is unknown; use lamp or bulb")
+    refused(
+        lambda: build(House, {"room": {"lamp": {"height": 1}}}), "room.lamp.height: 1 is out of range; give 2"
+    )
+    refused(lambda: build(House, {"hall": 3}), "hall: expected a table, found 3")

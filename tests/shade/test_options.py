@@ -18,7 +18,7 @@ from mi_refgs.reference.light import radiance_of
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.options import TRACED, ShadingOptions
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import reflect
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import multiple_scattering, shade
@@ -36,8 +36,6 @@ def test_shading_survives_json() -> None:
     shading = Shading(occlusion=True, dominant=True, visibility_rays=8, traced_bounces=3)
     note = json.loads(json.dumps(asdict(shading)))
     assert Shading.from_json(note) == shading
-    accuracy = {name: note.pop(name) for name in ("dominant", "multiscatter", *TRACED)}
-    assert Shading.from_json(note | {"accuracy": accuracy}) == shading  # as version 0.1 wrote it
 
 
 @pytest.mark.parametrize(
