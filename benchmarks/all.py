@@ -24,12 +24,13 @@ from typing import Any
 
 import mitsuba as mi
 
-from benchmarks import pages
+from benchmarks import pages, plots
 from benchmarks.common.build import RESULTS, commit, recorded, write_result
 from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
 from benchmarks.fits.measure import Workplace, group
 from benchmarks.fits.plan import GROUPS, TIMED, Fit
+from benchmarks.tables import PAGES
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 
@@ -38,8 +39,8 @@ from mi_refgs.io.files import is_file, read_json
 class Part:
     """A data file, and the module with arguments that measures it.
 
-    {data} is --data, {work} the folder of the fits, {run} that of TIMED. A module with a page of its own
-    writes its file itself; others print JSON, which becomes `result`. Groups of fits have no module.
+    {data} is --data, {run} the run of TIMED. Modules of `tables.PAGES` write their file themselves;
+    others print JSON, which becomes `result`. Groups of fits have no module.
     """
 
     name: str
@@ -69,16 +70,8 @@ PARTS = (
     *_fits(),
     Part("frames", 2, "mi_refgs profile {run} --json"),
     Part("viewer", 4, "benchmarks.viewer {run} --minutes 2"),
-    Part("kill", 10, "benchmarks.survival kill", "--times 2"),
-    Part("soak", 25, "benchmarks.survival soak", "--steps 1000"),
-    Part(
-        "frontier",
-        25,
-        "benchmarks.frontier {data}/chair_400 --methods ref_gaussian auto "
-        "--presets quick --surfels 20000 --iterations 500 1000 --threads 1",
-    ),
 )
-"""In this order: those with {run} or {work} need groups of fits."""
+"""In this order: those with {run} need groups of fits."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -107,7 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
     failed = [part.name for part in left if not run(part, options, folder)]
     if failed:
         print(f"failed: {' '.join(failed)}; the same command repeats only them", file=sys.stderr)
-    code = 0 if options.small else pages.main([])
+    code = 0 if options.small else plots.main([]) or pages.main([])
     return code or int(bool(failed))
 
 
@@ -119,10 +112,10 @@ def is_done(path: Path, build: str) -> bool:
 def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
     """Measure a part, and print how long it took; returns whether that succeeded."""
     begin, work = time.monotonic(), folder / "work" if options.small else Path("runs", "all")
-    words = part.module.format(data=options.data, work=work, run=work / commit() / TIMED.name / "run").split()
+    words = part.module.format(data=options.data, run=work / commit() / TIMED.name / "run").split()
     words += (part.small or "").split() if options.small else []
-    has_page = part.name in pages.TEMPLATES
-    if has_page:
+    writes = part.name in PAGES  # its data file itself
+    if writes:
         words += ["--quiet", *(["-o", str(folder)] if options.small else [])]
 
     def measure() -> dict[str, Any]:
@@ -131,14 +124,14 @@ def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
         done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
         if done.returncode:
             raise InputError(f"python -m {' '.join(words)}: exit code {done.returncode}; see above")
-        return {} if has_page else {"result": json.loads(done.stdout)}
+        return {} if writes else {"result": json.loads(done.stdout)}
 
     print(f"{part.name} …", flush=True)
     try:
         if options.data is None and "{data}" in part.module and not options.small:
             raise InputError(f"{part.name}: --data: missing; give the folder")
         found = recorded(measure)
-        if not has_page:
+        if not writes:
             write_result(folder / f"{part.name}.json", found)
     except InputError as error:
         print(error, file=sys.stderr, flush=True)

@@ -2,35 +2,27 @@
 
 A marker <!-- FILE.NAME --> … <!-- / --> contains what FILE.json says: a table with its caption, or a number.
 <!-- caption.FILE.FILE --> is the caption of a table whose cells contain markers. Where FILE.json is missing,
-the text stays; stale.toml lists those `files`, by page the `numbers` that no data file contains, and
-`settings`: numbers that nothing measures, such as bounds.
+the text stays. results/settings.toml lists, by page, the numbers that nothing measures, such as bounds.
 """
 
 from __future__ import annotations
 
-import importlib
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
+from benchmarks import tables
 from benchmarks.common import build
-from benchmarks.common.report import number, page_text, plain_parser, values_of, write_text
+from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
-from benchmarks.fits import page as fits
-from benchmarks.fits.plan import GROUPS
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import is_file
+from mi_refgs.io.files import is_file, write_bytes
 
-PAGES = ("README.md", "docs/accuracy.md", "docs/speed.md", "docs/photographs_in_detail.md")
-TEMPLATES = tuple(sorted(path.parent.name for path in (ROOT / "benchmarks").glob("*/page.md")))
-"""Benchmarks that write docs/NAME.md as a whole."""
-STALE = build.RESULTS / "stale.toml"
+SETTINGS: dict[str, list[str]] = tomllib.loads((build.RESULTS / "settings.toml").read_text(encoding="utf-8"))
+PAGES = tuple(SETTINGS)
 MARKER = re.compile(r"<!-- (\w+)\.([\w.]+) -->(.*?)<!-- / -->", flags=re.DOTALL)
 CODE = re.compile(r"```.*?```|`[^`\n]*`", flags=re.DOTALL)
 UNIT = r"(?:dB|°|%|ms|s|h|minutes|times|[kMG]i?B|frames per second)(?![\w*])"
@@ -41,22 +33,8 @@ MEASURED = re.compile(rf"\d[\d.,]*\s?{UNIT}|^\|[^\n]*[ (,]{UNIT}[^\n]*(?=\n\|[-:
 @lru_cache
 def values(path: Path) -> dict[str, Any]:
     """Return the tables and numbers of a data file by name; raises InputError for rows of several builds."""
-    result, name = build.read_result(path), path.stem
-    if name in GROUPS:
-        return values_of(result, lambda content: fits.values(name, content)) | {"about": result["build"]}
-    found: Any = lambda content: dict(_numbers(content["result"]))  # noqa: E731
-    if name in TEMPLATES:
-        found = importlib.import_module(f"benchmarks.{name}.__main__").page
-    return values_of(result, found) | {"about": result["build"]}
-
-
-def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Numbers of nested objects and lists as text, by the path of their keys."""
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inner in items:
-        yield from _numbers(inner, f"{name}_{key}".strip("_"))
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        yield name, f"{value:,}" if isinstance(value, int) else number(value)
+    result = build.read_result(path)
+    return tables.values(path.stem, result) | {"about": result["build"]}
 
 
 def files_of(text: str) -> set[str]:
@@ -102,9 +80,7 @@ def unmarked(text: str) -> list[str]:
 
 def rewritten(folder: Path = build.RESULTS) -> dict[Path, str]:
     """Return the pages with the numbers of the data files in a folder. Raises InputError as `filled`."""
-    texts = {ROOT / page: filled((ROOT / page).read_text(encoding="utf-8"), folder) for page in PAGES}
-    here = [folder / f"{name}.json" for name in TEMPLATES if is_file(folder / f"{name}.json")]
-    return texts | {ROOT / "docs" / f"{path.stem}.md": page_text(path.stem, values(path)) for path in here}
+    return {ROOT / page: filled((ROOT / page).read_text(encoding="utf-8"), folder) for page in PAGES}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -113,11 +89,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         for path, text in rewritten().items():
             if text != path.read_text(encoding="utf-8"):
-                write_text(path, text)
+                write_bytes(path, text.encode())
                 print(path)
-        stale = tomllib.loads(STALE.read_text(encoding="utf-8"))
-        stale["files"] = [name for name in stale["files"] if not is_file(build.RESULTS / f"{name}.json")]
-        write_text(STALE, tomli_w.dumps(stale))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -48,11 +48,7 @@ LONGEST = (
     "test_train.py",
     "test_routes.py",
     "test_variants.py",
-    "test_splatting_benchmark.py",
-    "test_splitsum_benchmark.py",
     "test_reflectance_models.py",
-    "test_visibility_benchmark.py",
-    "test_numbers.py",
     "test_bsdf.py",
     "test_sensor_derivatives.py",
     "test_traced_light.py",
@@ -64,7 +60,6 @@ LONGEST = (
     "test_profile.py",
     "test_packaging.py",
     "test_config.py",
-    "test_survival.py",
 )
 """Files that take longest, in this order: run first, so that no process ends long before the other."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.common.montecarlo import Estimate
-from benchmarks.common.report import Row, number, table
+from benchmarks.common.report import Row
 
 DARK = 0.01
 """Share of the mean radiance below which a relative error counts as one of this radiance."""
@@ -27,7 +27,7 @@ def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = 
     """Errors of (P, 3) values, over all points or those of a mask (P,), each with the floor of the noise.
 
     bias: mean signed error over mean radiance; relmse: mean of (x - ref)² / (ref² + ε), ε = (0.01 mean)²;
-    mape: mean of |x - ref| / (ref + 0.01 mean); below_floor: relMSE may be the reference's noise alone.
+    below_floor: relMSE may be the reference's noise alone.
     """
     scale = float(reference.mean.mean())
     chosen = np.ones(len(values), bool) if where is None else where
@@ -37,7 +37,6 @@ def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = 
     return {
         "bias": float((x - mean).mean() / mean.mean()),
         "relmse": relmse,
-        "mape": float((np.abs(x - mean) / (mean + DARK * scale)).mean()),
         "bias_floor": float(np.sqrt((noise**2).sum()) / noise.size / mean.mean()),
         "relmse_floor": floor,
         "below_floor": relmse < CLEAR * floor,
@@ -68,8 +67,8 @@ def decompose(steps: Sequence[Step]) -> Row:
     """Budget of a chain of at least two steps, the last of which is the reference.
 
     parts, in the order of the chain: bias (signed mean over mean radiance), relmse alone, and share of the
-    total, the projection on the whole error e_k·e / e·e, negative where it cancels others. sum: of the
-    parts' relmse; interaction: total - sum; pair: the two parts that interact most, and their correlation.
+    total, the projection on the whole error e_k·e / e·e, negative where it cancels others. adds_up: the sum
+    of the parts' relmse is within TOLERANCE of the total.
     """
     reference = steps[-1].values
     root = np.sqrt(weight(reference))
@@ -87,59 +86,9 @@ def decompose(steps: Sequence[Step]) -> Row:
         }
         for k, (name, difference, row) in enumerate(zip(names, differences, products, strict=True))
     ]
-    cross = np.triu(products, 1)
-    j, k = np.unravel_index(int(np.abs(cross).argmax()), cross.shape)
-    size = float(np.sqrt(products[j, j] * products[k, k]))
-    return {
-        "parts": parts,
-        "total": total,
-        "sum": squares,
-        "interaction": total - squares,
-        "adds_up": abs(total - squares) <= TOLERANCE * total,
-        "pair": [names[j], names[k]],
-        "correlation": float(cross[j, k]) / size if size > 0 else 0.0,
-    }
+    return {"parts": parts, "total": total, "adds_up": abs(total - squares) <= TOLERANCE * total}
 
 
 def noise_floor(error: np.ndarray, reference: np.ndarray) -> float:
     """relMSE below which a part or a whole cannot be told from standard errors (P, 3)."""
     return CLEAR * float((error**2 * weight(reference)).mean())
-
-
-# ---------------- as Markdown ----------------
-
-
-def budget_table(head: str, cases: Iterable[tuple[str, Row]]) -> str:
-    """A line for each labelled budget: parts, total, sum of squares and interaction."""
-    found = list(cases)
-    names = [part["name"] for part in found[0][1]["parts"]] if found else []
-    rows = [[label, *_cells(case)] for label, case in found]
-    return table([head, *names, "total", "sum", "interaction"], rows)
-
-
-def _cells(case: Row) -> list[str]:
-    if case["total"] < case["floor"]:
-        return [*["–"] * len(case["parts"]), f"< {number(case['floor'], 2)}", "–", "noise"]
-    parts = [f"{100 * part['share']:.0f} % ({number(part['relmse'], 2)})" for part in case["parts"]]
-    left = f"{100 * case['interaction'] / case['total']:+.0f} %"
-    if not case["adds_up"]:
-        left += f": {case['pair'][0]} and {case['pair'][1]}, ρ = {case['correlation']:+.2f}"
-    return [*parts, number(case["total"], 2), number(case["sum"], 2), left]
-
-
-def interactions(budgets: Sequence[Row]) -> str:
-    """The budgets above the noise whose squares do not add up, by the two parts that interact most."""
-    pairs: dict[str, list[float]] = {}
-    for row in above_noise(budgets):
-        if not row["adds_up"]:
-            pairs.setdefault(f"{row['pair'][0]} and {row['pair'][1]}", []).append(row["correlation"])
-    rows = [
-        [name, len(ρ), sum(x < 0 for x in ρ), f"{np.median(ρ):+.2f}"]
-        for name, ρ in sorted(pairs.items(), key=lambda item: -len(item[1]))
-    ]
-    return table(["parts", "budgets", "cancel in", "median ρ"], rows)
-
-
-def above_noise(budgets: Sequence[Row]) -> list[Row]:
-    """The budgets whose total is no noise."""
-    return [row for row in budgets if row["total"] >= row["floor"]]

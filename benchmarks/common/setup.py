@@ -18,7 +18,6 @@ from mi_refgs.surfels.table import Surfels
 ALBEDO = (0.9, 0.6, 0.3)
 OPACITY = 0.99
 """Opacity of surfels that cover a solid surface."""
-Colour = tuple[float, float, float]
 
 
 def path_tracer(depth: int) -> Any:
@@ -36,10 +35,9 @@ class Setup:
         light: Light,
         look: Look,
         settings: Any,
-        albedo: Colour = ALBEDO,
     ) -> None:
-        self.name, self.settings, self.albedo = name, settings, np.array(albedo)
-        colour = {"type": "rgb", "value": list(albedo)}
+        self.name, self.settings, self.albedo = name, settings, np.array(ALBEDO)
+        colour = {"type": "rgb", "value": list(ALBEDO)}
         bsdf = {"type": "refgs_bsdf", "albedo": colour, "metallic": 0.5, "roughness": 0.3}
         scene = {"type": "scene", "shape": shape | {"bsdf": bsdf}, "light": light.emitter()}
         self.scene = mi.load_dict(scene)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -71,14 +70,11 @@ def forget_peak() -> int:
     return int(psutil.Process().memory_info().rss)
 
 
-def in_fresh_process(
-    module: str, *arguments: Any, seconds: float | None = None, environment: Mapping[str, str] | None = None
-) -> dict[str, Any]:
+def in_fresh_process(module: str, *arguments: Any, seconds: float | None = None) -> dict[str, Any]:
     """Run `python -m module arguments` and return the JSON object of its last line.
 
     Raises subprocess.SubprocessError for one that fails or takes longer than `seconds`.
     """
     command = [sys.executable, "-m", module, *map(str, arguments)]
-    options: dict[str, Any] = {"cwd": ROOT, "env": {**os.environ, **(environment or {})}, "timeout": seconds}
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, **options)
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT, timeout=seconds)
     return dict(json.loads(done.stdout.splitlines()[-1]))

@@ -1,11 +1,10 @@
 """Peak memory of images and gradients against size, samples and surfels, measured and predicted.
 
-    python -m benchmarks.memory         the page docs/memory.md from a third of the cells, in a few minutes
-    python -m benchmarks.memory --all   from all of them
+    python -m benchmarks.memory         a third of the cells, in a few minutes
+    python -m benchmarks.memory --all   all of them
 
-Each cell is a process of its own. Those that are predicted to need more than LIMIT are left out, and said so.
-Writes memory.md and memory.json; without -o, the page to docs/ and the JSON to
-benchmarks/results/.
+Each cell is a process of its own; cells that are predicted to need more than LIMIT are left out. Writes
+memory.json; `python -m benchmarks.pages` makes the table of docs/memory.md.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import subprocess
 import sys
 from typing import Any
 
-from benchmarks.common.report import make_parser, table, write_reports
+from benchmarks.common.report import make_parser, write_measured
 from benchmarks.common.timing import in_fresh_process
 from benchmarks.memory import cell
 from mi_refgs.kernels import memory
@@ -53,41 +52,8 @@ def measured(kind: str, size: int, samples: int, surfels: int) -> dict[str, Any]
     return row
 
 
-def page(result: dict[str, Any]) -> dict[str, Any]:
-    """By name in page.md."""
-    known = [row for row in result["rows"] if row["measured"] is not None]
-    ratios = [row["predicted"] / row["measured"] for row in known]
-    lines = [
-        [
-            row["kind"],
-            f"{row['size']}²",
-            row["samples"],
-            f"{row['surfels']:,}",
-            f"{row['measured'] / 1e9:.2f}" if row["measured"] else "not measured",
-            f"{row['predicted'] / 1e9:.2f}",
-        ]
-        for row in result["rows"]
-    ]
-    head = ["", "pixels", "samples per pixel", "surfels", "measured, GB", "predicted, GB"]
-    most = max(known, key=lambda row: row["measured"])
-    return {
-        "table": table(head, lines),
-        "cells": len(known),
-        "least": f"{min(ratios):.1f}",
-        "largest": f"{max(ratios):.1f}",
-        "most": f"{most['measured'] / 1e9:.1f} GB ({most['kind']}) for {most['size']}² pixels with "
-        f"{most['samples']} samples per pixel and {most['surfels']:,} surfels",
-        "limit": f"{LIMIT / 1e9:.0f}",
-        "pass_samples": f"{memory.PASS_SAMPLES / 1e6:.1f} million",
-        "derivative_samples": f"{memory.DERIVATIVE_SAMPLES / 1e6:.1f} million",
-        "base": f"{memory.BASE / 1e9:.1f}",
-        "per_pixel": f"{memory.PER_PIXEL / 1e3:.1f}",
-        "per_surfel": f"{memory.PER_SURFEL / 1e3:.1f}",
-    }
-
-
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, and write the reports; the exit code, 2 for bad input."""
+    """Measure; returns the exit code, 2 for bad input."""
     parser = make_parser("memory", __doc__)
     parser.add_argument("--all", action="store_true", help="every cell")
     options = parser.parse_args(arguments)
@@ -100,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
                 print(rows[-1], file=sys.stderr, flush=True)
         return {"rows": rows}
 
-    return write_reports("memory", options, run, lambda *_: None, page)
+    return write_measured("memory", options, run)
 
 
 if __name__ == "__main__":

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.errors import InputError
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.splat import PinholeCamera
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.init import quaternions
-from mi_refgs.surfels.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels
 
 Grid = tuple[tuple[int, int], ...]
@@ -29,7 +26,6 @@ class Settings:
     surfels: tuple[int, ...] = (1_000, 10_000, 50_000, 200_000)
     sizes: tuple[int, ...] = (128, 256, 512, 1024)
     spreads: tuple[float, ...] = (0.75, 1.5)
-    scenes: tuple[str, ...] = ()  # run folders of `refgs train`
     repeats: int = 9  # of each of our times; at least three of a slow one
     seconds: float = 2.5  # spent on ours in one case, roughly
     volprim: Grid = (
@@ -39,17 +35,6 @@ class Settings:
     volprim_repeats: int = 2
     errors: Grid = ((1_000, 256), (10_000, 256), (50_000, 256), (50_000, 512))
     crop: int = 32  # pixels, edge of the part whose error is measured
-    memory: Grid = (
-        (1_000, 256),
-        (1_000, 1024),
-        (50_000, 256),
-        (50_000, 512),
-        (200_000, 256),
-        (200_000, 1024),
-        (1_000_000, 512),
-        (1_000_000, 1024),
-    )
-    compiled: tuple[int, int] = (10_000, 256)  # cold and warm compile times
     step: tuple[int, int] = (20_000, 200)  # of the training step
     steps: int = 30
     large_step: tuple[int, int] = (1_000_000, 1024)  # memory of one training step
@@ -67,8 +52,6 @@ SMALL = Settings(
     volprim_repeats=1,
     errors=((200, 32), (2_000, 64)),
     crop=16,
-    memory=((200, 32),),
-    compiled=(200, 32),
     step=(500, 32),
     steps=3,
     large_step=(500, 32),
@@ -91,8 +74,7 @@ COLOUR = 3
 class Workload:
     """Surfels, their features, and the camera."""
 
-    name: str
-    spread: float | None
+    spread: float
     raw: dict[str, np.ndarray]  # raw channels (N, D), float32
     features: np.ndarray  # (N, FEATURES) float32
     pinhole: PinholeCamera
@@ -141,26 +123,8 @@ def sphere(count: int, size: int, spread: float) -> Workload:
     focal = -0.5 * size / np.tan(np.radians(FIELD_OF_VIEW / 2))
     to_world = look_at(DISTANCE * np.array(DIRECTION), np.zeros(3))
     return Workload(
-        "sphere",
         spread,
         {name: values.astype(np.float32) for name, values in raw.items()},
         rng.uniform(size=(count, FEATURES)).astype(np.float32),
         PinholeCamera(size, size, focal, focal, size / 2, size / 2, to_world),
     )
-
-
-def fitted(folder: str) -> Workload:
-    """The surfels of a run folder in its first test camera, with random features."""
-    from mi_refgs.runs.run import Run
-    from mi_refgs.runs.views import views_of_run
-
-    run = Run(folder)
-    state = run.load_checkpoint()
-    view = views_of_run(run, run.method(), "test").views[0]
-    if state is None:
-        raise InputError(f"{folder}: checkpoints: none; train it first")
-    raw = {name: np.asarray(state[f"params/{name}"], np.float32) for name in Surfel.widths}
-    count = len(raw["position"])
-    features = np.random.default_rng(7).uniform(size=(count, FEATURES)).astype(np.float32)
-    pinhole = PinholeCamera(view.width, view.height, -view.fx, -view.fy, view.cx, view.cy, view.to_world)
-    return Workload(Path(folder).name, None, raw, features, pinhole)

@@ -20,9 +20,8 @@ from tqdm import tqdm
 
 from benchmarks.common import timing
 from benchmarks.common.fits import make_trainer, sphere_data
-from benchmarks.common.timing import once
-from benchmarks.splatting import process
-from benchmarks.splatting.cases import COLOUR, FEATURES, Settings, Workload, fitted, sphere
+from benchmarks.common.timing import in_fresh_process, once
+from benchmarks.splatting.cases import COLOUR, FEATURES, Settings, Workload, sphere
 from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.measure import measure as measure_case
@@ -126,8 +125,6 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
 
 PHASES = ("project", "tile lists", "sort", "splat forward", "splat backward", "surfels backward")
 PHASE_REPEATS = 5
-MEMORY = ("surfels", "pairs", "pixels")
-"""What peak memory is linear in."""
 COST = ("contributing", "pairs", "surfels")
 """What time is linear in."""
 Row = dict[str, Any]
@@ -144,10 +141,9 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         for spread in settings.spreads
         for count in settings.surfels
         for size in settings.sizes
-    ] + [fitted(folder) for folder in settings.scenes]
+    ]
     peaks = measure_peaks(settings.triad)
     rows = [case(workload, settings, peaks) for workload in shown(workloads, "cases")]
-    spheres = [row for row in rows if row["spread"] is not None]
     wrong = [
         {"surfels": count, "size": size, "spread": spread}
         | compare(sphere(count, size, spread), settings.crop)
@@ -155,17 +151,13 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         for count, size in shown(settings.errors, f"errors at {spread:g}")
     ]
     dr.flush_malloc_cache()
-    memory = [process.measure("memory", one) for one in shown(settings.memory, "memory")]
     return {
         "settings": asdict(settings),
         "peaks": peaks,
         "rows": rows,
-        "cost": plane(spheres, "both_ms", COST) if len(spheres) > len(COST) + 1 else None,
+        "cost": plane(rows, "both_ms", COST) if len(rows) > len(COST) + 1 else None,
         "errors": wrong,
-        "memory": memory,
-        "memory_fit": plane(memory, "peak", MEMORY) if len(memory) > len(MEMORY) + 1 else None,
-        "large_step": process.measure("step", settings.large_step),
-        "compile": process.measure_compile(settings.compiled),
+        "large_step": in_fresh_process("benchmarks.splatting.process", *settings.large_step),
         "step": step_times(*settings.step, settings.steps),
     }
 
@@ -212,7 +204,7 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
         "colour_both": colour.both,
     }
     slow = {}
-    if workload.spread is None or (count, size) in settings.volprim:
+    if (count, size) in settings.volprim:
         volprim = Volprim(workload)
         slow["volprim_forward"] = (volprim.forward, settings.volprim_repeats)
         slow["volprim_both"] = (volprim.both, settings.volprim_repeats)
@@ -221,7 +213,7 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
     bound = lower_bound(counts, peaks["gflops"])
     moved = bytes_moved(counts, FEATURES)
     phases = phase_times(full.both, min(PHASE_REPEATS, settings.repeats))
-    row: Row = {"case": workload.name, "spread": workload.spread, "surfels": count, "size": size}
+    row: Row = {"spread": workload.spread, "surfels": count, "size": size}
     names = ("pixels", "covered", "pairs", "evaluated", "contributing")
     row |= {name: getattr(counts, name) for name in names}
     row["share"] = counts.contributing / counts.evaluated if counts.evaluated else 1.0

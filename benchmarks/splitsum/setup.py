@@ -14,7 +14,6 @@ from benchmarks.common import montecarlo as mc
 from benchmarks.common.montecarlo import Estimate
 from benchmarks.common.setup import ALBEDO, Setup, path_tracer
 from benchmarks.common.view import BUILT_IN, ROOT, Light, Look, Points
-from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.split_sum import shade
@@ -53,17 +52,13 @@ class Settings:
     timing_size: int = 512  # of those that are timed: large enough that launching a kernel costs nothing
     truth_height: int = 512
     heights: tuple[int, ...] = (16, 32, 64, 128, 256)
-    height: int = 64  # rows where one number is asked for: the product's default
-    level_sets: tuple[str, ...] = ("few", "many")
     spp: tuple[int, ...] = (1, 4, 16, 64)
     timed_spp: tuple[int, ...] = (1, 4, 16)
-    samples: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
     lattice: int = 377  # points of the reference's lattices, and as many of the light
     batches: int = 8
     budget_shapes: tuple[str, ...] = ("sphere", "patch", "torus")
     budget_metallic: tuple[float, ...] = (0.0, 1.0)
     full_depth_spp: int = 256
-    surfels: int = 6000  # on the sphere of the surfels' budget
     timing_seconds: float = 0.25  # spent on each time, at least
     timing_rounds: int = 25  # of each time, at most
 
@@ -74,43 +69,24 @@ SMALL = Settings(
     lights=("constant", "gradient", "checker", "sunsky"),
     roughness=(0.1, 0.3, 0.8),
     metallic=(0.5,),
-    size=32,
+    size=24,
     timing_size=32,
     truth_height=64,
-    heights=(16, 32, 64),
-    height=32,
-    level_sets=("few",),
+    heights=(16, 64),
     spp=(1, 4, 16),
-    samples=(1, 16, 256),
+    timed_spp=(1, 4),
     lattice=233,
     budget_shapes=("sphere", "torus"),
     budget_metallic=(1.0,),
     full_depth_spp=16,
-    surfels=2000,
-    timing_seconds=0.05,
+    timing_seconds=0.01,
     timing_rounds=1,
 )
-SHIPPED = "shipped"
 FULL_DEPTH = 8
-
-
-def _levels(*roughness: float) -> Levels:
-    """Levels of these, each as fine as the shipped one of the next larger roughness."""
-    finer = (int(np.searchsorted(LEVELS.roughness, r - 1e-6)) for r in roughness)
-    return Levels(roughness, tuple(LEVELS.max_height[i] for i in finer))
-
-
-LEVEL_SETS = {
-    "few": _levels(0.1, 0.32, 1.0),
-    SHIPPED: LEVELS,
-    "many": _levels(0.07, 0.1, 0.12, 0.15, 0.18, 0.22, 0.265, 0.32, 0.38, 0.45, 0.54, 0.65, 0.8, 1.0),
-}
-"""Filtered levels; the map itself is one more."""
 
 OPTIONS = {
     "": ShadingOptions(diffuse="irradiance"),
     "dominant": ShadingOptions(diffuse="irradiance", dominant=True),
-    "multiscatter": ShadingOptions(diffuse="irradiance", multiscatter=True),
 }
 """Settings of `shade` that concern a surface that nothing shadows."""
 

@@ -1,11 +1,11 @@
 """Hard cases against a float64 reference.
 
-    python -m benchmarks.stability                     the page docs/stability.md, in 15 minutes on 2 cores
+    python -m benchmarks.stability                     every case, in 15 minutes on 2 cores
     python -m benchmarks.stability --quick -o out      without large cases, fits, the method's own error
     python -m benchmarks.stability --only light -o out cases whose name contains a word; repeatable
 
-Writes stability.md and stability.json to the output folder; without -o, the page to docs/ and
-the JSON to benchmarks/results/. The exit code is 1 if a case fails.
+Writes stability.json; `python -m benchmarks.pages` makes the tables and the plot of docs/stability.md. The
+exit code is 1 if a case fails.
 """
 
 from __future__ import annotations
@@ -20,18 +20,10 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common.fits import make_trainer, sphere_data
-from benchmarks.common.report import make_parser, table, write_reports
+from benchmarks.common.report import make_parser, write_measured
 from benchmarks.stability import bias, response
 from benchmarks.stability.cases import catalogue
-from benchmarks.stability.measure import (
-    GRADIENT_LIMIT,
-    GRADIENTS,
-    ILL,
-    IMAGE_LIMIT,
-    KEPT,
-    NEGLIGIBLE,
-    ORDER_LIMIT,
-)
+from benchmarks.stability.measure import IMAGE_LIMIT
 from benchmarks.stability.measure import measure as measure_case
 from mi_refgs.data.images import Pixels
 from mi_refgs.fitting.schedule import FitSetup
@@ -136,78 +128,8 @@ def _misses(row: dict[str, Any]) -> bool:
     return not all(row[key] is not None and row[key] <= IMAGE_LIMIT for key in ("value", "slope"))
 
 
-SHORT = {"radiance_sh": "SH", "roughness": "rough.", "indirect_sh": "indirect"}
-
-
-def page(result: dict[str, Any]) -> dict[str, Any]:
-    """By name in page.md."""
-    rows, limits = result["rows"], (IMAGE_LIMIT, GRADIENT_LIMIT, ORDER_LIMIT, NEGLIGIBLE)
-    names = ("image_limit", "gradient_limit", "order_limit", "negligible")
-    return dict(zip(names, map(_e, limits), strict=True)) | {
-        "count": len(rows),
-        "hold": sum(row["verdict"] == "within limits" for row in rows),
-        "ill": sum(row["verdict"].startswith("ill") for row in rows),
-        "failed": len(failures(result)),
-        "non_finite": sum(row["non_finite"] for row in [*rows, *result["losses"], *result["fits"]]),
-        "kept": f"{KEPT:.0%}",
-        "ill_factor": f"{ILL:g}",
-        "cases": table(["case", *COLUMNS], [[row["case"], *_case(row)] for row in rows]),
-        "gradients": table(
-            ["case", *(SHORT.get(n, n) for n in GRADIENTS)],
-            [[row["case"], *(_class(row, name) for name in GRADIENTS)] for row in rows],
-        ),
-        "curve": table(
-            ["sRGB at", "value", "slope"],
-            [[row["at"], _e(row["value"]), _e(row["slope"])] for row in result["curve"]],
-        ),
-        "losses": table(
-            ["image", "loss", "gradient", "not finite"],
-            [[r["name"], _e(r["value"]), _e(r["slope"]), r["non_finite"]] for r in result["losses"]],
-        ),
-        "fits": table(
-            ["fit", "steps", "first loss", "last loss", "not finite"],
-            [[r["name"], r["steps"], _e(r["first"]), _e(r["last"]), r["non_finite"]] for r in result["fits"]],
-        ),
-        "rules": table(
-            ["scene", "rule", "bias", "mean", "largest", "alpha"],
-            [
-                [r["scene"], r["rule"], _p(r["bias"]), _p(r["mean"], ""), _p(r["max"], ""), _p(r["alpha"])]
-                for r in result["rules"]
-            ],
-        ),
-        "cut": table(
-            ["opacity", "log scale", "logit of opacity"],
-            [[f"{r['opacity']:g}", _p(r["scale_bias"]), _p(r["opacity_bias"])] for r in result["gradient"]],
-        ),
-    }
-
-
-COLUMNS = ("image", "maps", "gradient, largest", "not finite", "image, 1 ulp", "gradient, 1 ulp", "verdict")
-
-
-def _case(row: dict[str, Any]) -> list[Any]:
-    worst = max((row[f"gradient_{n}"] or 0.0 for n in GRADIENTS), default=0.0)
-    ulps = [_e(x) if (x := row[key]) else "" for key in ("ulp_image", "ulp_gradient")]  # cheap cases
-    return [*map(_e, (row["image"], row["maps"], worst)), row["non_finite"], *ulps, row["verdict"]]
-
-
-def _class(row: dict[str, Any], name: str) -> str:
-    error = row[f"gradient_{name}"]
-    return "" if error is None else _e(error) + " †" * (name in row["negligible"].split())
-
-
-def _e(value: float | None) -> str:
-    if value is None or value == float("inf"):
-        return "not finite"
-    return "0" if value == 0 else f"{value:.1e}"
-
-
-def _p(value: float, sign: str = "+") -> str:
-    return "0" if abs(value) < 1e-9 else f"{100 * value:{sign}.2g} %"
-
-
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, and write the reports; exit code 1 where a case fails, 2 for bad input."""
+    """Measure; returns the exit code, 1 if a case fails, 2 for bad input."""
     parser = make_parser("stability", __doc__)
     parser.add_argument("--quick", action="store_true", help="what every test run can afford")
     parser.add_argument("--only", metavar="WORD", action="append", default=[], help="cases named so")
@@ -219,7 +141,7 @@ def main(arguments: list[str] | None = None) -> int:
         failed.extend(failures(result))
         return result
 
-    code = write_reports("stability", options, run, lambda *_: None, page)
+    code = write_measured("stability", options, run)
     print(*failed, sep="\n", end="\n" * bool(failed), file=sys.stderr)
     return code or int(bool(failed))
 

@@ -31,19 +31,13 @@ TIMED_ROUGHNESS = 0.3
 class Setup(setup.Setup):
     """One concave scene under the light."""
 
-    def __init__(
-        self,
-        concave: Concave,
-        settings: Settings,
-        light_name: str = "studio",
-        albedo: setup.Colour = setup.ALBEDO,
-    ) -> None:
-        light = make_light(light_name, settings.light_height)
+    def __init__(self, concave: Concave, settings: Settings) -> None:
+        light = make_light("studio", settings.light_height)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "mesh.ply"
             path.write_bytes(concave.mesh.export(file_type="ply", vertex_normal=True))
             shape = {"type": "ply", "filename": str(path)}
-            super().__init__(concave.name, shape, light, concave.look, settings, albedo)
+            super().__init__(concave.name, shape, light, concave.look, settings)
         constant = mi.load_dict({"type": "scene", "light": {"type": "constant"}, "ball": {"type": "sphere"}})
         self.constant = constant.environment()
         self.light = light.prefiltered(settings.light_height)
@@ -69,10 +63,6 @@ class Setup(setup.Setup):
         context = TraceContext(self.occluder, self.surfels, self.light, self.origin, -points.view)
         return reflection(at, context, rule.options())
 
-    def shaded(self, points: Points, rule: Rule) -> Any:
-        """Outgoing radiance (mi.Color3f)."""
-        return shade(self.seen(points, rule), self.light, rule.options()).total()
-
     def image(self, rule: Rule, indirect: np.ndarray | None = None) -> np.ndarray:
         """(P, 3); with indirect light (P, 3) of blocked rays in place of the rule's own."""
         at = self.seen(self.points, rule)
@@ -97,10 +87,6 @@ class Setup(setup.Setup):
         found, free = (self.reflected(self.constant, scene).mean(-1) for scene in (self.scene, None))
         blocked = found / free.mean(0)
         return blocked.mean(0), blocked.std(0, ddof=1) / np.sqrt(len(blocked))
-
-    def shading_call(self, rule: Rule) -> Callable[[], Any]:
-        """The timed image of the mesh: a primary ray through every pixel, visibility, shading."""
-        return self.with_primary_rays(lambda points: self.shaded(points, rule))
 
     def frame_call(self, rule: Rule) -> Callable[[], Any]:
         """The product's own frame: the surfels splatted, visibility, shading."""

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import pages
+from benchmarks import pages, plots
 from benchmarks.common.build import read_result
 from tests.helpers import run_process
 
 
 @pytest.fixture(scope="module")
-def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with its output."""
-    output = tmp_path_factory.mktemp(request.module.BENCHMARK)
-    done = run_process(
-        "-W", "error", "-m", f"benchmarks.{request.module.BENCHMARK}", "--small", "--quiet", "-o", output
-    )
+def result(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Its JSON, which has every name that the pages' markers require, and from which its plot is drawn."""
+    name = request.module.BENCHMARK
+    folder = tmp_path_factory.mktemp(name)
+    done = run_process("-W", "error", "-m", f"benchmarks.{name}", "--small", "--quiet", "-o", folder)
     assert done.returncode == 0, done.stderr[-3000:]
-    return output
-
-
-@pytest.fixture(scope="module")
-def result(request: pytest.FixtureRequest, folder: Path) -> Any:
-    """Its JSON, which has every name that the pages' markers want of it."""
-    path = folder / f"{request.module.BENCHMARK}.json"
-    assert pages.names_of(path.stem) <= pages.values(path).keys()
+    path = folder / f"{name}.json"
+    assert pages.names_of(name) <= pages.values(path).keys()
+    for plot in (plot for plot in plots.PLOTS if plot.startswith(name)):
+        drawn = plots.draw(plot, folder, folder)
+        assert drawn is not None and drawn.stat().st_size > 10_000
     return read_result(path)

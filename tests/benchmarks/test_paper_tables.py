@@ -12,7 +12,6 @@ from benchmarks.paper_tables import Figures, Place, place_of
 from mi_refgs.compare.table import Row, Scene, Statistic, Table
 from mi_refgs.errors import InputError
 from mi_refgs.methods import load, names
-from tests.helpers import run_process
 
 
 @pytest.mark.parametrize(
@@ -117,12 +116,9 @@ def test_paper_table_contains_our_figures() -> None:
     assert hours["  ours: mine"] == (1.0,)
 
 
-def test_command_prints_table_without_runs() -> None:
-    done = run_process("-W", "error", "-m", "benchmarks.paper_tables", "5")
-    assert (
-        "NeRO (published)" in done.stdout
-        and "29.73" in done.stdout
-        and "glossy_synthetic/tbell" in done.stdout
-    )
+def test_table_without_runs() -> None:
+    figures = Figures.read()
+    text = paper_tables.text(paper_tables.compared(5, None, figures), figures)
+    assert "NeRO (published)" in text and "29.73" in text and "glossy_synthetic/tbell" in text
     with pytest.raises(InputError, match="give one of 1, 2"):
         paper_tables.compared(9, None, Figures.read())

@@ -1,1 +1,0 @@
-"""Quality of fits against their CPU time, and the Pareto front of settings."""

@@ -1,0 +1,135 @@
+"""Plots of the pages, docs/images/NAME.png, from the data files: python -m benchmarks.plots [NAME ...]"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common import figures
+from benchmarks.common.build import RESULTS, read_result
+from benchmarks.common.errors import CLEAR
+from benchmarks.common.report import Row, plain_parser, where
+from benchmarks.common.view import ROOT
+from benchmarks.splatting.measure import FLOPS
+from benchmarks.stability.measure import GRADIENT_LIMIT, IMAGE_LIMIT
+from benchmarks.tables import worst_gradient
+from mi_refgs.io.files import is_file
+
+Result = dict[str, Any]
+BLUES = ("#9ecae1", "#4292c6", "#2171b5", "#08306b")
+
+
+def splatting_time(result: Result, path: Path) -> Path:
+    """Time over contributing pairs, ours, volprim's and the lower bound."""
+    kinds = {"forward": "forward", "both": "forward + backward"}
+    figure, axes = figures.grid(
+        list(kinds.values()), 2, 4.6, 3.8, "contributing surfel-pixel pairs", "milliseconds"
+    )
+    counts = sorted({row["surfels"] for row in result["rows"]})
+    for ax, kind in zip(axes, kinds, strict=True):
+        for k, count in enumerate(counts):
+            rows = where(result["rows"], surfels=count)
+            x, y = ([row[key] for row in rows] for key in ("contributing", f"{kind}_ms"))
+            label = f"ours, {count:,} surfels"
+            figures.series(ax, x, y, "os^D"[k % 4], label, color=BLUES[k % 4])
+        pairs = [row["contributing"] for row in result["rows"]]
+        theirs = [row[f"volprim_{kind}_ms"] for row in result["rows"]]
+        figures.series(ax, pairs, theirs, "x", "volprim_rf_basic", color="#c0392b")
+        line = np.geomspace(min(pairs), max(pairs), 50)
+        bound = 1e-6 * line * FLOPS[kind] / result["peaks"]["gflops"]
+        figures.series(ax, line, bound, "k-", "lower bound: peak arithmetic")
+    return figures.save(figure, axes, path, 3)
+
+
+def splitsum_pareto(result: Result, path: Path) -> Path:
+    """Error over time of the split sum and the path tracer, one panel per roughness."""
+    settings, lights = result["settings"], list(result["frequencies"])
+    light = "studio" if "studio" in lights else lights[-1]
+    metallic = settings["metallic"][len(settings["metallic"]) // 2]
+    titles = [f"roughness {r:g}" for r in settings["roughness"]]
+    figure, axes = figures.grid(titles, 4, 2.9, 2.6, "ms per megapixel", "relMSE")
+    for ax, roughness in zip(axes, settings["roughness"], strict=True):
+        case = {"shape": settings["shapes"][0], "light": light, "metallic": metallic, "n_dot_v": "all"}
+        cases = where(result["rows"], roughness=roughness, **case)
+        for method, style, label in (
+            ("path", "o-", "Mitsuba path, 1 to 64 samples per pixel"),
+            ("split_sum", "s", "split sum, 16 to 256 rows of light"),
+            ("split_sum_dominant", "D", "dominant direction"),
+        ):
+            rows = where(cases, method=method)
+            error = [max(row["relmse"], CLEAR * row["relmse_floor"]) for row in rows]
+            figures.series(ax, [row["ms_per_mpx"] for row in rows], error, style, label)
+    figure.suptitle(f"{case['shape']}, light: {light}, metallic {metallic:g}", fontsize=10)
+    return figures.save(figure, axes, path)
+
+
+def visibility_convergence(result: Result, path: Path) -> Path:
+    """Error over the time of a frame by bounces, one panel per scene, at a middling roughness."""
+    from matplotlib import ticker
+
+    values = result["settings"]["roughness"]
+    roughness = values[len(values) // 2]
+    figure, axes = figures.grid(
+        list(result["scenes"]), 4, 3.2, 2.9, "ms per frame", f"relMSE, roughness {roughness:g}"
+    )
+    for ax, scene in zip(axes, result["scenes"], strict=True):
+        rows = where(result["rows"], scene=scene, roughness=roughness, depth="full")
+        for k, bounces in enumerate((0, *result["settings"]["bounces"])):
+            found = [row for row in where(rows, bounces=bounces, dominant=False) if row["rays"]]
+            x, y = ([row[key] for row in found] for key in ("frame_ms", "relmse"))
+            label = f"{bounces} bounce{'s' * (bounces > 1)}" if bounces else "rays only"
+            figures.series(ax, x, y, "o-", label, color=("#c77b30", *BLUES)[k % 5])
+        none = where(rows, rays=0)[0]
+        figures.series(ax, [none["frame_ms"]], [none["relmse"]], "kx", "no occlusion")
+        ax.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+        ax.xaxis.set_minor_formatter(ticker.NullFormatter())
+    return figures.save(figure, axes, path, 6)
+
+
+def stability_cases(result: Result, path: Path) -> Path:
+    """Image and gradient errors of the hard cases in ascending order, with their limits."""
+    measures: dict[str, tuple[Callable[[Row], float], float]] = {
+        "image": (lambda row: float(row["image"]), IMAGE_LIMIT),
+        "gradient": (worst_gradient, GRADIENT_LIMIT),
+    }
+    figure, axes = figures.grid(list(measures), 2, 4.2, 2.8, "hard cases", "relative error")
+    for ax, (error, limit) in zip(axes, measures.values(), strict=True):
+        for verdict, style in (("within", "o"), ("ill", "x")):
+            rows = sorted(result["rows"], key=error)
+            found = [(i, error(row)) for i, row in enumerate(rows) if row["verdict"].startswith(verdict)]
+            if found:
+                label = "within limits" if verdict == "within" else "ill-conditioned"
+                ax.plot(*zip(*found, strict=True), style, markersize=3, label=label)
+        ax.axhline(limit, color="k", lw=0.8, ls=":", label="limit")
+        ax.set(yscale="log", ylim=(1e-9, 10))
+    return figures.save(figure, axes, path)
+
+
+PLOTS: dict[str, Callable[[Result, Path], Path]] = {
+    f.__name__: f for f in (splatting_time, splitsum_pareto, visibility_convergence, stability_cases)
+}
+"""Name of an image → what draws it; its first word is the data file."""
+
+
+def draw(name: str, results: Path, folder: Path) -> Path | None:
+    """Draw a plot into a folder; returns its path, None if its data file is not there."""
+    data = results / f"{name.partition('_')[0]}.json"
+    return PLOTS[name](read_result(data), folder / f"{name}.png") if is_file(data) else None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Draw the named plots, all without names."""
+    parser = plain_parser("plots", __doc__)
+    parser.add_argument("name", nargs="*", help="some of the plots; all without")
+    for name in parser.parse_args(arguments).name or PLOTS:
+        print(draw(name, RESULTS, ROOT / "docs" / "images"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
