@@ -41,7 +41,7 @@ def splatting_time(result: Result, path: Path) -> Path:
         figures.series(ax, pairs, theirs, "x", "volprim_rf_basic", color="#c0392b")
         line = np.geomspace(min(pairs), max(pairs), 50)
         bound = 1e-6 * line * FLOPS[kind] / result["peaks"]["gflops"]
-        figures.series(ax, line, bound, "k-", "lower bound: peak arithmetic")
+        figures.series(ax, line.tolist(), bound.tolist(), "k-", "lower bound: peak arithmetic")
     return figures.save(figure, axes, path, 3)
 
 

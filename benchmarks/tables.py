@@ -318,7 +318,8 @@ def _budget(result: Result, lights: list[str]) -> str:
     """Return the parts of the error on a metallic sphere, at a low, a middling and a high roughness."""
     budgets = where(result["budgets"], shape=result["settings"]["budget_shapes"][0])
     metallic = max(row["metallic"] for row in budgets)
-    shown = [min(result["settings"]["roughness"], key=lambda r, x=x: abs(r - x)) for x in (0.1, 0.3, 0.8)]
+    measured = np.array(result["settings"]["roughness"])
+    shown = [float(measured[np.abs(measured - x).argmin()]) for x in (0.1, 0.3, 0.8)]
     lines, names = [], [part["name"] for part in budgets[0]["parts"]]
     for light in lights:
         for row in where(budgets, light=light, metallic=metallic, roughness=shown):
