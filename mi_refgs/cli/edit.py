@@ -3,23 +3,11 @@
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from tyro.conf import arg
-
-from mi_refgs.cli.command import (
-    Flag,
-    OtherData,
-    Output,
-    Rendering,
-    Result,
-    RunFolder,
-    joined,
-    optional,
-)
+from mi_refgs.cli.command import Flag, OtherData, Output, Rendering, Result, RunFolder, joined
 from mi_refgs.editing.options import Change, Selection
 from mi_refgs.errors import InputError
 from mi_refgs.progress import say
@@ -38,13 +26,7 @@ class Edit:
     run_folder: RunFolder
     output: Output
     """new run folder"""
-    join: Annotated[Path | None, optional("OTHER")] = None
-    """add run OTHER, lit by the environment map of RUN; selection and change then apply to OTHER"""
     data: OtherData = None
-    view: Annotated[str, arg(metavar="I|CAMERA.json")] = "0"
-    """view of --mask: its number, or a camera that the page of `refgs view` saved"""
-    split: Literal["test", "train"] = "test"
-    """split of --view"""
     preview: Flag = False
     """also write preview.png: views before and after"""
     selection: Selection = Selection()
@@ -54,8 +36,7 @@ class Edit:
     def run(self) -> Result:
         """Edit the run."""
         from mi_refgs.editing.change import assignments
-        from mi_refgs.editing.expression import parse_condition
-        from mi_refgs.formats.cameras import read_cameras
+        from mi_refgs.editing.values import parse_condition
         from mi_refgs.io.images import write_png
         from mi_refgs.reconstruction.reconstruction import load
         from mi_refgs.runs.run import Run
@@ -63,23 +44,17 @@ class Edit:
         _require_free(self.output)
         options = vars(self.selection) | vars(self.change)
         options["set"] = joined(options["set"])
-        # Formulas are checked before the run is read, which takes seconds.
+        # Both are checked before the run is read, which takes seconds.
         assignments(options["set"])
         if self.selection.where is not None:
             parse_condition(self.selection.where)
 
-        # A number of a view or a file of a camera.
-        number = re.fullmatch(r"-?\d{1,9}", self.view, re.ASCII)
-        view = int(self.view) if number else read_cameras(Path(self.view))[0]
-
         whole = load(self.run_folder, write=False)
         whole = replace(whole, provenance=whole.provenance.with_data(self.data))
-        join = None if self.join is None else load(self.join, write=False)
         try:
-            edited = whole.edit(**options, view=view, split=self.split, join=join)
+            edited = whole.edit(**options)
         except InputError as error:
-            runs = " + ".join(str(path) for path in (self.run_folder, self.join) if path is not None)
-            raise InputError(f"{runs}: {error}") from error
+            raise InputError(f"{self.run_folder}: {error}") from error
         entry = edited.provenance.edits[-1]
         for note in entry["notes"]:
             say(f"note: {note}")

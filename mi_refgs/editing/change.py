@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.editing.expression import COLOUR, Expression, SurfelValues, parse_numbers
 from mi_refgs.editing.options import Assignments, Change, Rotate
 from mi_refgs.editing.placement import MAJORITY, TINY, Owners, Placement, joined_mesh
 from mi_refgs.editing.selection import finite
+from mi_refgs.editing.values import COLOUR, SurfelValues, activated
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
-ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(?!=)(.*)", re.ASCII | re.DOTALL)
-ANOTHER = re.compile(r"[\s,;][A-Za-z_][\w.]*\s*\*?=(?!=)", re.ASCII)
-"""The beginning of a further assignment in the value of one."""
-AXES: dict[str, Sequence[float]] = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(.*)", re.ASCII)
+AXES = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
 SCALES = (1e-6, 1e6)
 """Range of --scale: float32 represents no scene beyond."""
 COLOUR_FLOOR = 1e-3
@@ -34,40 +32,32 @@ class Assignment:
     """New values of an attribute, of one of its columns, or of `colour`."""
 
     name: str
-    values: tuple[Expression, ...]  # one per column, or one for all
+    values: tuple[float, ...]  # one per column, or one for all
     multiplies: bool  # the values multiply the old ones
     text: str  # as it was written
 
     @staticmethod
     def parse(text: str) -> Assignment:
-        """Parse `name=value` or `name*=value` with expressions between commas; raises InputError."""
-        found = ASSIGNMENT.fullmatch(text)
-        if found is None:
-            raise InputError(f"--set: {abbreviated(text)}: no assignment; write it like roughness=0.3")
-        if ANOTHER.search(found[3]):
-            raise InputError(
-                f"--set: {abbreviated(text)}: several assignments in one; quote each one separately"
-            )
-        return Assignment(found[1], tuple(parse_numbers(found[3])), found[2] == "*=", text.strip())
+        """Parse `name=value` or `name*=value` with numbers between commas; raises InputError."""
+        try:
+            name, sign, values = ASSIGNMENT.fullmatch(text).groups()  # type: ignore[union-attr]
+            numbers = tuple(map(float, values.split(",")))
+        except (AttributeError, ValueError):
+            what = f"{abbreviated(text)}: no assignment of numbers"
+            raise InputError(f"--set: {what}; write it like roughness=0.3 or albedo*=1,0.5,0.5") from None
+        if not np.isfinite(numbers).all():
+            raise InputError(f"--set: {abbreviated(text)}: not finite; give finite numbers")
+        return Assignment(name, numbers, sign == "*=", text.strip())
 
 
 def assignments(given: Assignments) -> tuple[Assignment, ...]:
-    """Parse texts as on the command line, or values by name such as {"albedo": (0.9, 0.6, "0.5 * albedo.b")}.
+    """Parse texts as on the command line, or numbers by name such as {"albedo": (0.9, 0.6, 0.2)}.
 
     Raises InputError for anything else.
     """
     if isinstance(given, Mapping):
-        lists = {
-            name: [value] if isinstance(value, str) or not isinstance(value, Iterable) else [*value]
-            for name, value in given.items()
-        }
-        try:
-            given = [
-                f"{name}={','.join(part if isinstance(part, str) else repr(float(part)) for part in parts)}"
-                for name, parts in lists.items()
-            ]
-        except (ValueError, TypeError) as error:
-            raise InputError(f"--set: {abbreviated(lists)}: {error}; give numbers or expressions") from error
+        lists = {name: ",".join(map(str, np.atleast_1d(value).tolist())) for name, value in given.items()}
+        given = [f"{name}={values}" for name, values in lists.items()]
     return tuple(Assignment.parse(text) for text in ([given] if isinstance(given, str) else given))
 
 
@@ -80,10 +70,7 @@ def placement_of(
     The pivot is the mean of the positions, weighted by opacity, before the change. The translation includes
     that of a duplicate.
     """
-    try:
-        scale = float(change.scale)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"--scale: {abbreviated(change.scale)}: no number; give one") from error
+    scale = float(finite("--scale", [change.scale], 1)[0])
     if not SCALES[0] <= scale <= SCALES[1]:
         raise InputError(f"--scale: {scale:g} is out of range; give {SCALES[0]:g} to {SCALES[1]:g}")
     options = (("--move", change.move), ("--duplicate", change.duplicate))
@@ -98,19 +85,14 @@ def _rotation(given: Rotate | None) -> Rotation:
     """Return a rotation by an axis and an angle; raises InputError for bad ones."""
     if given is None:
         return Rotation.identity()
-    if isinstance(given, str) or len(given) != 2:
-        raise InputError(f"--rotate: {abbreviated(given)}: not an axis and an angle; example: z 90")
-    name, angle = given
     try:
-        numbers = AXES.get(name) or name.split(",") if isinstance(name, str) else name
+        name, angle = given
+        degrees = float(angle)
+        numbers = AXES.get(name, name).split(",") if isinstance(name, str) else name
         axis = finite("--rotate", [float(number) for number in numbers], 3)
     except (ValueError, TypeError) as error:
-        remedy = "no axis; give x, y, z, or three numbers like 0,0,1"
-        raise InputError(f"--rotate: {abbreviated(name)}: {remedy}") from error
-    try:
-        degrees = float(angle)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"--rotate: {abbreviated(angle)}: no angle; give degrees, like z 90") from error
+        remedy = "give an axis and degrees, like z 90 or 0,0,1 90"
+        raise InputError(f"--rotate: {abbreviated(given)}: no rotation; {remedy}") from error
     length = np.linalg.norm(axis)
     if not (np.isfinite(degrees) and length > 0):
         raise InputError("--rotate: an axis without length, or an infinite angle; give them like z 90")
@@ -134,8 +116,6 @@ def apply(
         raise InputError("--cut: what is removed cannot be changed, too; leave the rest out")
     if change.keep and change.duplicate is not None:
         raise InputError("--keep: not possible with --duplicate; do one after the other")
-    if chosen.shape != (scene.surfels.count,) or not chosen.any():
-        raise InputError("selection: no surfel is in it; choose a wider one")
     if change.cut and chosen.all():
         raise InputError("--cut: no surfel would be left; choose fewer")
     values = SurfelValues(scene)
@@ -143,7 +123,7 @@ def apply(
     own = {name: table[chosen] for name, table in raw.items()}
     placement = placement_of(change, own)
     for assignment in assignments(change.set):
-        _assign(values, own, chosen, assignment)
+        _assign(values, own, assignment)
     mesh = _mesh(scene, chosen, own["opacity"], change, placement)
     placement.surfels(own)
     for name, table in raw.items():
@@ -189,45 +169,30 @@ def _mesh(
 def _assign(
     values: SurfelValues,
     own: dict[str, np.ndarray],  # raw attributes (chosen, D), changed in place
-    chosen: np.ndarray,  # (N,) bool
     assignment: Assignment,
 ) -> None:
     """Set attributes of the chosen surfels; raises InputError for what cannot be set."""
     # What is set: an attribute or the colour, and its columns.
-    name, given = assignment.name, assignment.values
+    name, given = assignment.name, np.array(assignment.values)
     if name not in values.settable:
-        raise InputError(
-            f"--set: {abbreviated(name)} cannot be set of these surfels; use one of "
-            f"{', '.join(values.settable)}"
-        )
+        known = f"cannot be set of these surfels; use one of {', '.join(values.settable)}"
+        raise InputError(f"--set: {abbreviated(name)} {known}")
     attribute, columns = values.columns[name]
     is_colour = attribute == COLOUR
     if len(given) not in (1, len(columns)):
         raise InputError(f"--set: {name}: {len(given)} values; give 1 or {len(columns)}")
+    if given.min() < 0 or (given.max() > 1 and not (is_colour or assignment.multiplies)):
+        wanted = "0 or more" if is_colour or assignment.multiplies else "0 to 1"
+        raise InputError(f"--set: {assignment.text}: out of range; give {wanted}")
 
-    # The new activated values (chosen, columns).
-    for value in given:
-        values.require(value.names, "--set")
-    new = np.stack([np.broadcast_to(v.evaluate(values), len(chosen))[chosen] for v in given], axis=1)
-    if assignment.multiplies:
-        new = new * values.activated(attribute)[chosen][:, columns]
-    new = np.broadcast_to(new, (len(new), len(columns)))
-    if not np.isfinite(new).all():
-        raise InputError(f"--set: {name}: not a finite number for every surfel; correct the formula")
-    least, most = new.min(), new.max()
-    fixed = not assignment.multiplies and not any(value.names for value in given)
-    if fixed and (least < 0 or (most > 1 and not is_colour)):
-        wanted = "0 or more" if is_colour else "0 to 1"
-        raise InputError(f"--set: {name}: {least:g} … {most:g} is out of range; give {wanted}")
-
-    # Their raw values. A new colour scales the SH of all degrees.
+    # The raw values (chosen, columns). A new colour scales the SH of all degrees.
+    old = activated(attribute, own)[:, columns]
+    new = given * old if assignment.multiplies else np.broadcast_to(given, old.shape)
     if not is_colour:
-        own[name.partition(".")[0]][:, columns] = logit(np.clip(new, 0, 1))
+        own[attribute][:, columns] = logit(np.clip(new, 0, 1))
         return
     raw = own["radiance_sh"]
-    old = 0.5 + SH_DC * raw[:, :3].astype(np.float64)
-    for column, wanted in zip(columns, np.maximum(new, 0).T, strict=True):
-        there = old[:, column] > COLOUR_FLOOR
-        factor = np.where(there, wanted / np.where(there, old[:, column], 1), 0)
-        raw[:, column] = (wanted - 0.5) / SH_DC
-        raw[:, 3 + column :: 3] *= factor[:, None].astype(np.float32)
+    factor = np.where(old > COLOUR_FLOOR, new / np.maximum(old, COLOUR_FLOOR), 0).astype(np.float32)
+    for i, column in enumerate(columns):
+        raw[:, column] = (np.maximum(new[:, i], 0) - 0.5) / SH_DC
+        raw[:, 3 + column :: 3] *= factor[:, i, None]

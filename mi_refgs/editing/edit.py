@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Unpack
 
 import numpy as np
 
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.editing.change import apply, assignments
-from mi_refgs.editing.expression import COLOUR
-from mi_refgs.editing.joining import join
 from mi_refgs.editing.options import Change, EditOptions, Selection
 from mi_refgs.editing.selection import select
+from mi_refgs.editing.values import COLOUR
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import contact_sheet, image_array
 from mi_refgs.render.display import displayed
@@ -37,15 +36,10 @@ class Edited:
     record: dict[str, Any]  # for JSON: the options given, `selected` surfels `of` so many, `surfels` now
 
 
-def edit(
-    scene: TrainedScene,
-    *,
-    camera: Camera | None = None,  # of the view that a mask was painted in
-    into: TrainedScene | None = None,  # a scene that the result is joined to
-    **options: Unpack[EditOptions],
-) -> Edited:
-    """Change surfels of a scene; `materials` applies to both scenes.
+def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
+    """Change surfels of a scene.
 
+    `materials` keeps the background and the near field of the light: the light stays that of the photographs.
     Raises InputError for bad values, an unknown option, an empty selection, and if there is nothing to do.
     """
     known = EditOptions.__annotations__
@@ -55,38 +49,32 @@ def edit(
     selection = Selection(**{f.name: given.pop(f.name) for f in fields(Selection) if f.name in given})
     given["set"] = tuple(assignment.text for assignment in assignments(given.get("set", ())))
     change = Change(**given)
-    if change.is_empty and into is None:
+    if change.is_empty:
         raise InputError("edit: nothing to do; give --set, --cut, --move or another change")
     if change.materials:
-        scene, into = relightable(scene), None if into is None else relightable(into)
-    chosen = select(scene, selection, camera)
-    notes = notes_of(scene, change, into is not None)
-    changed = scene if change.is_empty else apply(scene, chosen, change)
-    if into is not None:
-        changed, more = join(into, changed)
-        notes += more
+        scene = replace(relightable(scene), surroundings=scene.surroundings, near=scene.near)
+    chosen = select(scene, selection)
+    notes = notes_of(scene, change)
+    changed = apply(scene, chosen, change)
     counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}
     return Edited(changed, tuple(notes), {**_recorded(selection, change), **counts, "notes": notes})
 
 
 def _recorded(*parts: Selection | Change) -> dict[str, Any]:
-    """Return the options that differ from their defaults, as JSON values; a mask only if it is a file."""
+    """Return the options that differ from their defaults, as JSON values."""
     found = {}
     for part in parts:
         for field in fields(part):
-            value = getattr(part, field.name)
-            if not (field.name == "mask" and isinstance(value, np.ndarray)):
-                plain = json.loads(json.dumps(value, default=lambda x: getattr(x, "tolist", x.__str__)()))
-                if plain and plain != field.default:
-                    found[field.name] = plain
+            text = json.dumps(getattr(part, field.name), default=lambda x: x.tolist())
+            if (plain := json.loads(text)) and plain != field.default:
+                found[field.name] = plain
     return found
 
 
-def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[str]:
+def notes_of(scene: TrainedScene, change: Change) -> list[str]:
     """Return what of a fit does not follow a change: values that depend on its light and its place."""
     shading, surfels = scene.shading, scene.surfels
     names = [assignment.name.partition(".")[0] for assignment in assignments(change.set)]
-    placed = joined or change.moves
     indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
     read = {*shading.required_attributes, *surfels.primitive.widths}
     read |= {"indirect_sh"} if indirect else set()
@@ -104,9 +92,9 @@ def notes_of(scene: TrainedScene, change: Change, joined: bool = False) -> list[
             "the diffuse colour was fitted to the light as radiance_sh and stays so: albedo and metallic "
             f"change what is reflected, colour= changes it{convert}"
         )
-    if placed and "radiance_sh" in read:
+    if change.moves and "radiance_sh" in read:
         notes.append(f"the colour radiance_sh keeps the light of the place where it was fitted{convert}")
-    if indirect and (placed or change.cut or change.keep or {*names} - {"roughness"}):
+    if indirect and (change.moves or change.cut or change.keep or {*names} - {"roughness"}):
         trace = "; --materials traces rays instead" if has_materials else ""
         notes.append(f"interreflection (indirect_sh) stays as it was fitted{trace}")
     return notes

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
-import numpy as np
 from tyro.conf import UseAppendAction, arg
 
-Value = float | str | Sequence[float | str]
-Assignments = Mapping[str, Value] | Iterable[str]
-"""{"roughness": 0.3, "albedo": (0.9, 0.6, "0.5 * albedo.b")}, or texts such as "roughness*=0.5"."""
+Assignments = Mapping[str, float | Sequence[float]] | Iterable[str]
+"""{"roughness": 0.3, "albedo": (0.9, 0.6, 0.2)}, or texts such as "roughness*=0.5"."""
 Rotate = tuple[str | Sequence[float], float | str] | Sequence[str]
 """An axis, "x", "y", "z" or three numbers, and degrees."""
 
@@ -31,22 +28,14 @@ Vector = Annotated[Sequence[float] | None, optional(constructor=Three, metavar="
 class Selection:
     """Surfels that meet all of these (default: all surfels)."""
 
-    where: Annotated[
-        str | None,
-        optional(
-            metavar="EXPRESSION",
-            help='such as "metallic > 0.5 and z < 0", of activated values: x y z, opacity, size (the largest '
-            "standard deviation), normal.x … .z (outwards), materials such as albedo.r, colour.r … .b (the "
-            "fitted radiance, its SH term of degree 0), luminance; with + - * / **, comparisons, and or not, "
-            "abs sqrt min max; an unknown name lists the known ones",
-        ),
-    ] = None
+    where: Annotated[str | None, optional(metavar="CONDITION")] = None
+    """such as "metallic > 0.5 and z < 0": comparisons with a number, between `and` and `or`, of x y z,
+    opacity, size (the largest standard deviation), normal.x … .z (outwards), materials such as albedo.r, or
+    colour.r … .b (the fitted radiance, its SH term of degree 0); an unknown name lists the known ones"""
     box: Annotated[Sequence[float] | None, optional(constructor=Six, metavar="X0 Y0 Z0 X1 Y1 Z1")] = None
     """centres inside an axis-aligned box"""
     nearest: Annotated[Sequence[float] | None, optional(constructor=Four, metavar="X Y Z R")] = None
     """centres within R of the surfel that is nearest to the point"""
-    mask: Annotated[np.ndarray | str | Path | None, optional(constructor=Path, metavar="PNG")] = None
-    """visible, not behind, where an image of a view is white; in Python also an array (H, W) bool"""
     invert: Flag = False
     """all other surfels instead"""
 
@@ -59,13 +48,10 @@ class Change:
     """first replace colours that were fitted to the environment map, of the whole scene, by materials"""
     set: Annotated[
         Assignments,
-        optional(
-            constructor=UseAppendAction[tuple[tuple[str, ...], ...]],
-            metavar="NAME=VALUE …",
-            help='such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5 "metallic=max(metallic, 0.5)"; '
-            "colour=R,G,B for methods with fitted colours",
-        ),
+        optional(constructor=UseAppendAction[tuple[tuple[str, ...], ...]], metavar="NAME=VALUE …"),
     ] = ()
+    """such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5, one after the other; colour=R,G,B for methods
+    with fitted colours"""
     scale: Annotated[float, arg(metavar="F")] = 1.0
     """scale about the middle of the selection, the mean of the positions weighted by opacity"""
     rotate: Annotated[Rotate | None, optional(constructor=AxisAngle, metavar="AXIS DEG")] = None
@@ -100,7 +86,6 @@ class EditOptions(TypedDict, total=False):
     where: str | None
     box: Sequence[float] | None  # (6,)
     nearest: Sequence[float] | None  # (4,)
-    mask: np.ndarray | str | Path | None
     invert: bool
     materials: bool
     set: Assignments

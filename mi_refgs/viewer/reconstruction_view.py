@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import Region
-from mi_refgs.editing.selection import selected_alpha
+from mi_refgs.editing.painting import selected_alpha
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.runs.relightable import lacking, relightable
