@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +21,25 @@ from PIL import Image
 from mi_refgs import __version__, methods
 from mi_refgs.editing.options import EditOptions
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation import decomposition
 from mi_refgs.evaluation import evaluate as evaluation
+from mi_refgs.evaluation.decomposition import material_maps
 from mi_refgs.evaluation.images import (
     RenderedView,
     contact_sheet,
     displayed_over,
     light_panels,
     normal_colours,
+    panels,
 )
 from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
 from mi_refgs.io.images import read_png, to_8_bits
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.progress import say
+from mi_refgs.reconstruction import relight as relighting
 from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
-from mi_refgs.relighting import relight as relighting
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.make_dataset import make_dataset
@@ -336,8 +337,7 @@ def decomposition_image(run: Reconstruction, number: int, scale: np.ndarray) -> 
     camera, light = view.camera(), run.trained.light
     assert light is not None and views.environment is not None
     rendered = RenderedView.of(run.trained.renderer()(camera), views, view)
-    maps = decomposition.material_maps(run.trained)(camera, rendered)
-    found = decomposition.panels(decomposition.MeasuredView(rendered, maps, view, None), scale)
+    found = panels(replace(rendered, maps=material_maps(run.trained)(camera, rendered)), view, scale)
     titles = [*found]
     rows = [
         {title: found[title] for title in titles[i : i + PER_ROW]} for i in range(0, len(titles), PER_ROW)

@@ -27,8 +27,8 @@ from mi_refgs.reconstruction.new_light import NewLight as NewLight
 from mi_refgs.reconstruction.reconstruction import Reconstruction as Reconstruction
 from mi_refgs.reconstruction.reconstruction import import_splats as import_splats
 from mi_refgs.reconstruction.reconstruction import load as load
+from mi_refgs.reconstruction.relight import relight as relight
 from mi_refgs.reconstruction.relightable_import import import_relightable as import_relightable
-from mi_refgs.relighting.relight import relight as relight
 from mi_refgs.render.pipeline import Frame as Frame
 from mi_refgs.render.pipeline import Request as Request
 from mi_refgs.render.pipeline import SurfelScene as SurfelScene

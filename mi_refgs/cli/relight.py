@@ -49,10 +49,10 @@ class Relight:
     def run(self) -> Result:
         """Relight the run."""
         from mi_refgs.reconstruction.new_light import NewLight
-        from mi_refgs.relighting.relight import relight
+        from mi_refgs.reconstruction.relight import relight
         from mi_refgs.runs.run import Run
 
-        relit = relight(
+        result = relight(
             Run(self.run_folder),
             NewLight(self.envmap, self.world, self.azimuth, self.exposure),
             self.output,
@@ -61,10 +61,9 @@ class Relight:
             samples=self.samples,
             progress=True,
         )
-        if relit.warning:
-            warn(relit.warning)
-        result = relit.result
-        lines = [f"{len(result['pictures'])} images, scene.xml and {relit.sheet} in {result['output']}"]
+        if result["warning"]:
+            warn(f"{self.run_folder}: {result['warning']}")
+        lines = [f"{len(result['pictures'])} images, scene.xml and {result['sheet']} in {result['output']}"]
         if result["psnr"] is None:
             lines.append(f"score: none: {result['score_reason']}")
         else:

@@ -11,6 +11,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
+from mi_refgs.fitting.exposure import EXPOSURE_FILE
 from mi_refgs.formats import Shot
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
@@ -32,7 +33,8 @@ class Provenance:
     data: Path | None = None
     region: Region | None = None  # in images without alpha
     edits: tuple[dict[str, Any], ...] = ()  # made since, in order: `editing.Edited.record`
-    cameras: dict[str, Any] = field(default_factory=dict)  # `Run.cameras`
+    records: dict[str, Any] = field(default_factory=dict)
+    """Corrections of the fit by file: of its cameras and of the exposure."""
 
     @staticmethod
     def of(run: Run) -> Provenance:
@@ -40,12 +42,14 @@ class Provenance:
         method = run.method()
         record = run.path / EDITS
         edits = read_json(record).get("edits", []) if record.is_file() else []
-        return Provenance(method, run.dataset(), run.region(), tuple(edits), run.cameras())
+        exposure = run.path / EXPOSURE_FILE
+        records = {CAMERAS: run.cameras(), EXPOSURE_FILE: read_json(exposure) if exposure.is_file() else {}}
+        records = {name: record for name, record in records.items() if record}
+        return Provenance(method, run.dataset(), run.region(), tuple(edits), records)
 
     def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
         """Write a scene as a run folder (`runs.export.save`); raises InputError as that does."""
-        records = {EDITS: {"edits": self.edits} if self.edits else {}, CAMERAS: self.cameras}
-        records = {name: record for name, record in records.items() if record}
+        records = self.records | ({EDITS: {"edits": self.edits}} if self.edits else {})
         save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
     def with_data(self, folder: Path | None) -> Provenance:
@@ -64,7 +68,7 @@ class Provenance:
     @property
     def is_moved(self) -> bool:
         """Whether edits placed something elsewhere, so that the object may be outside of `region`."""
-        return any({"move", "duplicate", "join"} & edit.keys() for edit in self.edits)
+        return any({"move", "duplicate"} & edit.keys() for edit in self.edits)
 
     def views(self, split: str, decode: bool = True) -> Dataset:
         """Read a split of the data set; raises InputError for one that is unknown, missing or unreadable."""
@@ -72,7 +76,7 @@ class Provenance:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(f"views: {split}: {gone}; use cameras(), or restore the data set")
         views = with_region(read_views(self.method, self.data, split, decode=decode), self.region)
-        return with_poses(views, self.cameras)
+        return with_poses(views, self.records.get(CAMERAS, {}))
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
         """Return the named cameras of some splits; without a data set, cameras around the surfels.
@@ -84,7 +88,7 @@ class Provenance:
         shots = []
         for split in splits:
             data = read_views(self.method, self.data, split, truth=False, decode=False)
-            views, originals = with_poses(data, self.cameras).views, data.views
+            views, originals = with_poses(data, self.records.get(CAMERAS, {})).views, data.views
             if (self.method.data.downscale or 1) > 1:  # image files are those on disk
                 whole = self.method.downscaled(1)
                 originals = read_views(whole, self.data, split, truth=False, decode=False).views

@@ -233,25 +233,14 @@ class Reconstruction:
         scene = replace(relightable(self.trained), light=any_light(light, world, rotate, exposure))
         return self.changed(scene)
 
-    def edit(
-        self,
-        *,
-        view: CameraLike = 0,
-        split: str = "test",
-        join: Reconstruction | str | Path | None = None,
-        **options: Unpack[EditOptions],
-    ) -> Reconstruction:
+    def edit(self, **options: Unpack[EditOptions]) -> Reconstruction:
         """Change some surfels, as `refgs edit` does; `provenance.edits[-1]` then records how many.
 
-        options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}; a `mask` belongs to a
-        `view`. join: a reconstruction that is added under the light of this one; `options` then select and
-        change its surfels. Raises InputError for options that cannot be used.
+        options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}. Raises InputError for
+        options that cannot be used.
         """
-        changed = load(join) if isinstance(join, str | Path) else join or self
-        camera = None if options.get("mask") is None else changed.camera(view, split=split)
-        into = None if join is None else self.trained
-        edited = editing.edit(changed.trained, camera=camera, into=into, **options)
-        record = {"run" if join is None else "join": changed.folder and str(changed.folder), **edited.record}
+        edited = editing.edit(self.trained, **options)
+        record = {"run": self.folder and str(self.folder), **edited.record}
         provenance = replace(self.provenance, edits=(*self.provenance.edits, record))
         return replace(self.changed(edited.scene), provenance=provenance)
 

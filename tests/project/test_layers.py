@@ -28,7 +28,6 @@ FLOORS: list[set[str]] = [
     {"compare", "editing"},
     {"formats"},
     {"reconstruction"},
-    {"relighting"},
     {"viewer"},
     {"cli", "public"},
     {"__main__"},

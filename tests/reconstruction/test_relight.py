@@ -23,8 +23,7 @@ from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import read_png
 from mi_refgs.reconstruction.new_light import NewLight, any_light
 from mi_refgs.reconstruction.reconstruction import load
-from mi_refgs.relighting.relight import relight
-from mi_refgs.relighting.score import common_scale, score
+from mi_refgs.reconstruction.relight import common_scale, relight, score
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -40,7 +39,7 @@ SAMPLES = 4
 def result_of(known: Path, out: str, light: str = "dusk", run: str = "run", **options: Any) -> dict[str, Any]:
     """The result of relighting a run of `known` into its folder `out`."""
     new_light = NewLight(known / f"{light}.exr", **options)
-    return relight(Run(known / run), new_light, known / out, samples=SAMPLES).result
+    return relight(Run(known / run), new_light, known / out, samples=SAMPLES)
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +142,7 @@ def test_common_scale_is_fitted_per_channel(rng: np.random.Generator) -> None:
 
 
 def test_turntable_surrounds_the_object(known: Path) -> None:
-    relit = relight(Run(known / "run"), NewLight(known / "dusk.exr"), known / "turn", turntable=7).result
+    relit = relight(Run(known / "run"), NewLight(known / "dusk.exr"), known / "turn", turntable=7)
     assert len(relit["pictures"]) == 7 and relit["psnr"] is None and "turntable" in relit["score_reason"]
     frames = [read_png(known / "turn" / name)[..., 3] for name in relit["pictures"]]
     assert all(0.05 < frame.mean() < 0.9 and frame[0].max() == 0 for frame in frames)
@@ -187,7 +186,7 @@ def test_run_without_data_is_relit_around_the_object(
         np.testing.assert_allclose(shown, relit.render(camera), atol=1e-4)
         assert 0.05 < shown[..., 3].mean() < 0.9
     if record is not None and not turntable:  # with its data named there is ground truth
-        found = relight(Run(run), NewLight(light), tmp_path / "named", data=known / "data").result
+        found = relight(Run(run), NewLight(light), tmp_path / "named", data=known / "data")
         assert found["psnr"] > 20
 
 
@@ -213,9 +212,9 @@ def test_relight_warns_of_fitted_diffuse_colour(known: Path, tmp_path: Path) -> 
     run = write_known_run(known / "data", tmp_path / "run", diffuse="sh")
     relit = relight(run, NewLight(known / "dusk.exr"), turntable=2)
     folder = tmp_path / "run/relight/dusk"
-    assert "--for relighting" in relit.warning and (folder / "turntable/sheet.png").is_file()
+    assert "--for relighting" in relit["warning"] and (folder / "turntable/sheet.png").is_file()
     assert not (folder / "sheet.png").exists()  # nor are the scores of test views replaced
-    turned = relight(run, NewLight(known / "dusk.exr", rotate=90, exposure=-1), turntable=1).result
+    turned = relight(run, NewLight(known / "dusk.exr", rotate=90, exposure=-1), turntable=1)
     assert Path(turned["output"]) == tmp_path / "run/relight/dusk_r90_e-1"
     # Fewer frames leave none of the old ones behind.
     relight(run, NewLight(known / "dusk.exr"), turntable=1)

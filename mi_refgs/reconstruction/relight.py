@@ -1,4 +1,4 @@
-"""Render a trained scene under another light into a folder, and score it where there is ground truth.
+"""Render the scene of a run under another light into a folder, and score it where there is ground truth.
 
 The folder contains
 
@@ -12,20 +12,20 @@ The folder contains
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import contact_sheet, displayed_over, image_array, light_image
+from mi_refgs.evaluation import metrics
+from mi_refgs.evaluation.images import contact_sheet, displayed_over, encoded_over_black, light_image
 from mi_refgs.evaluation.scores import caption
-from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
@@ -33,30 +33,24 @@ from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import Method
 from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.new_light import NewLight, truth_under
-from mi_refgs.reconstruction.provenance import Provenance
-from mi_refgs.relighting.score import score
+from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.render.samples import samples_per_axis
-from mi_refgs.runs.export import export, write_if_stale
-from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import ARTEFACTS
 
 SHEET, RESULT = "sheet.png", "relight.json"
 SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
 SHEET_COLUMNS = 6  # most frames of a turntable per row of its sheet
-PREFIX = {"test": "r", "turntable": "t"}
-"""First letter of image names by folder; test views have the names of a data set."""
 NO_TRUTH = "the data set has no test views under this light; make them with `refgs dataset --relight`"
 NO_DATA = "there is no data set, so cameras are around the object; name its folder with --data"
-
-
-@dataclass(frozen=True)
-class Relit:
-    """The content of relight.json, and a warning for the user, if there is one."""
-
-    result: dict[str, Any]
-    sheet: str  # path in the folder
-    warning: str = ""
+FITTED_COLOUR = (
+    "its diffuse part was fitted as a colour; albedo is that colour divided by the irradiance of the fitted "
+    "light, with the errors of that light; `refgs train --for relighting` fits materials"
+)
+SCALE_REACH = 2.0  # stops around the ratio of the means within which the scale is searched
+INSIDE = 0.99  # alpha from which a pixel is inside the object: the coverage of edges does not depend on light
+SCALE_PIXELS = 200_000  # maximum number of pixels that the scale is fitted to
 
 
 def relight(
@@ -68,11 +62,10 @@ def relight(
     data: Path | None = None,
     samples: int = 1,
     progress: bool = False,
-) -> Relit:
-    """Render the scene of a run under another light into a folder.
+) -> dict[str, Any]:
+    """Render the scene of a run under another light into a folder; return the content of relight.json.
 
-    `out` is RUN/relight/NAME by default, with the rotation and the exposure in its name if they are set, and
-    with a number if there is another map of this name.
+    `out` is RUN/relight/NAME by default, with the rotation and the exposure in its name if they are set.
 
     Only materials of the scene stay (`runs.relightable`): diffuse light is the new light's irradiance, with
     the mesh's shadows and bounces; reflections are traced. The views are the test views of the run's data
@@ -87,43 +80,36 @@ def relight(
         raise InputError(f"--turntable: {turntable} is out of range; give a number of views from 1")
 
     # The views, and the ground truth under this light.
-    provenance = Provenance.of(run).with_data(data)
+    fitted = load(run.path)
+    fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
+    provenance, requested, true_views = fitted.provenance, light, None
     views = provenance.views("test") if provenance.has_data else None
-    requested, true_views = light, None
     if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
         true_views, light = _true_views(provenance.method, known[0], views), known[1]
-
-    # The scene under the new light.
-    fitted = write_if_stale(run, provenance.method, provenance.first_camera)
+    cameras = fitted.turntable(turntable) if turntable else fitted.cameras()
     try:
-        new_light = light.read()
-        scene = replace(relightable(fitted), light=new_light)
+        relit = fitted.relight(light)
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
-    cameras, kind = [shot.camera for shot in provenance.shots(fitted, "test")], "test"
-    if turntable:
-        region = provenance.region if views is None else views.region
-        region = None if fitted.surroundings is None or provenance.is_moved else region
-        # The mesh of an open scene contains its background, too.
-        bare = scene if fitted.surroundings is None else replace(scene, mesh=None)
-        cameras, kind = turntable_cameras(bare, cameras, turntable, region), "turntable"
 
     # The folder.
     name = light.path.stem if true_views is None else light.path.parent.name
-    own = f"{name}{light.suffix}"
-    output = _own_folder(run, own, requested) if out is None else _output(run, out, requested)
-    images = [f"{kind}/{PREFIX[kind]}_{i:03d}.png" for i in range(len(cameras))]
-    _prepare(output, kind, images)
+    folder = run.path / "relight" / f"{name}{light.suffix}" if out is None else out
+    inside = folder.resolve().is_relative_to(run.path.resolve())  # both may then move together
+    owner = f"relight {requested.identity}" + ("" if inside else f" of {run.path.resolve()}")
+    output = OutputFolder(folder, owner, remedy="choose another -o")
+    kind, place = ("turntable/t", "turntable/") if turntable else ("test/r", "")
+    images = [f"{kind}_{i:03d}.png" for i in range(len(cameras))]
+    _prepare(output, kind, [*images, place + RESULT, place + SHEET])
 
     # Files of the scene and its images.
-    export(scene, output.path, cameras[0], output=output)
-    render, ours = scene.renderer(aovs=False, samples=samples), []
+    export(relit.trained, folder, cameras[0], output=output)
+    ours = []
     jobs = list(zip(images, cameras, strict=True))
     for image, camera in with_bar(jobs, "relight", unit="view", disable=not progress):
-        frame = render(camera)
-        ours.append(image_array([*frame.radiance, frame.alpha], camera.height, camera.width))
-        write_exr((output.path / image).with_suffix(".exr"), ours[-1])
-        write_png(output.path / image, straight_srgb(ours[-1]))
+        ours.append(relit.render(camera, samples=samples))
+        write_exr((folder / image).with_suffix(".exr"), ours[-1])
+        write_png(folder / image, straight_srgb(ours[-1]))
 
     # The score, and the sheet.
     colour = BACKGROUNDS[provenance.method.data.background]
@@ -131,63 +117,37 @@ def relight(
     reason = NO_DATA if views is None else "a turntable has no ground truth" if turntable else NO_TRUTH
     result: dict[str, Any] = {
         "run": str(run.path),
-        "output": str(output.path),
+        "output": str(folder),
+        "sheet": place + SHEET,
         "light": str(requested.path),
         "rotate": light.rotate,
         "exposure": light.exposure,
-        "pictures": images,  # name of this key in version 0.1
+        "pictures": images,
         "samples": samples_per_axis(samples) ** 2,
+        "warning": FITTED_COLOUR if fitted.trained.shading.diffuse == "sh" else None,
     } | {"psnr": None, "psnr_scaled": None, "score_reason": reason}
     truth: list[np.ndarray] = []
     if true_views is not None and views is not None:
         truth = _truth(true_views, light.exposure)
         result |= score([view.name for view in views.views], ours, truth, background) | {"score_reason": None}
         result["caption"] = caption(truth[0].shape[1::-1], relit=True)
+    assert relit.trained.light is not None
+    environment = light_image(relit.trained.light.radiance().numpy())
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
-    radiance = new_light.radiance().numpy()
-    sheet = _beside(kind, SHEET)
-    write_png(output.path / sheet, contact_sheet(rows, {"environment map": light_image(radiance)}))
-    write_json(output.path / _beside(kind, RESULT), result)
-    warning = ""
-    if fitted.shading.diffuse == "sh":
-        warning = (
-            f"{run.path}: its diffuse part was fitted as a colour; albedo is that colour divided by the "
-            "irradiance of the fitted light, with the errors of that light; `refgs train --for relighting` "
-            "fits materials"
-        )
-    return Relit(result, sheet, warning)
+    write_png(folder / place / SHEET, contact_sheet(rows, {"environment map": environment}))
+    write_json(folder / place / RESULT, result)
+    return result
 
 
-def _output(run: Run, out: Path, light: NewLight) -> OutputFolder:
-    """Return the folder `out` for the images of a run under a light."""
-    inside = out.resolve().is_relative_to(run.path.resolve())  # the run and its folder may then move together
-    of = "" if inside else f" of {run.path.resolve()}"
-    return OutputFolder(out, f"relight {light.identity}{of}", remedy="choose another -o")
-
-
-def _own_folder(run: Run, name: str, light: NewLight) -> OutputFolder:
-    """Return RUN/relight/NAME, or the first of NAME_2, NAME_3, … without files of another light."""
-    numbered = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
-    outputs = (_output(run, run.path / "relight" / folder, light) for folder in numbered)
-    return next(o for o in outputs if o.owner in o.owners().values() or not o.path.exists())
-
-
-def _beside(kind: str, file: str) -> str:
-    """Return the path of RESULT or SHEET: a turntable's are with its frames, and replace no scores."""
-    return f"{kind}/{file}" if kind == "turntable" else file
-
-
-def _prepare(output: OutputFolder, kind: str, images: Sequence[str]) -> None:
+def _prepare(output: OutputFolder, kind: str, names: Sequence[str]) -> None:
     """Remove the images of the last call for the same light, and claim the names of the new ones."""
     out = output.path
     if (out / "config.toml").exists() or any(out.glob("transforms*.json")):
         what = "contains a run or a data set, whose files would be replaced"
         raise InputError(f"{out}: output: {what}; choose another -o")
-    names = [*images, *(str(Path(name).with_suffix(".exr")) for name in images)]
-    names += [_beside(kind, RESULT), _beside(kind, SHEET)]
+    names = [*names, *(str(Path(name).with_suffix(".exr")) for name in names if name.startswith(kind))]
     output.require_free([*names, *ARTEFACTS])
-    stale = output.owned(f"{kind}/{PREFIX[kind]}_*.*")  # of more views, or another data set
-    output.remove(path.relative_to(out).as_posix() for path in stale)
+    output.remove(path.relative_to(out).as_posix() for path in output.owned(f"{kind}_*.*"))
     output.claim(*names)
 
 
@@ -229,3 +189,52 @@ def _rows(
     lines = -(-len(frames) // SHEET_COLUMNS)
     columns = -(-len(frames) // lines)  # rows of equal length: 8 frames are 4 and 4, not 6 and 2
     return [dict(frames[i : i + columns]) for i in range(0, len(frames), columns)]
+
+
+# ---------------- scores ----------------
+
+
+def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
+    """Fit the scale of radiance per channel (3,) that minimises the error of displayed images.
+
+    Light and albedo of a fit share an unknown scale, which tints everything under another light. It is one
+    for all images, by least squares of displayed colours inside the object: of radiance, lamps alone would be
+    fitted. 1 for a channel that is black in either.
+    """
+    a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))
+    inside = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
+    chosen = inside[:: max(1, len(inside) // SCALE_PIXELS)]
+    a, b = a[chosen], b[chosen]
+    scale = np.ones(3)
+    for c in range(3):
+        goal, mean = encoded_over_black(b[:, c], b[:, 3]), (a[:, c].sum(), b[:, c].sum())
+        if min(mean) <= 0:
+            continue
+
+        def error(stops: float, c: int = c, goal: np.ndarray = goal) -> float:
+            return float(np.mean((encoded_over_black(a[:, c] * 2**stops, a[:, 3]) - goal) ** 2))
+
+        middle = float(np.log2(mean[1] / mean[0]))
+        found = minimize_scalar(error, bounds=(middle - SCALE_REACH, middle + SCALE_REACH))
+        scale[c] = 2.0 ** min((0.0, middle, float(found.x)), key=error)
+    return scale
+
+
+def score(
+    names: Sequence[str], ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], background: np.ndarray
+) -> dict[str, Any]:
+    """Return `psnr`, `ssim` and both after `scale` (`…_scaled`): means over images; and `views`.
+
+    Images are premultiplied linear RGBA (H, W, 4), compared display-encoded over the background.
+    """
+    scale = common_scale(ours, truth)
+    views = []
+    for name, own, true in zip(names, ours, truth, strict=True):
+        goal = displayed_over(true, background)
+        plain, scaled = displayed_over(own, background), displayed_over(own, background, scale)
+        found: dict[str, Any] = {"name": name}
+        for key, measure in (("psnr", metrics.psnr), ("ssim", metrics.ssim)):
+            found |= {key: measure(plain, goal), f"{key}_scaled": measure(scaled, goal)}
+        views.append(found)
+    means = {k: float(np.mean([v[k] for v in views])) for k in views[0] if k != "name"}
+    return means | {"scale": [float(x) for x in scale], "views": views}

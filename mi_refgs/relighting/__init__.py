@@ -1,1 +1,0 @@
-"""Relight a trained scene: images, a scene file, and a score where there is ground truth."""
