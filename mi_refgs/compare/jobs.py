@@ -135,7 +135,7 @@ def settings_of(folder: Path) -> dict[str, Any]:
 
 def output_folder(folder: Path) -> OutputFolder:
     """Return the folder of a comparison with its files beside the runs."""
-    files = (SETTINGS, TABLE, TABLE_TEXT, PAGE, f"{PICTURES}/*_psnr.png", f"{PICTURES}/*_crops.png")
+    files = (SETTINGS, TABLE, TABLE_TEXT, PAGE, f"{PICTURES}/*_psnr.png")
     return OutputFolder(folder, "compare", files, marker=SETTINGS)
 
 
