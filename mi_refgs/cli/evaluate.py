@@ -12,7 +12,7 @@ from mi_refgs.evaluation.scores import PIXEL_CLASSES, SCORES, Score, caption_lin
 
 @dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Writes metrics.json, renders, and contact sheets compared with ground truth to the run folder.
+    """Writes metrics.json, renders, and a contact sheet with the ground truth to the run folder.
 
     example:
       refgs eval runs/glossy --json
@@ -25,12 +25,12 @@ class Eval:
 
     def run(self) -> Result:
         """Evaluate the run."""
-        from mi_refgs.evaluation.evaluate import DECOMPOSITION, SHEET, evaluate
+        from mi_refgs.evaluation.evaluate import SHEET, evaluate
         from mi_refgs.runs.run import Run
 
         folder = Run(self.run_folder)
         result = evaluate(folder, self.data, progress=True, samples=self.samples)
-        return Result(result, f"{table(result)}\nsheets: {self.run_folder / SHEET}, {DECOMPOSITION}")
+        return Result(result, f"{table(result)}\nsheet: {self.run_folder / SHEET}")
 
 
 def table(result: dict[str, Any]) -> str:

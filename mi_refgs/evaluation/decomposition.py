@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.images import RenderedView, material_colours, normal_colours, on_white, side_by_side
+from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.evaluation.surface import NO_SURFACE
 from mi_refgs.io.images import psnr_of
 from mi_refgs.runs.relightable import relightable
@@ -26,7 +26,7 @@ from mi_refgs.splat import Camera
 
 KNOWN_SHARE = 0.5  # fraction of a pixel that a true material must cover for it to count
 CONCAVE = "_concave"  # suffix of the numbers of concave pixels
-NAMES = ("albedo", "roughness", "metallic")
+MATERIALS = ("albedo", "roughness", "metallic")
 KEYS = ("albedo_psnr", "roughness_mae", "metallic_mae")
 
 
@@ -65,15 +65,6 @@ class _Sums:
         return float(np.mean(self.absolute)) / self.count if self.count else None
 
 
-class MeasuredView(NamedTuple):
-    """A test view, and what is rendered of it."""
-
-    rendered: RenderedView
-    maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), by material
-    view: View  # with its image decoded
-    concave: np.ndarray | None  # (H, W) bool; None without a true surface
-
-
 @dataclass
 class Decomposition:
     """Accumulates the errors of materials, and of concave pixels, over views."""
@@ -85,9 +76,9 @@ class Decomposition:
     angles: list[np.ndarray] = field(default_factory=list)  # degrees, of concave pixels
     squares: list[np.ndarray] = field(default_factory=list)  # squared differences of displayed colours there
 
-    def add(self, measured: MeasuredView) -> None:
-        """Add the pixels of a view."""
-        rendered, maps, view, concave = measured
+    def add(self, rendered: RenderedView, view: View, concave: np.ndarray | None) -> None:
+        """Add the pixels of a loaded view; `concave` (H, W) bool is None without a true surface."""
+        maps = rendered.maps
         front = view.covered() > metrics.FOREGROUND_ALPHA
         self.foreground += int(front.sum())
         regions = {"": front}
@@ -114,14 +105,14 @@ class Decomposition:
         """Return the numbers of metrics.json by key; None, with a reason, where nothing was compared."""
         found: dict[str, Any] = {}
         for suffix in ("", CONCAVE):
-            albedo, roughness, metallic = (self.sums.get(name + suffix, _Sums()) for name in NAMES)
+            albedo, roughness, metallic = (self.sums.get(name + suffix, _Sums()) for name in MATERIALS)
             values = (albedo.psnr(self.scale()), roughness.mae(), metallic.mae())
             found |= {key + suffix: value for key, value in zip(KEYS, values, strict=True)}
         found["albedo_scale"] = None if found["albedo_psnr"] is None else [float(x) for x in self.scale()]
         found["concave_share"] = None if self.concave is None else self.concave / max(self.foreground, 1)
         found[f"normal_mae_deg{CONCAVE}"], error = _mean(self.angles), _mean(self.squares)
         found[f"psnr{CONCAVE}"] = None if error is None else psnr_of(error)
-        for name, key in zip(NAMES, KEYS, strict=True):
+        for name, key in zip(MATERIALS, KEYS, strict=True):
             reason = f"the data set defines no {name}" if name in self.ours else f"the run has no {name}"
             found[f"{name}_reason"] = reason if found[key] is None else None
         found["concave_reason"] = NO_SURFACE if self.concave is None else None
@@ -149,24 +140,3 @@ def material_maps(
         return lambda camera, rendered: {n: m for n, m in rendered.maps.items() if n != "albedo"}
     render = replace(scene, shading=Shading("pixel", "split_sum", "irradiance")).renderer(samples=samples)
     return lambda camera, rendered: RenderedView.maps_of(render(camera), *rendered.alpha.shape)
-
-
-def panels(measured: MeasuredView, scale: np.ndarray) -> dict[str, np.ndarray]:
-    """Return fitted and ground-truth maps side by side, by title; albedo after its scale (3,)."""
-    rendered, maps, view, concave = measured
-    pairs, covered = {"image": [rendered.image, view.displayed]}, view.covered()
-    if view.normal is not None:
-        shown = normal_colours(rendered.normal, rendered.alpha), normal_colours(view.normal, covered)
-        pairs["normals"] = [*shown]
-    for name in NAMES:
-        if name in maps:
-            ours = maps[name] * (scale if name == "albedo" else 1.0)
-            pairs[name] = [material_colours(ours, rendered.alpha)]
-            if name in view.materials:
-                true = view.materials[name]
-                pairs[name].append(material_colours(true[..., :-1], true[..., -1]))
-    sides = {1: "fitted", 2: "fitted | ground truth"}
-    found = {f"{name}: {sides[len(pair)]}": side_by_side(pair) for name, pair in pairs.items()}
-    if concave is not None:
-        found["concave"] = on_white(np.repeat(0.75 * concave[..., None], 3, axis=-1) * [1, 0.4, 0], covered)
-    return {title: np.clip(image, 0, 1) for title, image in found.items()}

@@ -1,13 +1,10 @@
-"""Evaluate a run on the test views of its data set: metrics.json, renders, contact sheets."""
+"""Evaluate a run on the test views of its data set: metrics.json, renders, a contact sheet."""
 
 from __future__ import annotations
 
-import hashlib
 import re
-import unicodedata
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +15,10 @@ from mi_refgs.data.region import region_pixels
 from mi_refgs.data.registration import registered
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation import decomposition, metrics
+from mi_refgs.evaluation import metrics
+from mi_refgs.evaluation.decomposition import Decomposition, material_maps
 from mi_refgs.evaluation.error_budget import ErrorBudget, classify
-from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
+from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, on_white, panels
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.exposure import EXPOSURE_FILE, displayed_of, image_of, with_gain
@@ -36,22 +34,16 @@ from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.light_file import read_radiance
 
 FOLDER = "eval"
-SHEET = "contact_sheet.png"
-DECOMPOSITION = "decomposition.png"
-METRICS = "metrics.json"
+SHEET, METRICS = "contact_sheet.png", "metrics.json"
 LONGEST_STEM = 60  # characters of the view's name in an image's file name; file systems allow 255 bytes
-SHEET_VIEWS = 4  # rows of either sheet, spread evenly over the test views
+SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
+ORANGE = np.array([0.75, 0.3, 0.0])  # of concave pixels
 MEANS = """psnr psnr_gain psnr_registered ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
     normal_mae_deg_full""".split()  # scores of views whose means are reported
 
 
-def evaluate(
-    run: Run,
-    data: Path | None = None,
-    progress: bool = False,
-    samples: int = 1,
-) -> dict[str, Any]:
-    """Render the test views, measure them, and write metrics.json, renders and two contact sheets.
+def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples: int = 1) -> dict[str, Any]:
+    """Render the test views, measure them, and write metrics.json, renders and a contact sheet.
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
     Every key of the upper level is always present. Where a score does not apply it is null, and `NAME_reason`
@@ -83,7 +75,7 @@ def evaluate(
     method = run.method()
     views = views_of_run(run, method, "test", data)
     renders = render_names(views.views)
-    outputs = [*renders, SHEET, DECOMPOSITION, METRICS]
+    outputs = [*renders, SHEET, METRICS]
     run.output.require_free(outputs)
     fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
     per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
@@ -92,22 +84,23 @@ def evaluate(
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
     files = [run.path / name for name in renders]
-    measured = _measure(fitted, views, surface, samples, files, progress)
+    errors, budget = Decomposition(), ErrorBudget()
+    scores, shown = _measure(fitted, views, surface, samples, files, progress, errors, budget)
     cameras_decided = _decision(run, CAMERAS, "to_world")
     if cameras_decided is not None and cameras_decided.get("corrected"):
-        _register(measured.per_view, fitted, views, samples, progress)
+        _register(scores, fitted, views, samples, progress)
 
     # The numbers.
     light_scores, footer = _light(fitted, views)
-    result: dict[str, Any] = (
-        _means(measured.per_view)
-        | light_scores
-        | measured.errors.result()
-        | measured.budget.result()
-        | surface_scores(fitted.mesh, surface, views.views)
-    )
     cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
     size = [views.views[0].width, views.views[0].height]
+    result: dict[str, Any] = (
+        _means(scores)
+        | light_scores
+        | errors.result()
+        | budget.result()
+        | surface_scores(fitted.mesh, surface, views.views)
+    )
     result |= {
         "caption": caption(size),
         "exposure": _decision(run, EXPOSURE_FILE, "gain"),
@@ -121,33 +114,18 @@ def evaluate(
         "method": method.name,
         "preset": method.preset,
         "dataset": str(views.path),
-        "test_views": len(measured.per_view),
+        "test_views": len(scores),
         "image_size": size,
         "downscale": method.data.downscale or 1,
         "machine": machine(),
-        "views": [
-            {k: v for k, v in scores.items() if not k.endswith("_reason")} for scores in measured.per_view
-        ],
+        "views": [{k: v for k, v in view.items() if not k.endswith("_reason")} for view in scores],
     }
 
-    # The sheets.
-    write_png(run.path / SHEET, contact_sheet(measured.panels, footer))
-    scale = measured.errors.scale()
-    rows = [decomposition.panels(materials, scale) for materials in measured.materials]
-    write_png(run.path / DECOMPOSITION, contact_sheet(rows, footer))
+    # The sheet.
+    rows = [panels(rendered, view, errors.scale()) | more for rendered, view, more in shown]
+    write_png(run.path / SHEET, contact_sheet(rows, footer))
     run.write_json(METRICS, result)
     return result
-
-
-@dataclass
-class Measured:
-    """Scores of each test view, errors of all, and what the sheets show of some views."""
-
-    per_view: list[dict[str, Any]] = field(default_factory=list)
-    errors: decomposition.Decomposition = field(default_factory=decomposition.Decomposition)
-    budget: ErrorBudget = field(default_factory=ErrorBudget)
-    panels: list[dict[str, np.ndarray]] = field(default_factory=list)  # rows of SHEET
-    materials: list[decomposition.MeasuredView] = field(default_factory=list)  # rows of DECOMPOSITION
 
 
 def _measure(
@@ -157,42 +135,46 @@ def _measure(
     samples: int,
     images: Sequence[Path],  # one per view
     progress: bool,
-) -> Measured:
-    """Render and measure the test views one by one, and write their images."""
-    render = fitted.renderer(samples=samples)
-    object_only = None
-    if fitted.surroundings is not None:
-        object_only = replace(fitted, surroundings=None).renderer(samples=samples)
-    material_maps = decomposition.material_maps(fitted, samples)
-    in_sheets = evenly_spread(len(views.views), SHEET_VIEWS)
-    measured = Measured()
+    errors: Decomposition,
+    budget: ErrorBudget,
+) -> tuple[list[dict[str, Any]], list[tuple[RenderedView, View, dict[str, np.ndarray]]]]:
+    """Render and measure the test views one by one, and write their images.
+
+    Returns their scores; and what the sheet shows of some: the render, the view, and more images by title.
+    """
+    render, maps_of = fitted.renderer(samples=samples), material_maps(fitted, samples)
+    object_only = (
+        replace(fitted, surroundings=None).renderer(samples=samples) if fitted.surroundings else None
+    )
+    in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
+    per_view: list[dict[str, Any]] = []
+    shown = []
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
         frame = render(view.camera())
         rendered = RenderedView.of(frame, views, view)
-        scores = _scores(rendered, view, views, measured.per_view[0] if measured.per_view else {})
+        scores = _scores(rendered, view, views, per_view[0] if per_view else {})
         gain, gained = with_gain(frame, view, views)
         scores |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
-        measured.per_view.append(scores)
+        per_view.append(scores)
 
         # Errors of materials, of concave pixels and per class of pixels.
         concave = None if surface is None else surface.concave(view)
-        materials = decomposition.MeasuredView(
-            rendered, material_maps(view.camera(), rendered), view, concave
-        )
-        measured.errors.add(materials)
-        measured.budget.add(rendered, view, classify(view, surface))
+        rendered = replace(rendered, maps=maps_of(view.camera(), rendered))
+        errors.add(rendered, view, concave)
+        budget.add(rendered, view, classify(view, surface))
 
         # Images.
         write_png(images[index], rendered.image)
-        if index in in_sheets:
-            row = panels(rendered, view)
+        if index in in_sheet:
+            more = (
+                {} if concave is None else {"concave": on_white(concave[..., None] * ORANGE, view.covered())}
+            )
             if object_only is not None:
-                row["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
-            measured.panels.append(row)
-            measured.materials.append(materials)
-    return measured
+                more["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
+            shown.append((rendered, view, more))
+    return per_view, shown
 
 
 def _register(
@@ -251,21 +233,9 @@ def _decision(run: Run, file: str, per_view: str) -> dict[str, Any] | None:
 
 
 def render_names(views: Sequence[View]) -> list[str]:
-    """Return unique paths, below the run folder, of the image that `evaluate` writes of each test view.
-
-    Views whose names differ only in what file names lose, such as case, get a hash of the name.
-    """
-    plain = [unicodedata.normalize("NFC", view.name) for view in views]
-    stems = [re.sub(r"[^\w]+", "_", name).strip("_")[:LONGEST_STEM] for name in plain]
-    alike = Counter(stem.casefold() for stem in stems)
-    found: list[str] = []
-    for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
-        if not stem or alike[stem.casefold()] > 1:
-            same = sum(other.name == view.name for other in views[:index])
-            digest = hashlib.sha256(f"{same}/{view.name}".encode()).hexdigest()[:12]
-            stem = f"{stem}_{digest}".lstrip("_")
-        found.append(f"{FOLDER}/{stem}.png")
-    return found
+    """Return paths, below the run folder, of the image that `evaluate` writes of each test view."""
+    stems = [re.sub(r"[^\w]+", "_", view.name).strip("_")[:LONGEST_STEM] for view in views]
+    return [f"{FOLDER}/{index:03d}_{stem}.png" for index, stem in enumerate(stems)]
 
 
 def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:

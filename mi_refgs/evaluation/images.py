@@ -27,9 +27,8 @@ LIGHT_KEY = 0.36
 CELL_MIN = 128
 """Pixels: smaller images are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
 MARGIN = 4  # pixels between images
-TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 16
-"""Heights of titles in pixels: the largest at which all of a sheet fit, up to TITLE_MAX or, of large images,
-their width over TITLE_PART."""
+TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 14
+"""Heights of titles in pixels, and widths of images per height: the longest title then fits."""
 BESIDE_GREYS = np.array([0.80, 0.87, 0.95])  # pale blue: on white, a metal (metallic 1) would not be visible
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
@@ -84,16 +83,20 @@ class RenderedView:
 # ---------------- panels ----------------
 
 
-def panels(rendered: RenderedView, view: View) -> dict[str, np.ndarray]:
-    """Return all images of a view by title."""
-    found = {"ground truth": view.displayed, "render": rendered.image}
+def panels(rendered: RenderedView, view: View, scale: np.ndarray | float = 1.0) -> dict[str, np.ndarray]:
+    """Return fitted maps next to the ground truth that a loaded view has, by title; albedo after a scale."""
+    pairs = {"image": [rendered.image, view.displayed]}
+    pairs["normals"] = [normal_colours(rendered.normal, rendered.alpha)]
     if view.normal is not None:
-        found["ground-truth normals"] = normal_colours(view.normal, np.linalg.norm(view.normal, axis=-1))
-    found["normals"] = normal_colours(rendered.normal, rendered.alpha)
+        pairs["normals"].append(normal_colours(view.normal, np.linalg.norm(view.normal, axis=-1)))
     for name in (*(name for name, attribute in ATTRIBUTES.items() if attribute.aov), "visibility"):
         if name in rendered.maps:
-            found[name] = material_colours(rendered.maps[name], rendered.alpha)
-    return {title: np.clip(image, 0, 1) for title, image in found.items()}
+            ours = rendered.maps[name] * (scale if name == "albedo" else 1.0)
+            pairs[name] = [material_colours(ours, rendered.alpha)]
+            if (true := view.materials.get(name)) is not None:
+                pairs[name].append(material_colours(true[..., :-1], true[..., -1]))
+    sides = {1: "fitted", 2: "fitted | ground truth"}
+    return {f"{name}: {sides[len(pair)]}": np.clip(side_by_side(pair), 0, 1) for name, pair in pairs.items()}
 
 
 def normal_colours(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -184,7 +187,8 @@ def contact_sheet(
     titles = list(dict.fromkeys(title for row in rows for title in row))
     factor = -(-CELL_MIN // min(next(iter(rows[0].values())).shape[:2]))
     enlarged = [{t: row[t].repeat(factor, 0).repeat(factor, 1) for t in titles if t in row} for row in rows]
-    size = _title_size(enlarged)
+    narrowest = min(image.shape[1] for row in enlarged for image in row.values())
+    size = min(max(narrowest // TITLE_PART, TITLE_MIN), TITLE_MAX)
     lines = [_line(row, size) for row in enlarged]
     if footer:
         width = max(line.shape[1] for line in lines)
@@ -192,19 +196,6 @@ def contact_sheet(
         lines.append(_line({title: _resized(image, part) for title, image in footer.items()}, size))
     width = max(line.shape[1] for line in lines)
     return np.concatenate([_padded(line, MARGIN, width - line.shape[1]) for line in lines])
-
-
-def _title_size(rows: Sequence[dict[str, np.ndarray]]) -> int:
-    """The height of all titles of a sheet, at which those of its rows fit."""
-    from PIL import ImageFont
-
-    widths = [(title, image.shape[1]) for row in rows for title, image in row.items()]
-    most = max(TITLE_MAX, min(width for _, width in widths) // TITLE_PART)
-    for size in range(most, TITLE_MIN, -1):
-        font = ImageFont.load_default(size)
-        if all(font.getlength(title) < width - 2 for title, width in widths):
-            return size
-    return TITLE_MIN
 
 
 def _line(cells: dict[str, np.ndarray], size: int) -> np.ndarray:

@@ -39,7 +39,7 @@ RUN_FILES = (
     *("surfels.ply", "envmap.exr", "near_field.npz", "mesh.ply", "surroundings.ply", "background.exr"),
     *("scene.xml", "model.json"),
     *("exposure.json", CAMERAS, "decisions.json", "edit.json", "preview.png"),
-    *("metrics.json", "contact_sheet.png", "decomposition.png", "eval/*.png"),
+    *("metrics.json", "contact_sheet.png", "eval/*.png"),
     *("job.json", "failed.json", "job.log"),
 )
 """Patterns of all files that commands write into a run folder, relative to it."""

@@ -15,8 +15,8 @@ from mi_refgs.cli.evaluate import table
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
-from mi_refgs.evaluation.decomposition import Decomposition, MeasuredView
-from mi_refgs.evaluation.evaluate import DECOMPOSITION, evaluate
+from mi_refgs.evaluation.decomposition import Decomposition
+from mi_refgs.evaluation.evaluate import SHEET, evaluate
 from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.io.images import read_png
 from mi_refgs.runs.export import export
@@ -67,7 +67,7 @@ def test_perfect_decomposition_has_no_error() -> None:
     errors = Decomposition()
     for seed in range(3):
         shot, view, concave = random_view(seed)
-        errors.add(MeasuredView(shot, maps_of(view, factor), view, concave))
+        errors.add(replace(shot, maps=maps_of(view, factor)), view, concave)
     found = errors.result()
     for suffix in ("", "_concave"):
         assert found[f"albedo_psnr{suffix}"] == pytest.approx(100, abs=1)
@@ -87,7 +87,7 @@ def test_errors_equal_plain_formulas() -> None:
         maps, rough = maps_of(view), np.where(concave, 0.3, 0.1)
         maps["albedo"] = maps["albedo"] + rng.normal(0, 0.1, (H, W, 3))
         maps["roughness"] = maps["roughness"] + rough
-        errors.add(MeasuredView(shot, maps, view, concave))
+        errors.add(replace(shot, maps=maps), view, concave)
         assert view.alpha is not None
         true = view.materials["albedo"]
         counted = (view.alpha > 0.5) & (true[..., -1] > 0)
@@ -107,7 +107,7 @@ def test_missing_materials_are_null_with_a_reason() -> None:
     errors = Decomposition()
     maps = maps_of(view)
     del maps["albedo"], view.materials["metallic"]
-    errors.add(MeasuredView(shot, maps, view, None))
+    errors.add(replace(shot, maps=maps), view, None)
     found = errors.result()
     assert found["albedo_psnr"] is None and "run has no albedo" in found["albedo_reason"]
     assert found["metallic_mae"] is None and "data set defines no metallic" in found["metallic_reason"]
@@ -131,7 +131,7 @@ def test_evaluate_scores_a_perfect_run(data: Path, tmp_path: Path) -> None:
     assert "albedo, PSNR after scale" in text and "(concave: " in text
     assert text.startswith("scale: ") and "whole image of " in text
     assert json.loads((run.path / "metrics.json").read_text())["surface_reason"] is None
-    sheet = read_png(run.path / DECOMPOSITION)
+    sheet = read_png(run.path / SHEET)
     assert sheet.shape[1] > 10 * SIZE and sheet.std() > 0.1
 
 
