@@ -11,7 +11,7 @@ import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 from mi_refgs.errors import InputError
@@ -83,15 +83,7 @@ class Format:
         return inspect.getdoc(write) or self.summary
 
 
-def _require_shared_options(made: Format) -> None:
-    shared = options_of(FORMATS)
-    for option in made.options:
-        if shared.get(option.name, option) != option:
-            where = f"format: '{made.name}': {option.name}"
-            raise InputError(f"{where}: another format declares it differently; rename it")
-
-
-FORMATS: Registry[Format] = Registry("format", _require_shared_options)  # every format by name
+FORMATS: Registry[Format] = Registry("format")  # every format by name
 register = FORMATS.register
 
 
@@ -108,26 +100,22 @@ def import_extra(name: str) -> Any:
         raise InputError(f'--to: {name} is not installed; pip install "mi_refgs[export]"') from None
 
 
-P = ParamSpec("P")
-R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
-def remember_last(
-    function: Callable[Concatenate[TrainedScene, P], R],
-) -> Callable[Concatenate[TrainedScene, P], R]:
+def remember_last(function: F) -> F:
     """Decorate a function of a scene so that it keeps its last result per scene, as long as the scene exists.
 
     Several formats of one export require the same result.
     """
-    results: WeakKeyDictionary[TrainedScene, tuple[Any, R]] = WeakKeyDictionary()
+    results: WeakKeyDictionary[TrainedScene, tuple[Any, Any]] = WeakKeyDictionary()
 
-    @functools.wraps(function)
-    def cached(scene: TrainedScene, /, *args: P.args, **kwargs: P.kwargs) -> R:
-        if scene not in results or results[scene][0] != (args, kwargs):
-            results[scene] = (args, kwargs), function(scene, *args, **kwargs)
+    def cached(scene: TrainedScene, *args: Any) -> Any:
+        if scene not in results or results[scene][0] != args:
+            results[scene] = args, function(scene, *args)
         return results[scene][1]
 
-    return cached
+    return cast(F, functools.wraps(function)(cached))
 
 
 def write(

@@ -36,7 +36,7 @@ def shots_around(
     InputError if there are no surfels.
     """
     position, weight = _weighted(surfels)
-    middle = _middle_of(position, weight)
+    middle = _middle(position, weight)
     deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)
     far = np.linalg.norm(position - middle, axis=1) + SIGMAS * deviation
     reach = weighted_quantile(far, weight, INSIDE)
@@ -65,7 +65,10 @@ def turntable_cameras(
     They have the first one's lens. The object is what lies in the `region`; without one, all of the scene but
     strays: the box of INSIDE of the surfels by opacity, or of the mesh's vertices.
     """
-    centre = _middle(scene) if region is None else np.array(region.centre)
+    position, weight = _weighted(scene.surfels)
+    if scene.mesh is not None:
+        position, weight = scene.mesh.vertices.astype(np.float64), np.ones(len(scene.mesh.vertices))
+    centre = _middle(position, weight) if region is None else np.array(region.centre)
     offset = np.array([camera.pose()[:3, 3] for camera in cameras]) - centre
     length = np.linalg.norm(offset, axis=1)
     distance, height = float(np.median(length)), float(np.median(offset[:, 2] / length))
@@ -76,16 +79,7 @@ def turntable_cameras(
     return [cameras[0].moved(pose) for pose in poses_around(outward, centre, distance)]
 
 
-def _middle(scene: TrainedScene) -> np.ndarray:
-    """Return the centre (3,) of the box around all of a scene but strays."""
-    if scene.mesh is None:
-        position, weight = _weighted(scene.surfels)
-    else:
-        position, weight = scene.mesh.vertices.astype(np.float64), np.ones(len(scene.mesh.vertices))
-    return _middle_of(position, weight)
-
-
-def _middle_of(position: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _middle(position: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the centre (3,) of the box between the quantiles 1 - INSIDE and INSIDE along each axis."""
     ends = [[weighted_quantile(axis, weight, share) for axis in position.T] for share in (1 - INSIDE, INSIDE)]
     return np.mean(ends, axis=0)

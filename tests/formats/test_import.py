@@ -85,10 +85,10 @@ def their_image(raw: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[np.n
     return maps.features + (1 - maps.alpha[..., None]) * BACKGROUND, maps.band
 
 
-@pytest.fixture(params=LAYOUTS, ids=[name.replace(" ", "-") for name in LAYOUTS])
-def theirs(request: pytest.FixtureRequest, tmp_path: Path, rng: np.random.Generator) -> Path:
+@pytest.fixture
+def theirs(tmp_path: Path, rng: np.random.Generator) -> Path:
     path = tmp_path / "theirs.ply"
-    path.write_bytes(their_bytes(raw_of(*LAYOUTS[request.param], rng)))
+    path.write_bytes(their_bytes(raw_of(3, 0, rng)))
     return path
 
 
@@ -130,22 +130,10 @@ def test_import_command_makes_a_run_that_renders_the_same(
     refused(["import", theirs, "-o", run], "a run already")
 
 
-def test_import_reports_one_gaussian_in_the_singular(
-    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole, run = their_bytes(raw_of(3, 0, rng)), tmp_path / "run"
-    header, end, body = whole.partition(b"end_header\n")
-    path = tmp_path / "one.ply"
-    path.write_bytes(header.replace(b"vertex 40", b"vertex 1") + end + body[: len(body) // COUNT])
-    assert main(["import", str(path), "-o", str(run)]) == 0
-    assert f"{run}: 1 gaussian of SH degree 0, 4 cameras in scene.xml" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("form", ["gltf-mesh", "mitsuba"])
-def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Path, form: str) -> None:
+def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert main(["import", str(theirs), "-o", str(run)]) == 0
-    command = ["export", run, "--to", form, "-o", tmp_path / "out"]
+    command = ["export", run, "--to", "mitsuba", "-o", tmp_path / "out"]
     refused(command, f"{run}: albedo, metallic, roughness: the run has none; fit one")
 
 
@@ -167,11 +155,14 @@ def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path, linear: 
     refused(lambda: mi_refgs.import_splats(tmp_path / "no.ply"), "cannot be read")
 
 
-def test_imported_gaussians_are_exported_unchanged(theirs: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_imported_gaussians_are_exported_unchanged(
+    name: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
     """Encoded colours are not fitted anew; Gaussians come back bit for bit."""
-    run, again = tmp_path / "run", tmp_path / "again.ply"
-    assert main(["import", str(theirs), "-o", str(run)]) == 0
-    assert main(["export", str(run), "--to", "3dgs-ply", "-o", str(again)]) == 0
+    theirs, again = tmp_path / "theirs.ply", tmp_path / "again.ply"
+    theirs.write_bytes(their_bytes(raw_of(*LAYOUTS[name], rng)))
+    mi_refgs.import_splats(theirs).export("3dgs-ply", again)
     before, after = (read_splats(path).surfels.to_numpy() for path in (theirs, again))
     columns = before["radiance_sh"].shape[1]
     np.testing.assert_array_equal(after["radiance_sh"][:, :columns], before["radiance_sh"])
@@ -267,16 +258,11 @@ def test_transforms_file_defines_the_cameras_of_an_import(theirs: Path, tmp_path
     [
         ({"frames": []}, "frames: empty"),
         ({"w": None}, "w: 0 × 48 is no size of an image"),
-        ({"w": 1e6}, "is no size of an image"),
         ({"fl_x": -3}, "fl_x: -3.0 is not a positive number"),
-        ({"w": 48.4}, "w: 48.4 × 48 is no size of an image"),
         ({"cx": 0}, "cx: 0.0 is not a positive number"),
-        ({"cy": -5}, "cy: -5.0 is not a positive number"),
         ({"k1": 0.1}, "k1: no pinhole"),
-        ({"is_fisheye": True}, "is_fisheye: no pinhole"),
         ({"camera_model": "OPENCV_FISHEYE"}, "camera_model: no pinhole"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model: this lens is not supported"),
-        ({"latlong": True}, "latlong: this lens is not supported"),
         ({"frames": [{}]}, "frames[0].transform_matrix: missing or not 4 × 4"),
         ({"frames": [{"transform_matrix": (2 * np.eye(4)).tolist()}]}, "not a rotation and a translation"),
     ],
