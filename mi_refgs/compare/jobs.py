@@ -40,9 +40,7 @@ class Job:
 
     folder: str  # of the run, absolute
     data: str  # folder of the data set, absolute
-    variant: (
-        str  # the method, in job.json by this name: a shipped method's name or the absolute path of a .toml
-    )
+    variant: str  # the method: a name of the package's, or the absolute path of a .toml
     seed: int
     preset: str
     settings: tuple[str, ...]  # key=value
@@ -180,25 +178,19 @@ def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:
 
 def require_one_size(where: str, sizes: Mapping[str, list[int]], remedy: str) -> None:
     """Raise InputError for runs of different image sizes: the PSNR of one fit differs by decibels."""
-    named: dict[tuple[int, ...], str] = {}
-    for name, size in sizes.items():
-        named.setdefault(tuple(size), name)
+    named = {tuple(size): name for name, size in sizes.items()}
     if len(named) > 1:
         each = ", ".join(f"{name} with {size[0]} × {size[1]} pixels" for size, name in named.items())
-        raise InputError(f"{where}: image sizes: {each}: scores of different sizes do not compare; {remedy}")
+        raise InputError(f"{each}: scores of different sizes do not compare", where, "image sizes", remedy)
 
 
 def require_settings(folder: Path, shared: Shared) -> None:
     """Raise InputError if `folder` has a comparison with another preset or other settings."""
-    if not (folder / SETTINGS).is_file():
-        return
-    before = read_json(folder / SETTINGS)
+    before = settings_of(folder)
     for option, now in (("preset", shared.preset), ("set", list(shared.settings))):
-        if (then := before.get(option)) != now:
-            raise InputError(
-                f"{folder / SETTINGS}: --{option}: the comparison was begun with {_words(then)}, "
-                f"not {_words(now)}; repeat that, or choose another -o"
-            )
+        if (then := before.get(option, now)) != now:
+            what = f"the comparison was begun with {then}, not {now}"
+            raise InputError(what, folder / SETTINGS, f"--{option}", "repeat that, or choose another -o")
 
 
 def require_same(job: Job) -> None:
@@ -207,25 +199,14 @@ def require_same(job: Job) -> None:
         job.method()
         job.run.output.require_free()
         return
-    made = job.run.method()
+    made, remedy = job.run.method(), "choose another -o, or remove that run"
     for key, (before, now) in differences(made, as_decided(job.method(), made)).items():
-        raise InputError(
-            f"{job.folder}/config.toml: {key}: the run was made with {before}, and now --methods, "
-            f"--preset or --set would make it {now}; choose another -o, or remove that run"
-        )
-    if (job_file := Path(job.folder) / JOB).is_file() and (
-        was := Job.read(job_file.parent).mitsuba_variant
-    ) != job.mitsuba_variant:
-        raise InputError(
-            f"{job_file}: --mitsuba-variant: the run was made with {was}, not {job.mitsuba_variant}; repeat "
-            "that, or choose another -o"
-        )
+        what = f"the run was made with {before}, and --methods, --preset or --set would make it {now}"
+        raise InputError(what, f"{job.folder}/config.toml", key, remedy)
     data = job.run.dataset()
     if data is None or data.resolve() != Path(job.data).resolve():
-        raise InputError(
-            f"{job.folder}/dataset.json: DATA: the run was fitted to {data or 'unknown data'}, not to "
-            f"{job.data}; choose another -o, or remove that run"
-        )
+        what = f"the run was fitted to {data or 'unknown data'}, not to {job.data}"
+        raise InputError(what, f"{job.folder}/dataset.json", "DATA", remedy)
 
 
 def finished(job: Job) -> bool:
@@ -258,7 +239,3 @@ def _unique(names: Iterable[str], option: str, remedy: str) -> None:
         if name in seen:
             raise InputError(f"{option}: '{name}' is given twice; {remedy}")
         seen.add(name)
-
-
-def _words(value: Any) -> str:
-    return " ".join(map(str, value)) or "nothing" if isinstance(value, list) else str(value)

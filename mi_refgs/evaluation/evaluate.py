@@ -110,7 +110,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
         "surfels": fitted.surfels.count,
         "samples": per_pixel,
         "antialias": fitted.shading.antialias,
-        "ms_per_frame": metrics.frame_milliseconds([timed], cameras, views)[0],
+        "ms_per_frame": metrics.frame_milliseconds(timed, cameras, views),
         "method": method.name,
         "preset": method.preset,
         "dataset": str(views.path),

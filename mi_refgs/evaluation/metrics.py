@@ -182,16 +182,13 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
 # ---------------- time ----------------
 
 
-def frame_milliseconds(
-    renderers: Sequence[Callable[[Camera], Frame]], cameras: Sequence[Camera], data: Dataset
-) -> list[float]:
-    """Return the median time per synchronised frame up to the displayed image; renderers take turns."""
-    seconds: list[list[float]] = [[] for _ in renderers]
+def frame_milliseconds(render: Callable[[Camera], Frame], cameras: Sequence[Camera], data: Dataset) -> float:
+    """Return the median time per synchronised frame up to the displayed image."""
+    seconds = []
     for i in range(WARM_UP_FRAMES + TIMED_FRAMES):
-        for render, times in zip(renderers, seconds, strict=True):
-            dr.sync_thread()
-            begin = time.perf_counter()
-            dr.eval(displayed(render(cameras[i % len(cameras)]), data.background, data.is_linear_radiance))
-            dr.sync_thread()
-            times.append(time.perf_counter() - begin)
-    return [1000 * float(np.median(times[WARM_UP_FRAMES:])) for times in seconds]
+        dr.sync_thread()
+        begin = time.perf_counter()
+        dr.eval(displayed(render(cameras[i % len(cameras)]), data.background, data.is_linear_radiance))
+        dr.sync_thread()
+        seconds.append(time.perf_counter() - begin)
+    return 1000 * float(np.median(seconds[WARM_UP_FRAMES:]))

@@ -172,15 +172,8 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
 
 def sample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample points (count, 3) evenly over the area of a mesh, and return the triangle (count,) of each."""
-    rng = np.random.default_rng(0)
-    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
-    edges = corners[:, 1:] - corners[:, :1]
-    until = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
-    place = (np.arange(count) + rng.random(count)) / count * until[-1]
-    triangle = np.minimum(np.searchsorted(until, place, side="right"), len(until) - 1)
-    share = rng.random((count, 2))
-    share = np.where(share.sum(1, keepdims=True) > 1, 1 - share, share)
-    return corners[triangle, 0] + np.einsum("pe,pec->pc", share, edges[triangle]), triangle
+    made = trimesh.Trimesh(mesh.vertices.astype(np.float64), mesh.faces, process=False)
+    return trimesh.sample.sample_surface(made, count, seed=0)[:2]
 
 
 def distance_to(mesh: Mesh, points: np.ndarray) -> np.ndarray:

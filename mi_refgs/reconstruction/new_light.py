@@ -40,7 +40,7 @@ class NewLight:
     def __post_init__(self) -> None:
         """Raise InputError for a missing file, or a number out of range."""
         require_file(self.path)
-        _require_range(f"{self.path}: --", "azimuth", self.rotate, self.exposure)
+        _require_range(self.rotate, self.exposure)
 
     @property
     def suffix(self) -> str:
@@ -59,13 +59,13 @@ class NewLight:
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
 
 
-def _require_range(where: str, angle: str, rotate: float, exposure: float) -> None:
-    """Raise InputError for a number out of range; `angle` is what the user calls the rotation."""
+def _require_range(rotate: float, exposure: float) -> None:
+    """Raise InputError for a number out of range."""
     if not np.isfinite(rotate):
-        raise InputError(f"{where}{angle}: {rotate} is out of range; give degrees")
+        raise InputError(f"{rotate} is no angle", "light", "rotation", "give degrees")
     if not abs(exposure) <= EXPOSURE_MAX:
         allowed = f"give stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
-        raise InputError(f"{where}exposure: {exposure} is out of range; {allowed}")
+        raise InputError(f"{exposure} is out of range", "light", "exposure", allowed)
 
 
 def world_light(
@@ -75,7 +75,7 @@ def world_light(
 
     Raises InputError for an array that is no such map, and for a number out of range.
     """
-    _require_range("light: ", "rotate", rotate, exposure)
+    _require_range(rotate, exposure)
     radiance = np.ascontiguousarray(radiance, dtype=np.float32)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
         raise InputError(f"light: {radiance.shape} is no lat-long map; give linear radiance (h, w, 3)")
@@ -97,17 +97,13 @@ AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray
 def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> EnvironmentLight:
     """Convert a light, its file or its radiance (h, w, 3) to a light; options as in `NewLight`.
 
-    An `EnvironmentLight` is in world directions already. Raises InputError for any other object.
+    An `EnvironmentLight` is in world directions already; a `NewLight` has options of its own.
     """
-    if isinstance(light, NewLight):
-        if world or rotate or exposure:
-            raise InputError("light: a NewLight has its own world, rotate and exposure; set them there")
-        return light.read()
     if isinstance(light, EnvironmentLight):
         return world_light(light.radiance().numpy(), True, rotate, exposure)
     if isinstance(light, np.ndarray):
         return world_light(light, world, rotate, exposure)
-    return NewLight(Path(light), world, rotate, exposure).read()
+    return (light if isinstance(light, NewLight) else NewLight(Path(light), world, rotate, exposure)).read()
 
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:

@@ -230,13 +230,13 @@ def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
     refused(lambda: relight(run, light, turntable=-1), "--turntable: -1")
     refused(lambda: relight(run, NewLight(tmp_path / "bad.exr"), tmp_path / "out"), "bad.exr")
     refused(lambda: NewLight(tmp_path / "none.exr"), "none.exr")
-    for angle, stops, option, wrong in (
-        (float("nan"), 0.0, "--azimuth", "rotate: nan is out of range"),
-        (0.0, 50.0, "--exposure", "exposure: 50.0 is out of range"),
+    for angle, stops, wrong in (
+        (float("nan"), 0.0, "light: rotation: nan is no angle"),
+        (0.0, 50.0, "light: exposure: 50.0 is out of range"),
     ):
-        refused(partial(NewLight, light.path, False, angle, stops), f"{light.path}: {option}: ")
+        refused(partial(NewLight, light.path, False, angle, stops), wrong)
         for given in (other_sky(), light.read()):
-            refused(partial(any_light, given, False, angle, stops), f"light: {wrong}")
+            refused(partial(any_light, given, False, angle, stops), wrong)
     bare = Run(shutil.copytree(run.path, tmp_path / "bare"))
     changes: dict[str, Any] = {"light": None, "mesh": None, "shading": Shading("surfel", "radiance")}
     colour = replace(TrainedScene.read(run.path), **changes)
