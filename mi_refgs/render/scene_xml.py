@@ -117,15 +117,22 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
         size = f"{camera.width} x {camera.height} pixels of focal lengths {abs(fx):g} and {abs(fy):g}"
         scene.append(ElementTree.Comment(f" the view of {size}, with square pixels "))
 
+    # The field of view and the principal point are those of the whole film, of which a crop is rendered.
+    (left, top), whole = (0, 0), (width, height)
+    if camera.film is not None and per_pixel == (1.0, 1.0):
+        (left, top), whole = camera.offset, camera.film
+    x, y = cx * per_pixel[0] + left, cy * per_pixel[1] + top
     sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id=name)
-    put(sensor, fov_axis="x", fov=math.degrees(2 * math.atan(width / (2 * focal))))
+    put(sensor, fov_axis="x", fov=math.degrees(2 * math.atan(whole[0] / (2 * focal))))
     put(sensor, near_clip=max(near, NEAR_CLIP_MIN), far_clip=FAR_CLIP)
-    put(sensor, principal_point_offset_x=0.5 - cx * per_pixel[0] / width)
-    put(sensor, principal_point_offset_y=0.5 - cy * per_pixel[1] / height)
+    put(sensor, principal_point_offset_x=0.5 - x / whole[0])
+    put(sensor, principal_point_offset_y=0.5 - y / whole[1])
     transform = ElementTree.SubElement(sensor, "transform", name="to_world")
     ElementTree.SubElement(transform, "matrix", value=_numbers(to_world.ravel()))
     sampler = ElementTree.SubElement(sensor, "sampler", type="independent")
     ElementTree.SubElement(sampler, "integer", name="sample_count", value="$spp")
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
-    put(film, width=width, height=height, pixel_format="rgba", component_format="float32")
+    put(film, width=whole[0], height=whole[1], pixel_format="rgba", component_format="float32")
+    if whole != (width, height):
+        put(film, crop_width=width, crop_height=height, crop_offset_x=left, crop_offset_y=top)
     ElementTree.SubElement(film, "rfilter", type="box")

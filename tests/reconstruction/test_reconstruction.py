@@ -165,6 +165,18 @@ def test_mitsuba_scene_renders_the_same_and_differentiates(balls: Reconstruction
         assert np.abs(dr.grad(params[key]).numpy()).max() > 0, key
 
 
+def test_mitsuba_scene_keeps_the_crop_of_a_sensor(balls: Reconstruction) -> None:
+    """Its place on the film, on which the random numbers of a pixel depend, too."""
+    film = {"type": "hdrfilm", "width": 48, "height": 32, "crop_offset_x": 10, "crop_offset_y": 4}
+    film |= {"crop_width": 24, "crop_height": 20}
+    pose = mi.ScalarTransform4f().look_at([2.0, 2.5, 1.0], [0.1, 0.0, 0.2], [0.0, 0.0, 1.0])
+    sensor = mi.load_dict({"type": "perspective", "fov": 35, "to_world": pose, "film": film})
+    scene = balls.scene(sensor)
+    camera = Camera.from_sensor(scene.sensors()[0])
+    assert (camera.offset, camera.film, camera.width, camera.height) == ((10, 4), (48, 32), 24, 20)
+    np.testing.assert_allclose(mi.render(scene, spp=1).numpy(), balls.render(sensor), atol=2e-3)
+
+
 # ---------------- run folders ----------------
 
 
