@@ -54,7 +54,7 @@ class Edit:
         try:
             edited = whole.edit(**options)
         except InputError as error:
-            raise InputError(f"{self.run_folder}: {error}") from error
+            raise error.at(self.run_folder) from None
         entry = edited.provenance.edits[-1]
         for note in entry["notes"]:
             say(f"note: {note}")

@@ -43,10 +43,10 @@ class Assignment:
             name, sign, values = ASSIGNMENT.fullmatch(text).groups()  # type: ignore[union-attr]
             numbers = tuple(map(float, values.split(",")))
         except (AttributeError, ValueError):
-            what = f"{abbreviated(text)}: no assignment of numbers"
-            raise InputError(f"--set: {what}; write it like roughness=0.3 or albedo*=1,0.5,0.5") from None
+            remedy = "write it like roughness=0.3 or albedo*=1,0.5,0.5"
+            raise InputError("no assignment of numbers", "--set", abbreviated(text), remedy) from None
         if not np.isfinite(numbers).all():
-            raise InputError(f"--set: {abbreviated(text)}: not finite; give finite numbers")
+            raise InputError("not finite", "--set", abbreviated(text), "give finite numbers")
         return Assignment(name, numbers, sign == "*=", text.strip())
 
 
@@ -72,7 +72,8 @@ def placement_of(
     """
     scale = float(finite("--scale", [change.scale], 1)[0])
     if not SCALES[0] <= scale <= SCALES[1]:
-        raise InputError(f"--scale: {scale:g} is out of range; give {SCALES[0]:g} to {SCALES[1]:g}")
+        remedy = f"give {SCALES[0]:g} to {SCALES[1]:g}"
+        raise InputError(f"{scale:g} is out of range", "--scale", remedy=remedy)
     options = (("--move", change.move), ("--duplicate", change.duplicate))
     shift = sum((finite(name, x, 3) for name, x in options if x is not None), np.zeros(3))
     # Not the median, which does not rotate with the surfels: a rotation and its inverse would shift them.
@@ -92,10 +93,11 @@ def _rotation(given: Rotate | None) -> Rotation:
         axis = finite("--rotate", [float(number) for number in numbers], 3)
     except (ValueError, TypeError) as error:
         remedy = "give an axis and degrees, like z 90 or 0,0,1 90"
-        raise InputError(f"--rotate: {abbreviated(given)}: no rotation; {remedy}") from error
+        raise InputError("no rotation", "--rotate", abbreviated(given), remedy) from error
     length = np.linalg.norm(axis)
     if not (np.isfinite(degrees) and length > 0):
-        raise InputError("--rotate: an axis without length, or an infinite angle; give them like z 90")
+        what = "an axis without length, or an infinite angle"
+        raise InputError(what, "--rotate", remedy="give them like z 90")
     if degrees % 360 == 0:
         return Rotation.identity()
     return Rotation.from_rotvec(np.radians(degrees) * axis / length)
@@ -113,11 +115,11 @@ def apply(
     and if no surfel would be left.
     """
     if change.cut and (change.set or change.keep or change.moves):
-        raise InputError("--cut: what is removed cannot be changed, too; leave the rest out")
+        raise InputError("what is removed cannot be changed, too", "--cut", remedy="leave the rest out")
     if change.keep and change.duplicate is not None:
-        raise InputError("--keep: not possible with --duplicate; do one after the other")
+        raise InputError("not possible with --duplicate", "--keep", remedy="do one after the other")
     if change.cut and chosen.all():
-        raise InputError("--cut: no surfel would be left; choose fewer")
+        raise InputError("no surfel would be left", "--cut", remedy="choose fewer")
     values = SurfelValues(scene)
     raw = values.raw
     own = {name: table[chosen] for name, table in raw.items()}
@@ -175,15 +177,15 @@ def _assign(
     # What is set: an attribute or the colour, and its columns.
     name, given = assignment.name, np.array(assignment.values)
     if name not in values.settable:
-        known = f"cannot be set of these surfels; use one of {', '.join(values.settable)}"
-        raise InputError(f"--set: {abbreviated(name)} {known}")
+        what = f"{abbreviated(name)} cannot be set of these surfels"
+        raise InputError(what, "--set", remedy=f"use one of {', '.join(values.settable)}")
     attribute, columns = values.columns[name]
     is_colour = attribute == COLOUR
     if len(given) not in (1, len(columns)):
-        raise InputError(f"--set: {name}: {len(given)} values; give 1 or {len(columns)}")
+        raise InputError(f"{len(given)} values", "--set", name, f"give 1 or {len(columns)}")
     if given.min() < 0 or (given.max() > 1 and not (is_colour or assignment.multiplies)):
-        wanted = "0 or more" if is_colour or assignment.multiplies else "0 to 1"
-        raise InputError(f"--set: {assignment.text}: out of range; give {wanted}")
+        remedy = "give 0 or more" if is_colour or assignment.multiplies else "give 0 to 1"
+        raise InputError("out of range", "--set", assignment.text, remedy)
 
     # The raw values (chosen, columns). A new colour scales the SH of all degrees.
     old = activated(attribute, own)[:, columns]

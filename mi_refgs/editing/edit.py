@@ -44,13 +44,13 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
     """
     known = EditOptions.__annotations__
     for name in options.keys() - known:
-        raise InputError(f"edit: {name}: unknown option; use some of {', '.join(known)}")
+        raise InputError("unknown option", "edit", name, f"use some of {', '.join(known)}")
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     selection = Selection(**{f.name: given.pop(f.name) for f in fields(Selection) if f.name in given})
     given["set"] = tuple(assignment.text for assignment in assignments(given.get("set", ())))
     change = Change(**given)
     if change.is_empty:
-        raise InputError("edit: nothing to do; give --set, --cut, --move or another change")
+        raise InputError("nothing to do", "edit", remedy="give --set, --cut, --move or another change")
     if change.materials:
         scene = replace(relightable(scene), surroundings=scene.surroundings, near=scene.near)
     chosen = select(scene, selection)

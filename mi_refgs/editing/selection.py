@@ -26,21 +26,22 @@ def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
     if selection.nearest is not None and count:
         *point, radius = finite("--nearest", selection.nearest, 4)
         if radius < 0:
-            raise InputError(f"--nearest: the distance {radius:g} is negative; give one from 0")
+            raise InputError(f"the distance {radius:g} is negative", "--nearest", remedy="give one from 0")
         middle = position[np.argmin(np.linalg.norm(position - point, axis=1))]
         chosen &= np.linalg.norm(position - middle, axis=1) <= radius
     chosen = ~chosen if selection.invert else chosen
     if not chosen.any():
-        raise InputError(f"selection: none of the {count} surfels is in it; choose a wider one")
+        raise InputError(f"none of the {count} surfels is in it", "selection", remedy="choose a wider one")
     return chosen
 
 
 def finite(where: str, numbers: Sequence[float], count: int) -> np.ndarray:
-    """Return numbers (count,) float64; raises InputError, with `where` in the message, for anything else."""
+    """Return numbers (count,) float64; raises InputError that starts with `where` for anything else."""
     try:
         found = np.asarray(numbers, dtype=np.float64)
     except (ValueError, TypeError):
         found = np.zeros(0)
     if found.shape != (count,) or not (np.abs(found) <= MAX_NUMBER).all():
-        raise InputError(f"{where}: {count} finite numbers are needed, none beyond {MAX_NUMBER:g}; give them")
+        what = f"{count} finite numbers are needed, none beyond {MAX_NUMBER:g}"
+        raise InputError(what, where, remedy="give them")
     return found

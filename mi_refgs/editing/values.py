@@ -40,7 +40,7 @@ def _comparison(text: str) -> tuple[str, str, float]:
             return match[1], match[2], float(match[3])
         except ValueError:
             pass
-    raise InputError(f"--where: {abbreviated(text.strip())}: no comparison; write it like metallic > 0.5")
+    raise InputError("no comparison", "--where", abbreviated(text.strip()), "write it like metallic > 0.5")
 
 
 def activated(name: str, raw: dict[str, np.ndarray]) -> np.ndarray:
@@ -92,8 +92,8 @@ class SurfelValues:
             normal = outward(self.scene.surfels, self.scene.mesh)[0]
             return normal[:, NORMALS.index(name)].astype(np.float64)
         if name not in self.names:
-            known = f"is no value of these surfels; use one of {', '.join(self.names)}"
-            raise InputError(f"--where: {abbreviated(name)} {known}")
+            what = f"{abbreviated(name)} is no value of these surfels"
+            raise InputError(what, "--where", remedy=f"use one of {', '.join(self.names)}")
         of, columns = self.columns[name]
         return activated(of, self.raw)[:, columns[0]]
 

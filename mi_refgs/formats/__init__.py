@@ -3,9 +3,7 @@
 The command line reads these declarations before it runs anything, so they do not import what computes.
 """
 
-from functools import partial
-
-from mi_refgs.formats.format import FORMATS, Format, Option, Shot, Writer, options_of, write
+from mi_refgs.formats.format import FORMATS, Format, Option, Shot, options_of, write
 
 _OBJECT = Option(
     "object", False, "the object without its background Gaussians; splat files have no environment"
@@ -16,28 +14,33 @@ _TEXTURE = Option("texture", 1024, "texels along each side of its textures")
 _VIEW = Option("view", 0, "the view of an EXR file, by number; test views come first")
 _SAMPLES = Option("samples", 4, "samples per pixel of an EXR file, box filtered: 4 are 2 × 2")
 
-_splats = partial(Format, options=(_DEGREE, _OBJECT))
-_mesh = partial(Format, options=(_FACES, _TEXTURE), extra="export")
+_GAUSSIANS, _MESH = (_DEGREE, _OBJECT), (_FACES, _TEXTURE)
 for _format in (
-    _splats("3dgs-ply", "3D Gaussians with baked colours, for splat viewers", ".ply", Writer("gaussian_ply")),
-    _splats(
-        "gltf-splats",
-        "the same in binary glTF (KHR_gaussian_splatting)",
+    Format(
+        "3dgs-ply", "3D Gaussians with baked colours, for viewers", ".ply", "gaussian_ply:write", _GAUSSIANS
+    ),
+    Format(
+        "gltf-splats", "the same in glTF (KHR_gaussian_splatting)", ".glb", "gltf:write_gaussians", _GAUSSIANS
+    ),
+    Format(
+        "gltf-mesh",
+        "glTF: a mesh with metallic-roughness textures",
         ".glb",
-        Writer("gltf", "write_gaussians"),
+        "gltf:write_mesh",
+        _MESH,
+        "export",
     ),
-    _mesh(
-        "gltf-mesh", "glTF 2.0: a mesh with metallic-roughness textures", ".glb", Writer("gltf", "write_mesh")
-    ),
-    _mesh(
+    Format(
         "mitsuba",
-        "a folder that Mitsuba renders without this package: mesh, principled, textures, envmap",
+        "a folder for plain Mitsuba: a textured mesh, envmap",
         "",
-        Writer("mitsuba_scene"),
+        "mitsuba_scene:write",
+        _MESH,
+        "export",
     ),
-    Format("cameras", "transforms.json and COLMAP's text files of the cameras", "", Writer("cameras")),
-    Format("exr", "one view with all its layers", ".exr", Writer("exr_layers"), (_VIEW, _SAMPLES, _OBJECT)),
+    Format("cameras", "transforms.json and COLMAP's text files of the cameras", "", "cameras:write"),
+    Format("exr", "one view with all its layers", ".exr", "exr_layers:write", (_VIEW, _SAMPLES, _OBJECT)),
 ):
     FORMATS.register(_format)
 
-__all__ = ["FORMATS", "Format", "Option", "Shot", "Writer", "options_of", "write"]
+__all__ = ["FORMATS", "Format", "Option", "Shot", "options_of", "write"]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs.data.colmap_model import write_cameras, write_images, write_points, write_test_list
-from mi_refgs.data.lens import COEFFICIENTS, Lens
+from mi_refgs.data.lens import COEFFICIENTS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.transforms import Frame
 from mi_refgs.data.view import FileCamera
@@ -39,7 +39,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     files = [_file(shot) for shot in shots]
     names = [file.path.as_posix() for file in files]
     poses = [shot.camera.pose() for shot in shots]
-    cameras = [_numbers(file) for file in files]
+    cameras = [((file.width, file.height, *map(float, file.intrinsics)), file.lens) for file in files]
     numbered = {camera: i for i, camera in enumerate(dict.fromkeys(cameras), 1)}
     below = _below_images(names)
     write_cameras(sparse, numbered)
@@ -56,11 +56,11 @@ def transforms(shots: Sequence[Shot]) -> dict[str, Any]:
     listed: dict[str, list[str]] = {"train": [], "test": []}
     for shot in shots:
         file = _file(shot)
-        numbers, lens = _numbers(file)
-        name = file.path.as_posix()
+        name, lens = file.path.as_posix(), file.lens
         listed[shot.split].append(name)
         frame: dict[str, Any] = {"file_path": name}
-        frame |= zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True)
+        frame |= {"w": file.width, "h": file.height}
+        frame |= zip(("fl_x", "fl_y", "cx", "cy"), map(float, file.intrinsics), strict=True)
         if file.mask is not None and file.mask.below is None:
             frame["mask_path"] = file.mask.path.as_posix()
         frame["camera_model"] = "PINHOLE" if lens is None else lens.model
@@ -69,11 +69,6 @@ def transforms(shots: Sequence[Shot]) -> dict[str, Any]:
         frames.append(frame)
     names = {f"{split}_filenames": found for split, found in listed.items()}
     return {"camera_model": frames[0]["camera_model"], **names, "frames": frames}
-
-
-def _numbers(file: FileCamera) -> tuple[tuple[float, ...], Lens | None]:
-    """Return width, height and intrinsics of an image file in pixels, and its lens."""
-    return (file.width, file.height, *map(float, file.intrinsics)), file.lens
 
 
 def _file(shot: Shot) -> FileCamera:

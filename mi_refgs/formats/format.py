@@ -48,39 +48,35 @@ class Option:
 
 
 @dataclass(frozen=True)
-class Writer:
-    """A function of a module of this package, imported when it is first called."""
-
-    module: str
-    name: str = "write"
-
-    def function(self) -> Any:
-        """Import the function."""
-        return getattr(importlib.import_module(f"mi_refgs.formats.{self.module}"), self.name)
-
-    def __call__(self, *arguments: Any, **options: Any) -> list[Path]:
-        return self.function()(*arguments, **options)
-
-
-@dataclass(frozen=True)
 class Format:
     """A format that other programs read."""
 
     name: str
     summary: str  # one line, for `--help` and for the list of formats
     suffix: str  # of its file, such as ".ply"; empty for a format that writes a folder
-    write: Callable[..., list[Path]]
-    """write(trained, target, shots, **options): writes the file or the folder `target` atomically and returns
-    the paths that it wrote. `shots` (a sequence of Shot, never empty) are the cameras of the fit, the test
-    views first. Raises InputError for a scene that the format cannot represent."""
+    write: Callable[..., list[Path]] | str
+    """write(trained, target, shots, **options), or MODULE:NAME of one of this package, imported when it is
+    needed: writes the file or the folder `target` atomically and returns the paths that it wrote. `shots` (a
+    sequence of Shot, never empty) are the cameras of the fit, the test views first. Raises InputError for a
+    scene that the format cannot represent."""
     options: tuple[Option, ...] = ()
     extra: str = ""  # name of the extra that `pip install "mi_refgs[…]"` must have installed
 
     @property
+    def writer(self) -> Callable[..., list[Path]]:
+        """The function `write`, imported."""
+        if not isinstance(self.write, str):
+            return self.write
+        module, _, name = self.write.partition(":")
+        found: Callable[..., list[Path]] = getattr(
+            importlib.import_module(f"mi_refgs.formats.{module}"), name
+        )
+        return found
+
+    @property
     def description(self) -> str:
         """The docstring of `write`, which describes the file; the documentation shows it."""
-        write = self.write.function() if isinstance(self.write, Writer) else self.write
-        return inspect.getdoc(write) or self.summary
+        return inspect.getdoc(self.writer) or self.summary
 
 
 FORMATS: Registry[Format] = Registry("format")  # every format by name
@@ -156,7 +152,7 @@ def write(
             require_no_run(target)
         else:
             OutputFolder(target.parent, owner, remedy=remedy, overwrite=overwrite).claim(target.name)
-        found[made.name] = made.write(trained, target, shots, **own)
+        found[made.name] = made.writer(trained, target, shots, **own)
     return found
 
 
@@ -180,7 +176,7 @@ def _write_folder(
     try:
         with tempfile.TemporaryDirectory(prefix=".refgs_", dir=output.path) as name:
             stage = Path(name)
-            listed = [path.relative_to(stage) for path in made.write(trained, stage, shots, **options)]
+            listed = [path.relative_to(stage) for path in made.writer(trained, stage, shots, **options)]
             files = [path.relative_to(stage) for path in stage.rglob("*") if path.is_file()]
             output.claim(*(path.as_posix() for path in files))
             for path in files:

@@ -16,12 +16,13 @@ preconditioner, whose solution is the first step, is the least-squares problem o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import evenly_spread
@@ -36,19 +37,15 @@ from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
-THIN = 0.01
-"""Third standard deviation of a surfel relative to its shorter one: below every filter. Thicker ones widen
-outlines: alpha of a ring at 200² is 21.1 dB from the surfels' with 0.1, 21.5 with 0.01 and with 0.001."""
+THIN = 0.01  # third standard deviation of a surfel relative to its shorter one: thicker ones widen outlines
 INSET = 0.8
-"""Pixels of the training cameras by which surfels move inwards: of the same ring alpha is 24.0, 34.3, 34.9
-and 30.2 dB from the surfels' with 0, 0.6, 0.8 and 1, of a chair with the last three 30.4, 33.4 and 34.4."""
+"""Pixels of the training cameras by which surfels move inwards: alpha of a ring is then 34.9 dB from that of
+the surfels, without 24.0 dB."""
 SEEN = 0.5  # blended weight, in pixels over these views, above which a surfel counts as seen
 VIEWS = 64  # maximum number of renders that colours are fitted to
 PIXELS = 400**2  # maximum number of pixels per render: colours need no more, and time grows with it
 STEPS = 3  # conjugate-gradient steps after the first; two improve a chair by 2.8 dB
-DAMPING = 0.1
-"""λ, over the 1/4π that Y² is on average. A smooth ball fitted to 20 views is, inside its outline in other
-views, 33.7 dB from the surfels without the factor l², 36.8 with it; a smooth metal ball 31.2 and 33.1."""
+DAMPING = 0.1  # λ, over the 1/4π that Y² is on average; the factor l² gains 2 to 3 dB in other views
 
 
 @remember_last
@@ -93,8 +90,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
 def _limited(camera: Camera) -> Camera:
     """Return a camera of at most about PIXELS."""
     factor = (camera.width * camera.height / PIXELS) ** 0.5
-    size = max(round(camera.width / factor), 1), max(round(camera.height / factor), 1)
-    return camera if factor <= 1 else camera.resized(size)
+    return camera if factor <= 1 else camera.resized(round(max(camera.width, camera.height) / factor))
 
 
 def _is_flat(table: Surfels) -> bool:
@@ -173,7 +169,14 @@ class _ColourFit:
         Gaussians that no view sees get the coefficients of the nearest one that is seen.
         """
         right, inverse, weight = self._preconditioner()
-        found, seen = self._conjugate_gradients(right, inverse), weight > 0
+        shape = right.shape
+
+        def operator(function: Callable[[np.ndarray], np.ndarray]) -> LinearOperator:
+            return LinearOperator((right.size,) * 2, lambda x: function(x.reshape(shape)).ravel())
+
+        matrix, first = operator(self._normal_equations), operator(lambda x: inverse @ x)
+        found = cg(matrix, right.ravel(), rtol=0, maxiter=STEPS + 1, M=first)[0].reshape(shape)
+        seen = weight > 0
         if seen.any() and not seen.all():
             position = self.position.numpy().T
             found[~seen] = found[seen][cKDTree(position[seen]).query(position[~seen])[1]]
@@ -201,19 +204,6 @@ class _ColourFit:
         # Gaussians that no view sees: any matrix that can be inverted.
         own[:, diagonal, diagonal] += self.ridge + np.maximum(1e-6 * weight, 1e-6)[:, None]
         return right, np.linalg.inv(own), weight
-
-    def _conjugate_gradients(self, right: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-        """Take STEPS preconditioned steps per colour. [Hestenes and Stiefel 1952]"""
-        residual, found, direction = right, np.zeros_like(right), inverse @ right
-        product = np.sum(residual * direction, axis=(0, 1))
-        for _ in range(STEPS + 1):
-            image = self._normal_equations(direction)
-            length = product / np.maximum(np.sum(direction * image, axis=(0, 1)), 1e-30)
-            found, residual = found + length * direction, residual - length * image
-            moved, before = inverse @ residual, product
-            product = np.sum(residual * moved, axis=(0, 1))
-            direction = moved + product / np.maximum(before, 1e-30) * direction
-        return found
 
     def _normal_equations(self, coefficients: np.ndarray) -> np.ndarray:
         """Apply the matrix of the normal equations to coefficients (N, terms, 3)."""

@@ -296,5 +296,5 @@ def import_splats(
         try:
             trained = editing.edit(trained, box=box, keep=True).scene
         except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+            raise error.at(path) from None
     return Reconstruction(trained, Provenance(method_of(trained, Path(path).stem)))

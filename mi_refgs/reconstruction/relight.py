@@ -77,7 +77,8 @@ def relight(
     folder that cannot be written or contains a run, images of another light, or foreign files of these names.
     """
     if turntable < 0:
-        raise InputError(f"--turntable: {turntable} is out of range; give a number of views from 1")
+        remedy = "give a number of views from 1"
+        raise InputError(f"{turntable} is out of range", "--turntable", remedy=remedy)
 
     # The views, and the ground truth under this light.
     fitted = load(run.path)
@@ -90,7 +91,7 @@ def relight(
     try:
         relit = fitted.relight(light)
     except InputError as error:
-        raise InputError(f"{run.path}: {error}") from error
+        raise error.at(run.path) from None
 
     # The folder.
     name = light.path.stem if true_views is None else light.path.parent.name
@@ -144,7 +145,7 @@ def _prepare(output: OutputFolder, kind: str, names: Sequence[str]) -> None:
     out = output.path
     if (out / "config.toml").exists() or any(out.glob("transforms*.json")):
         what = "contains a run or a data set, whose files would be replaced"
-        raise InputError(f"{out}: output: {what}; choose another -o")
+        raise InputError(what, out, "output", "choose another -o")
     names = [*names, *(str(Path(name).with_suffix(".exr")) for name in names if name.startswith(kind))]
     output.require_free([*names, *ARTEFACTS])
     output.remove(path.relative_to(out).as_posix() for path in output.owned(f"{kind}_*.*"))
@@ -159,7 +160,8 @@ def _true_views(method: Method, folder: Path, views: Dataset) -> Dataset:
     if len(found.views) != len(views.views) or any(
         np.abs(a.to_world - b.to_world).max() > 1e-6 for a, b in zip(found.views, views.views, strict=True)
     ):
-        raise InputError(f"{folder}: transforms_test.json: not the cameras of {views.path}; make it again")
+        what = f"not the cameras of {views.path}"
+        raise InputError(what, folder / "transforms_test.json", remedy="make it again")
     return found
 
 

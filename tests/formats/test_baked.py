@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 from mi_refgs.evaluation.images import image_array
-from mi_refgs.formats import Shot, gltf, write
+from mi_refgs.formats import Shot, baking, gltf, write
 from mi_refgs.formats.baking import TexturedMesh, bake, simplified, texels, unwrap
 from mi_refgs.formats.mitsuba_scene import base_colour, diffuse_ratio
 from mi_refgs.formats.orbits import shots_around
@@ -79,8 +79,10 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     chosen = around[1], around[3], *around[4::4]
     shots = [replace(shot, camera=shot.camera.resized(SIZE)) for shot in chosen]
     folder = tmp_path_factory.mktemp("baked")
-    write(trained, ["mitsuba", "gltf-mesh"], folder, shots, {"faces": FACES, "texture": TEXTURE})
-    return Exported(trained, shots, folder, bake(trained, shots, FACES, TEXTURE))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baking, "VIEW_SIZE", 256)
+        write(trained, ["mitsuba", "gltf-mesh"], folder, shots, {"faces": FACES, "texture": TEXTURE})
+        return Exported(trained, shots, folder, bake(trained, tuple(shots), FACES, TEXTURE))
 
 
 def ball_of(points: np.ndarray) -> np.ndarray:
@@ -152,13 +154,14 @@ def test_vertices_and_normals_match_the_balls(exported: Exported) -> None:
     assert ((crossed * made.normals[made.faces[:, 0]]).sum(axis=1) > 0.8).all()
 
 
-def test_mesh_below_the_surface_moves_outwards(exported: Exported) -> None:
+def test_mesh_below_the_surface_moves_outwards(exported: Exported, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mesh of the balls that is 1.5 voxels too small grows to their outlines."""
     trained = exported.trained
     assert trained.mesh is not None
     ball = ball_of(trained.mesh.vertices)
     inward = (trained.mesh.vertices - MIDDLES[ball]) * (0.015 / RADII[ball])[:, None]
     small = replace(trained.mesh, vertices=(trained.mesh.vertices - inward).astype(np.float32))
+    monkeypatch.setattr(baking, "VIEW_SIZE", 256)
     vertices = bake(replace(trained, mesh=small), exported.shots, FACES, 64).vertices
     radius = np.linalg.norm(vertices - MIDDLES[ball_of(vertices)], axis=1)
     assert np.abs(np.median(radius / RADII[ball_of(vertices)]) - 1) < 0.012
@@ -233,7 +236,7 @@ def test_plain_mitsuba_reads_texture_encodings(exported: Exported) -> None:
     assert text.count('name="raw" value="true"') == 2 and text.count('name="raw" value="false"') == 1
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.5, 0.9])
+@pytest.mark.parametrize("roughness", [0.2, 0.9])
 def test_principled_albedo_equals_ours(roughness: float) -> None:
     """Mean albedo over all view directions: sampled weights against the split-sum table."""
     known, share = diffuse_ratio()
