@@ -173,7 +173,8 @@ def _seen(mesh: Mesh, occluder: Occluder, views: Sequence[View]) -> tuple[np.nda
 def sample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample points (count, 3) evenly over the area of a mesh, and return the triangle (count,) of each."""
     made = trimesh.Trimesh(mesh.vertices.astype(np.float64), mesh.faces, process=False)
-    return trimesh.sample.sample_surface(made, count, seed=0)[:2]
+    points, triangle = trimesh.sample.sample_surface(made, count, seed=0)
+    return np.array(points), triangle
 
 
 def distance_to(mesh: Mesh, points: np.ndarray) -> np.ndarray:

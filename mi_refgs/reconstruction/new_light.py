@@ -124,7 +124,7 @@ def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
         recorded = lights.get(folder.name) if folder != data else None  # `data` may have a light's name
         own = map_.read_bytes() == content
         if own and not light.world:
-            raise InputError(f"{light.path}: --envmap: this map is in world directions; add --world")
+            raise InputError("this map is in world directions", light.path, "--envmap", "add --world")
         if (own if light.world else recorded == digest) and not light.rotate % 360:
             return folder, NewLight(map_, True, 0.0, light.exposure)
     return None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,15 +28,11 @@ from mi_refgs.splat import Camera
 
 DATA = "data"  # folder of the rendered views, in the run folder
 FILES = (TRANSFORMS, "train/*.png", "test/*.png")
-PURPOSE = "relighting"
-"""Purpose of the method that is fitted by default: `auto` keeps colours alone, since the images of a file are
-exactly such colours, and cannot be relit."""
+PURPOSE = "relighting"  # of the default method: `auto` would keep colours alone, which are those of the file
 VIEWS = {"train": 100, "test": 12}
 ELEVATION = (-90.0, 90.0)  # degrees: files of other programs have any side up
 SMALL = 64  # pixels of a side of the views by which an object is told from a scene around it
-OPAQUE_BORDER = 0.3
-"""Mean alpha at the border of the views above which a file is a scene: views around *chair* and `mirror_ring`
-have 0.00, around *tabletop*, a room, 0.48."""
+OPAQUE_BORDER = 0.3  # mean alpha at the border of the views above which a file is a scene: a room has 0.48
 
 
 def import_relightable(
@@ -70,8 +64,12 @@ def import_relightable(
         method = methods.for_purpose(PURPOSE)
     wanted = runner.load_method(None if method is None else str(method), preset)
     made = import_splats(path, linear=linear, box=box)
-    given = None if cameras is None else _given(cameras)
-    views = OutputFolder(run.path / DATA, _owner(path, linear, box, given), FILES)
+    given = [
+        Shot(f"{split}/r_{i:03d}", split, camera)
+        for split in VIEWS
+        for i, camera in enumerate(held_out(cameras or (), split))
+    ]
+    views = OutputFolder(run.path / DATA, f"import of {path.resolve()}", FILES)
     if not (resume and run.exists()):
         run.require_none()
         pixels = PRESETS.get(wanted.preset, PRESETS[DEFAULT_PRESET]).pixels
@@ -80,29 +78,8 @@ def import_relightable(
         with run.alone():
             _write_views(made, shots, views, progress is not False)
     elif not views.owned(TRANSFORMS):
-        raise InputError(
-            f"{path}: --resume: {views.path} has no views of this file with these --linear, --box and "
-            "--camera; choose another -o"
-        )
+        raise InputError(f"{views.path} has no views of this file", path, "--resume", "choose another -o")
     return fit(views.path, method, preset=preset, output=output, resume=resume, progress=progress)
-
-
-def _given(cameras: Sequence[Camera]) -> list[Shot]:
-    """Return views of given cameras, of which every eighth is a test view."""
-    return [
-        Shot(f"{split}/r_{i:03d}", split, camera)
-        for split in VIEWS
-        for i, camera in enumerate(held_out(cameras, split))
-    ]
-
-
-def _owner(path: Path, linear: bool, box: Sequence[float] | None, given: Sequence[Shot] | None) -> str:
-    """Return the owner of the views: the file, and what decides which views of it are written."""
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256")
-    corners = None if box is None else [*map(float, box)]
-    digest.update(json.dumps([linear, corners, given and transforms(given)]).encode())
-    return f"import {digest.hexdigest()[:16]}"
 
 
 def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> None:
@@ -110,13 +87,11 @@ def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> 
     cameras = [shot.camera for shot in shots if shot.split == "test"]
     seen = [made.render(camera, size=SMALL)[..., 3] for camera in cameras]
     if max(alpha.max() for alpha in seen) < OPAQUE_BORDER:
-        raise InputError(f"{path}: opacity: views of the surfels show nothing; export the file again")
+        raise InputError("views of the surfels show nothing", path, "opacity", "export the file again")
     border = [np.concatenate([x[0], x[-1], x[:, 0], x[:, -1]]).mean() for x in seen]
     if np.mean(border) > OPAQUE_BORDER:
-        raise InputError(
-            f"{path}: surfels: views are opaque up to the border, so this is a scene, not a free "
-            "object; crop the object with --box"
-        )
+        what = "views are opaque up to the border, so this is a scene, not a free object"
+        raise InputError(what, path, "surfels", "crop the object with --box")
 
 
 def _write_views(made: Reconstruction, shots: Sequence[Shot], output: OutputFolder, bar: bool) -> None:

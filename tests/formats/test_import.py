@@ -18,12 +18,10 @@ from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats.cameras import read_cameras
 from mi_refgs.formats.gaussian_ply import read_splats
 from mi_refgs.io.exr import read_exr
-from mi_refgs.io.images import read_png
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import PinholeCamera
 from mi_refgs.reference.models import harmonics
 from mi_refgs.render.display import displayed
-from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera
@@ -109,27 +107,6 @@ def test_splat_file_matches_float64_reference(name: str, tmp_path: Path, rng: np
     assert GAUSSIAN_LOW_PASS == 0.3  # theirs
 
 
-def test_import_command_makes_a_run_that_renders_the_same(
-    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Rendered from scene.xml and by TrainedScene.read; exported."""
-    run = tmp_path / "run"
-    assert main(["import", str(theirs), "-o", str(run), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["surfels"] == COUNT and report["cameras"] == 4
-    assert main(["render", str(run), "-o", str(tmp_path / "out.png")]) == 0
-    camera = mi_refgs.load(run).camera(0)
-    frame = TrainedScene.read(run).renderer()(camera)
-    size = camera.height, camera.width
-    encoded = image_array(displayed(frame, np.zeros(3), False), *size)
-    picture = read_png(tmp_path / "out.png")
-    assert picture.shape == (*size, 4) and encoded.max() > 0.5
-    goal = np.minimum(encoded, image_array(frame.alpha, *size)[..., None])  # 8 bits end at white
-    assert np.abs(picture[..., :3] * picture[..., 3:] - goal).max() < 3 / 255
-    assert main(["export", str(run)]) == 0
-    refused(["import", theirs, "-o", run], "a run already")
-
-
 def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert main(["import", str(theirs), "-o", str(run)]) == 0
@@ -137,21 +114,21 @@ def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Pat
     refused(command, f"{run}: albedo, metallic, roughness: the run has none; fit one")
 
 
-@pytest.mark.parametrize("linear", [False, True])
-def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path, linear: bool) -> None:
+def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path) -> None:
     """In memory, saved, and by the command: the same image bit for bit; linear colours render differently."""
-    made = mi_refgs.import_splats(str(theirs), linear=linear)
-    shading = Shading("surfel", "radiance") if linear else Shading("pixel", "displayed")
-    assert made.trained.shading == shading and made.folder is None
+    made = mi_refgs.import_splats(str(theirs))
+    assert made.trained.shading == Shading("pixel", "displayed") and made.folder is None
     assert made.method.name == "theirs" and len(made.cameras()) == 4
     picture = made.render(1, size=32)
     assert picture[..., :3].max() > 0.1
     np.testing.assert_array_equal(made.save(tmp_path / "saved").render(1, size=32), picture)
     run = tmp_path / "run"
-    assert main(["import", str(theirs), "-o", str(run), *(["--linear"] if linear else [])]) == 0
+    assert main(["import", str(theirs), "-o", str(run)]) == 0
     np.testing.assert_array_equal(mi_refgs.load(run).render(1, size=32), picture)
-    other = mi_refgs.import_splats(theirs, linear=not linear).render(1, size=32)
-    assert np.abs(other - picture).max() > 0.05
+    refused(["import", theirs, "-o", run], "a run already")
+    other = mi_refgs.import_splats(theirs, linear=True)
+    assert other.trained.shading == Shading("surfel", "radiance")
+    assert np.abs(other.render(1, size=32) - picture).max() > 0.05
     refused(lambda: mi_refgs.import_splats(tmp_path / "no.ply"), "cannot be read")
 
 
@@ -200,11 +177,8 @@ def broken(kind: str, whole: bytes) -> bytes:
         + bytes(8),
         "mesh": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         b"property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n",
-        "garbage": header.replace(b"binary_little_endian", b"ascii") + end + b"what is this? " * 2000,
         "empty": header.replace(b"vertex 40", b"vertex 0") + end,
         "degree": whole.replace(b"float f_rest_44\n", b"float nothing\n"),
-        "truncated": whole[:-7],
-        "nothing": b"",
         "text": b"hello\n",
     }[kind]
 
@@ -217,11 +191,8 @@ def broken(kind: str, whole: bytes) -> bytes:
         ("materials", "metallic: materials of a run"),
         ("compressed", "packed_position: a compressed PLY"),
         ("mesh", "vertex: a mesh, no Gaussians"),
-        ("garbage", ""),
         ("empty", "there are none"),
         ("degree", "f_rest_*: 44 properties"),
-        ("truncated", ""),
-        ("nothing", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
         ("text", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
     ],
 )
@@ -250,7 +221,6 @@ def test_transforms_file_defines_the_cameras_of_an_import(theirs: Path, tmp_path
     assert (first.width, first.height, second.width) == (64, 48, 32)
     np.testing.assert_allclose(first.pose(), pinhole().to_world, atol=1e-6)
     np.testing.assert_allclose([-first.fx[0], -second.fx[0]], [32 / np.tan(0.4), 40], rtol=1e-4)
-    assert main(["render", str(run), "-o", str(tmp_path / "a.exr"), "--sensor", "1"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -289,7 +259,7 @@ def test_render_uses_cameras_of_a_file(theirs: Path, tmp_path: Path) -> None:
     refused([*command, "2"], f"{file}: --sensor: 2: the file has 2 frames; give 0 to 1")
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
+@pytest.mark.parametrize("scale", [1e-4, 1e5])
 def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path: Path) -> None:
     """A black ball in white light, whose camera has no near plane: it is not cut off.
 
