@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from mi_refgs.editing.options import Assignments, Change, Rotate
-from mi_refgs.editing.placement import MAJORITY, TINY, Owners, Placement, joined_mesh
-from mi_refgs.editing.selection import finite
+from mi_refgs.editing.options import Assignments, Change
+from mi_refgs.editing.placement import MAJORITY, Owners
 from mi_refgs.editing.values import COLOUR, SurfelValues, activated
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import Mesh
@@ -20,9 +18,6 @@ from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
 ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(.*)", re.ASCII)
-AXES = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
-SCALES = (1e-6, 1e6)
-"""Range of --scale: float32 represents no scene beyond."""
 COLOUR_FLOOR = 1e-3
 """Colour below which a surfel's SH of higher degrees are set to 0 by a new colour instead of scaled."""
 
@@ -61,48 +56,6 @@ def assignments(given: Assignments) -> tuple[Assignment, ...]:
     return tuple(Assignment.parse(text) for text in ([given] if isinstance(given, str) else given))
 
 
-def placement_of(
-    change: Change,
-    raw: Mapping[str, np.ndarray],  # raw attributes of the selected surfels
-) -> Placement:
-    """Return the transform of selected surfels; raises InputError for bad numbers.
-
-    The pivot is the mean of the positions, weighted by opacity, before the change. The translation includes
-    that of a duplicate.
-    """
-    scale = float(finite("--scale", [change.scale], 1)[0])
-    if not SCALES[0] <= scale <= SCALES[1]:
-        remedy = f"give {SCALES[0]:g} to {SCALES[1]:g}"
-        raise InputError(f"{scale:g} is out of range", "--scale", remedy=remedy)
-    options = (("--move", change.move), ("--duplicate", change.duplicate))
-    shift = sum((finite(name, x, 3) for name, x in options if x is not None), np.zeros(3))
-    # Not the median, which does not rotate with the surfels: a rotation and its inverse would shift them.
-    weight = sigmoid(raw["opacity"][:, 0]) + TINY
-    pivot = np.average(raw["position"].astype(np.float64), axis=0, weights=weight)
-    return Placement(pivot, shift, _rotation(change.rotate), scale)
-
-
-def _rotation(given: Rotate | None) -> Rotation:
-    """Return a rotation by an axis and an angle; raises InputError for bad ones."""
-    if given is None:
-        return Rotation.identity()
-    try:
-        name, angle = given
-        degrees = float(angle)
-        numbers = AXES.get(name, name).split(",") if isinstance(name, str) else name
-        axis = finite("--rotate", [float(number) for number in numbers], 3)
-    except (ValueError, TypeError) as error:
-        remedy = "give an axis and degrees, like z 90 or 0,0,1 90"
-        raise InputError("no rotation", "--rotate", abbreviated(given), remedy) from error
-    length = np.linalg.norm(axis)
-    if not (np.isfinite(degrees) and length > 0):
-        what = "an axis without length, or an infinite angle"
-        raise InputError(what, "--rotate", remedy="give them like z 90")
-    if degrees % 360 == 0:
-        return Rotation.identity()
-    return Rotation.from_rotvec(np.radians(degrees) * axis / length)
-
-
 def apply(
     scene: TrainedScene,
     chosen: np.ndarray,  # (N,) bool
@@ -110,28 +63,21 @@ def apply(
 ) -> TrainedScene:
     """Return the scene with the chosen surfels and their triangles changed; `materials` is the caller's.
 
-    All other surfels keep their values bit for bit, and the order stays; a duplicate comes after all. Raises
-    InputError for an empty selection, for values that cannot be set, for options that contradict each other,
-    and if no surfel would be left.
+    All other surfels keep their values bit for bit, and the order stays. Raises InputError for values that
+    cannot be set, for options that contradict each other, and if no surfel would be left.
     """
-    if change.cut and (change.set or change.keep or change.moves):
+    if change.cut and (change.set or change.keep):
         raise InputError("what is removed cannot be changed, too", "--cut", remedy="leave the rest out")
-    if change.keep and change.duplicate is not None:
-        raise InputError("not possible with --duplicate", "--keep", remedy="do one after the other")
     if change.cut and chosen.all():
         raise InputError("no surfel would be left", "--cut", remedy="choose fewer")
     values = SurfelValues(scene)
     raw = values.raw
     own = {name: table[chosen] for name, table in raw.items()}
-    placement = placement_of(change, own)
     for assignment in assignments(change.set):
         _assign(values, own, assignment)
-    mesh = _mesh(scene, chosen, own["opacity"], change, placement)
-    placement.surfels(own)
+    mesh = _mesh(scene, chosen, own["opacity"], change)
     for name, table in raw.items():
-        if change.duplicate is not None:
-            raw[name] = np.concatenate([table, own[name]])
-        elif change.cut:
+        if change.cut:
             raw[name] = table[~chosen]
         elif change.keep:
             raw[name] = own[name]
@@ -145,27 +91,20 @@ def _mesh(
     chosen: np.ndarray,  # (N,) bool
     opacity: np.ndarray,  # (chosen, 1) raw, after the change
     change: Change,
-    placement: Placement,
 ) -> Mesh | None:
-    """Return the mesh after a change."""
+    """Return the mesh after a change: triangles whose surfels are removed or have become transparent go."""
     mesh, before = scene.mesh, scene.surfels.to_numpy()["opacity"]
-    stays = placement.is_identity and np.array_equal(before[chosen], opacity)
-    if mesh is None or not len(mesh.faces):
-        return mesh
-    if stays and not (change.cut or change.keep or change.duplicate is not None):
+    stays = np.array_equal(before[chosen], opacity) and not (change.cut or change.keep)
+    if mesh is None or not len(mesh.faces) or stays:
         return mesh
     owners = Owners(scene)
-    theirs = owners.of(chosen)
+    theirs, others = owners.of(chosen), ~owners.of(np.ones(len(chosen), bool))
     if change.cut:
         return mesh.part(~theirs)
-    # Triangles whose surfels have become transparent go.
     after = sigmoid(before[:, 0])
     after[chosen] = sigmoid(opacity[:, 0])
-    moved = placement.mesh(mesh.part(theirs & (owners.share(after) >= MAJORITY)))
-    if change.duplicate is not None:
-        return joined_mesh(mesh, moved)
-    left = ~owners.of(np.ones(len(chosen), bool)) if change.keep else ~theirs
-    return joined_mesh(mesh.part(left), moved)
+    solid = theirs & (owners.share(after) >= MAJORITY)
+    return mesh.part(solid | (others if change.keep else ~theirs))
 
 
 def _assign(

@@ -50,7 +50,7 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
     given["set"] = tuple(assignment.text for assignment in assignments(given.get("set", ())))
     change = Change(**given)
     if change.is_empty:
-        raise InputError("nothing to do", "edit", remedy="give --set, --cut, --move or another change")
+        raise InputError("nothing to do", "edit", remedy="give --set, --cut or another change")
     if change.materials:
         scene = replace(relightable(scene), surroundings=scene.surroundings, near=scene.near)
     chosen = select(scene, selection)
@@ -72,7 +72,7 @@ def _recorded(*parts: Selection | Change) -> dict[str, Any]:
 
 
 def notes_of(scene: TrainedScene, change: Change) -> list[str]:
-    """Return what of a fit does not follow a change: values that depend on its light and its place."""
+    """Return what of a fit does not follow a change: values that depend on its light."""
     shading, surfels = scene.shading, scene.surfels
     names = [assignment.name.partition(".")[0] for assignment in assignments(change.set)]
     indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
@@ -92,9 +92,7 @@ def notes_of(scene: TrainedScene, change: Change) -> list[str]:
             "the diffuse colour was fitted to the light as radiance_sh and stays so: albedo and metallic "
             f"change what is reflected, colour= changes it{convert}"
         )
-    if change.moves and "radiance_sh" in read:
-        notes.append(f"the colour radiance_sh keeps the light of the place where it was fitted{convert}")
-    if indirect and (change.moves or change.cut or change.keep or {*names} - {"roughness"}):
+    if indirect and (change.cut or change.keep or {*names} - {"roughness"}):
         trace = "; --materials traces rays instead" if has_materials else ""
         notes.append(f"interreflection (indirect_sh) stays as it was fitted{trace}")
     return notes

@@ -11,17 +11,12 @@ from tyro.conf import UseAppendAction, arg
 
 Assignments = Mapping[str, float | Sequence[float]] | Iterable[str]
 """{"roughness": 0.3, "albedo": (0.9, 0.6, 0.2)}, or texts such as "roughness*=0.5"."""
-Rotate = tuple[str | Sequence[float], float | str] | Sequence[str]
-"""An axis, "x", "y", "z" or three numbers, and degrees."""
 
 optional = partial(arg, help_behavior_hint="")
 Flag = Annotated[bool, optional()]
 # What commands parse.
-Three: Any = tuple[float, float, float] | None
 Four: Any = tuple[float, float, float, float] | None
 Six: Any = tuple[float, float, float, float, float, float] | None
-AxisAngle: Any = tuple[str, str] | None
-Vector = Annotated[Sequence[float] | None, optional(constructor=Three, metavar="X Y Z")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,14 +47,6 @@ class Change:
     ] = ()
     """such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5, one after the other; colour=R,G,B for methods
     with fitted colours"""
-    scale: Annotated[float, arg(metavar="F")] = 1.0
-    """scale about the middle of the selection, the mean of the positions weighted by opacity"""
-    rotate: Annotated[Rotate | None, optional(constructor=AxisAngle, metavar="AXIS DEG")] = None
-    """rotate about the middle of the selection and the axis x, y, z or X,Y,Z, counter-clockwise"""
-    move: Vector = None
-    """translate, scene units"""
-    duplicate: Vector = None
-    """change a copy that is translated by this; the original stays"""
     cut: Flag = False
     """remove the selection"""
     keep: Flag = False
@@ -68,19 +55,14 @@ class Change:
     @property
     def is_empty(self) -> bool:
         """Whether it changes nothing."""
-        return not (self.materials or self.set or self.cut or self.keep or self.moves)
-
-    @property
-    def moves(self) -> bool:
-        """Whether it places surfels elsewhere, or larger."""
-        return self.scale != 1 or any(x is not None for x in (self.move, self.rotate, self.duplicate))
+        return not (self.materials or self.set or self.cut or self.keep)
 
 
 class EditOptions(TypedDict, total=False):
     """Keywords of `Reconstruction.edit`, described by `Selection` and `Change` of `mi_refgs.editing.options`.
 
     The surfels that meet every given condition are selected, without a condition all of them. Changes are
-    applied in the order of `Change`. Lengths are in scene units.
+    applied in the order of `Change`.
     """
 
     where: str | None
@@ -89,9 +71,5 @@ class EditOptions(TypedDict, total=False):
     invert: bool
     materials: bool
     set: Assignments
-    scale: float
-    rotate: Rotate | None
-    move: Sequence[float] | None  # (3,)
-    duplicate: Sequence[float] | None  # (3,)
     cut: bool
     keep: bool

@@ -65,11 +65,6 @@ class Provenance:
         """Whether the data set is known and exists."""
         return self.data is not None and self.data.is_dir()
 
-    @property
-    def is_moved(self) -> bool:
-        """Whether edits placed something elsewhere, so that the object may be outside of `region`."""
-        return any({"move", "duplicate"} & edit.keys() for edit in self.edits)
-
     def views(self, split: str, decode: bool = True) -> Dataset:
         """Read a split of the data set; raises InputError for one that is unknown, missing or unreadable."""
         if self.data is None or not self.has_data:
@@ -118,4 +113,4 @@ class Provenance:
         if trained.surroundings is None:
             return turntable_cameras(trained, cameras, count)
         surfels = replace(trained, mesh=None)  # the mesh contains the background, too
-        return turntable_cameras(surfels, cameras, count, None if self.is_moved else self.region)
+        return turntable_cameras(surfels, cameras, count, self.region)

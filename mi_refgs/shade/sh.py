@@ -12,14 +12,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
-
-ROTATION_DIRECTIONS = 64
-"""Directions, evenly spread, at which a rotated function is equated with itself: four times the coefficients
-of degree 3."""
 
 
 def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
@@ -57,25 +52,6 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
             -k33 * x * (xx - 3 * yy),
         ]
     return basis
-
-
-def sh_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
-    """The matrix (K, K) float64 that takes coefficients of f(d) to those of f(R⁻¹ d), R a rotation (3, 3).
-
-    Both sides are polynomials that the basis spans, so that the solution at more directions than coefficients
-    is exact. Raises InputError unless 0 ≤ degree ≤ 3.
-    """
-    index = np.arange(ROTATION_DIRECTIONS) + 0.5
-    z, angle = 1 - 2 * index / ROTATION_DIRECTIONS, index * math.pi * (3 - math.sqrt(5))
-    ring = np.sqrt(1 - z**2)
-    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z])
-
-    def basis(d: np.ndarray) -> np.ndarray:
-        values = [np.array(value, np.float64) for value in sh_basis(mi.Vector3d(d), degree)]
-        return np.stack([np.broadcast_to(value, d.shape[1]) for value in values], axis=1)
-
-    solution: np.ndarray = np.linalg.lstsq(basis(directions), basis(rotation.T @ directions), rcond=None)[0]
-    return solution
 
 
 def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:

@@ -54,7 +54,6 @@ class Attribute:
     initial: float = 0.0  # activated; the points decide for geometry and the first colour
     jitter: float = 0.0  # half the width of uniform noise added to it, activated
     rest_rate: float = 1.0  # factor of the rate for spherical harmonics of degree 1 and above
-    direction: bool = False  # a vector in world directions, which turns with its primitive
     geometry: bool = False  # position or size of a primitive; present if its primitive has it
     aov: str = ""  # suffixes of its AOV as Mitsuba names them: "RGB", "Y"; empty without an AOV
 
@@ -158,6 +157,6 @@ for _declared in (
     Attribute("roughness", (1,), "sigmoid", 5e-3, ("roughness",), 0.1, aov="Y"),
     Attribute("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05),
     Attribute("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, aov="RGB"),
-    Attribute("normal_offset", (3,), "identity", 1e-3, _numbered("offset"), direction=True),
+    Attribute("normal_offset", (3,), "identity", 1e-3, _numbered("offset")),
 ):
     register(_declared)

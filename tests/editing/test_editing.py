@@ -1,4 +1,4 @@
-"""Edits: exact surfels, images of moved scenes, meshes, run folders."""
+"""Edits: exact surfels, meshes, run folders."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from mi_refgs.cli import main
-from mi_refgs.editing.change import apply, placement_of
 from mi_refgs.editing.edit import edit
-from mi_refgs.editing.options import Change, Selection
-from mi_refgs.editing.placement import rotated_sh
+from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.editing.values import SurfelValues
 from mi_refgs.reconstruction.reconstruction import load
@@ -25,7 +22,6 @@ from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.sh import eval_sh
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import SH_DC, logit
@@ -162,19 +158,7 @@ def test_a_new_colour_scales_all_sh_degrees(scene: TrainedScene) -> None:
     np.testing.assert_array_equal(one[:, [0, 2, 3, 5]], before[:, [0, 2, 3, 5]])
 
 
-def test_arrays_and_lists_give_the_same_edit(scene: TrainedScene) -> None:
-    given: dict[str, Any] = {"box": [-2, -2, -2, 0, 2, 2], "nearest": [-1, 0, 0, 0.5]}
-    given |= {"move": [0.5, 0, 0], "duplicate": [0, 0, 1], "rotate": ([0.0, 0.0, 1.0], 90)}
-    lists = edit(scene, **given)
-    axis, degrees = given.pop("rotate")
-    given = {name: np.array(value) for name, value in given.items()} | {"rotate": (np.array(axis), degrees)}
-    arrays = edit(scene, **given)
-    assert lists.record == json.loads(json.dumps(arrays.record))
-    for name, table in lists.scene.surfels.to_numpy().items():
-        np.testing.assert_array_equal(arrays.scene.surfels.to_numpy()[name], table)
-
-
-@pytest.mark.parametrize("change", [{"materials": True}, {"set": {"roughness": 0.3}}, {"move": (0, 0, 0.1)}])
+@pytest.mark.parametrize("change", [{"materials": True}, {"set": {"roughness": 0.3}}])
 def test_the_background_stays(change: Any) -> None:
     """Pixels that show only the background are those of before."""
     scene = with_background(balls(), 0.3)
@@ -207,16 +191,12 @@ def test_the_background_stays(change: Any) -> None:
         ({"where": "x > __import__('os')", "cut": True}, "no comparison"),
         ({"where": "x > 100", "cut": True}, "none of the 6000 surfels is in it; choose a wider one"),
         ({"cut": True}, "--cut: no surfel would be left"),
-        ({"cut": True, "where": "x>0", "move": (1, 0, 0)}, "what is removed cannot be changed"),
-        ({"set": None, "scale": None}, "nothing to do"),
-        ({"scale": "big"}, "--scale: 1 finite numbers"),
-        ({"scale": 0.0}, "--scale: 0 is out of range"),
-        ({"move": (1, 2)}, "--move: 3 finite numbers are needed"),
-        ({"move": (1e30, 0, 0)}, "--move: 3 finite numbers are needed, none beyond 1e+09"),
-        ({"rotate": ("z",)}, "--rotate: ('z',): no rotation; give an axis and degrees"),
-        ({"rotate": ("w", 90)}, "no rotation"),
-        ({"rotate": ("0,0,0", 90)}, "--rotate: an axis without length"),
-        ({"rotate": ("z", "much")}, "no rotation"),
+        ({"cut": True, "where": "x>0", "set": ["roughness=1"]}, "what is removed cannot be changed"),
+        ({"set": None}, "nothing to do"),
+        (
+            {"box": (1e30, 0, 0, 1, 1, 1), "cut": True},
+            "--box: 6 finite numbers are needed, none beyond 1e+09",
+        ),
         ({"box": (0, 0, 0, 1, 1, float("inf")), "cut": True}, "--box: 6 finite numbers"),
         ({"nearest": (0, 0, 0, -1), "cut": True}, "--nearest: the distance -1 is negative"),
         ({"wehre": "x > 0", "set": ["roughness=1"]}, "edit: wehre: unknown option; use some of where, box"),
@@ -228,104 +208,7 @@ def test_bad_options_are_refused_in_one_sentence(
     assert "\n" not in refused(lambda: edit(scene, **given), message)
 
 
-# ---------------- transforms ----------------
-
-
-def test_sh_rotates_exactly(rng: np.random.Generator) -> None:
-    """The turned function at d is the old one at R⁻¹ d, of every degree."""
-    direction = rng.normal(size=(50, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    turn = Rotation.from_rotvec([0.7, -1.1, 2.2])
-    for degree in range(4):
-        raw = random_sh(1, degree, 5, 1.0)
-        turned = rotated_sh(raw, turn)
-
-        def at(coefficients: np.ndarray, d: np.ndarray) -> np.ndarray:
-            colours = [mi.Color3f(*map(float, row)) for row in coefficients.reshape(-1, 3)]
-            return np.array(eval_sh(colours, mi.Vector3f(d.T)), np.float64)
-
-        np.testing.assert_allclose(at(turned, direction), at(raw, turn.inv().apply(direction)), atol=2e-5)
-
-
-def moved_pose(scene: TrainedScene, change: Change) -> np.ndarray:
-    """FRONT, transformed as the scene is."""
-    place, pose = placement_of(change, scene.surfels.to_numpy()), FRONT.copy()
-    pose[:3, :3] = place.rotation.as_matrix() @ FRONT[:3, :3]
-    pose[:3, 3] = place.points(FRONT[None, :3, 3])[0]
-    return pose
-
-
-@pytest.mark.parametrize(
-    "placement",
-    [
-        {"move": (0.4, -0.2, 0.3)},
-        {"rotate": ("0.3,-1,0.5", 70), "move": (0.1, 0, 0)},
-        {"scale": 2.0},
-        {"rotate": ("z", 200), "scale": 0.5},
-    ],
-)
-@pytest.mark.parametrize("rays", [{}, TRACED_LIGHT], ids=["sh", "irradiance"])
-def test_a_moved_scene_equals_the_scene_with_moved_camera(
-    placement: dict[str, Any], rays: dict[str, Any]
-) -> None:
-    """Under constant light, with reflections, shadows and fitted SH."""
-    scene = balls(**rays)
-    change = Change(**placement)
-    moved = apply(scene, np.ones(2 * HALF, bool), change)
-    before, after = image(scene), image(moved, moved_pose(scene, change))
-    assert before[:, 3].max() > 0.99 and np.ptp(before[:, 0]) > 0.2
-    # Few pixels at outlines change sides by rounding; rays of a turned frame are other samples of the same.
-    limit = 0.02 if rays else 2e-3
-    assert np.mean(np.abs(after - before).max(axis=1) > limit) < 0.02
-    assert np.abs(after - before).mean() < 0.1 * limit
-
-
-def test_gaussians_rotate_and_scale_like_surfels() -> None:
-    raw = balls(reflectance="radiance", occlusion=False).surfels.to_numpy()
-    raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1] - 2], axis=1)
-    scene = replace(balls(reflectance="radiance", occlusion=False), surfels=Surfels.from_numpy(raw))
-    change = Change(rotate=("1,2,3", 130), scale=1.5, move=(0.5, 0, 0))
-    after = image(apply(scene, np.ones(2 * HALF, bool), change), moved_pose(scene, change))
-    np.testing.assert_allclose(after, image(scene), atol=2e-3)
-
-
-def test_normal_offset_and_zero_quaternion_rotate(scene: TrainedScene) -> None:
-    raw = scene.surfels.to_numpy()
-    raw["normal_offset"] = random_sh(2 * HALF, 0, 3)
-    raw["rotation"][0] = 0
-    whole = replace(scene, surfels=Surfels.from_numpy(raw))
-    turned = edit(whole, rotate=("x", 90)).scene.surfels.to_numpy()
-    x, y, z = raw["normal_offset"].T
-    np.testing.assert_allclose(turned["normal_offset"], np.stack([x, -z, y], axis=1), atol=1e-7)
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(turned["rotation"][0], (half, 0, 0, half), atol=1e-7)
-
-
-def test_a_transform_and_its_inverse_restore_the_scene(scene: TrainedScene) -> None:
-    there = edit(scene, where="z > 0.1", rotate=("1,2,3", 77), scale=2.0, move=(1, 0, 0)).scene
-    chosen = SurfelValues(scene)["z"] > 0.1
-    back = apply(there, chosen, Change(rotate=("1,2,3", -77), scale=0.5, move=(-1, 0, 0)))
-    for name, table in scene.surfels.to_numpy().items():
-        now = back.surfels.to_numpy()[name]
-        sign = np.sign(np.sum(now * table, axis=1, keepdims=True)) if name == "rotation" else 1
-        np.testing.assert_allclose(sign * now, table, atol=2e-5)
-
-
-def test_only_the_selected_ball_and_its_triangles_move(scene: TrainedScene) -> None:
-    moved = edit(scene, where=METAL_BALL, move=(0, 0, 3), scale=2.0).scene
-    before, after = scene.surfels.to_numpy(), moved.surfels.to_numpy()
-    chosen = before["position"][:, 0] < 0
-    for name in before:
-        np.testing.assert_array_equal(before[name][~chosen], after[name][~chosen])
-    middle = before["position"][chosen].astype(np.float64).mean(axis=0)
-    expected = 2 * (before["position"][chosen] - middle) + middle + (0, 0, 3)
-    np.testing.assert_allclose(after["position"][chosen], expected, atol=1e-5)
-    np.testing.assert_allclose(np.exp(after["scale"] - before["scale"])[chosen], 2, rtol=1e-5)
-    assert moved.mesh is not None and scene.mesh is not None
-    assert len(moved.mesh.faces) == len(scene.mesh.faces) and moved.mesh.voxel == 2 * scene.mesh.voxel
-    high = moved.mesh.vertices[:, 2] > 1
-    assert high.sum() == len(high) / 2 == (moved.mesh.vertices[:, 2] < 0.5).sum()
-    np.testing.assert_allclose(np.linalg.norm(moved.mesh.vertices[high] - (-0.5, 0, 3), axis=1), 1, atol=0.02)
+# ---------------- meshes ----------------
 
 
 def test_cut_removes_a_ball_its_shadow_and_its_reflection() -> None:
@@ -344,15 +227,10 @@ def test_cut_removes_a_ball_its_shadow_and_its_reflection() -> None:
 
 
 def test_the_background_keeps_its_triangles() -> None:
-    """Only the object's triangles are moved, cut and kept."""
+    """Only the object's triangles are cut and kept."""
     scene = with_background(balls())
     assert scene.mesh is not None
     of_wall = scene.mesh.vertices[scene.mesh.vertices[:, 0] > 0.05]
-    moved = edit(scene, move=(0, 0, 9)).scene
-    assert moved.surroundings is scene.surroundings and moved.mesh is not None
-    high = moved.mesh.vertices[:, 2] > 5
-    assert high.sum() == len(scene.mesh.vertices) / 2
-    np.testing.assert_array_equal(np.sort(moved.mesh.vertices[~high], axis=0), np.sort(of_wall, axis=0))
     for half in (edit(scene, where="z > 0", keep=True), edit(scene, where="z > 0", cut=True)):
         mesh = half.scene.mesh
         assert mesh is not None and len(mesh.faces) / len(scene.mesh.faces) == pytest.approx(0.75, abs=0.02)
@@ -366,19 +244,6 @@ def test_transparent_surfels_lose_their_triangles(scene: TrainedScene) -> None:
         assert mesh is not None and len(mesh.faces) == kept * len(scene.mesh.faces)
 
 
-def test_duplicate_changes_the_copy_only(scene: TrainedScene) -> None:
-    edited = edit(scene, where=METAL_BALL, duplicate=(0, 5, 0), set=["roughness=0.75"], rotate=("z", 90))
-    before, after = scene.surfels.to_numpy(), edited.scene.surfels.to_numpy()
-    assert edited.record["selected"] == HALF and edited.scene.surfels.count == 3 * HALF
-    for name in before:
-        np.testing.assert_array_equal(before[name], after[name][: 2 * HALF])
-    np.testing.assert_allclose(SurfelValues(edited.scene)["roughness"][2 * HALF :], 0.75, rtol=1e-6)
-    np.testing.assert_allclose(after["position"][2 * HALF :].mean(axis=0), (-0.5, 5, 0), atol=5e-3)
-    assert edited.scene.mesh is not None and scene.mesh is not None
-    assert len(edited.scene.mesh.faces) == 1.5 * len(scene.mesh.faces)
-    np.testing.assert_array_equal(edited.scene.mesh.faces[: len(scene.mesh.faces)], scene.mesh.faces)
-
-
 # ---------------- notes ----------------
 
 
@@ -386,8 +251,6 @@ def test_notes_name_what_stays_as_fitted(scene: TrainedScene) -> None:
     assert edit(scene, set=["roughness=0.1"]).notes == ()
     metal = edit(scene, set=["metallic=1"]).notes
     assert any("albedo and metallic change what is reflected" in note for note in metal)
-    moved = edit(scene, where=METAL_BALL, move=(1, 0, 0)).notes
-    assert any("keeps the light of the place" in note for note in moved)
     plain = edit(balls(reflectance="radiance", occlusion=False), set=["metallic=1"]).notes
     assert any("metallic: no image of this run depends" in note for note in plain)
     assert edit(balls(diffuse="irradiance", occlusion=False), set=["metallic=1"]).notes == ()
@@ -407,14 +270,16 @@ def test_an_edited_run_is_a_run(finished: Path, tmp_path: Path, capsys: pytest.C
     options = ["--set", "roughness=0.5", "--where", "x > 0", "--preview"]
     assert main(["edit", str(finished), "-o", str(new), *options]) == 0
     out = capsys.readouterr().out
-    assert main(["edit", str(new), "-o", str(newer), "--move", "0", "0", "0.125", "--json"]) == 0
+    assert main(["edit", str(new), "-o", str(newer), "--set", "metallic=0.25", "--json"]) == 0
     second = json.loads(capsys.readouterr().out)
     assert files(finished) == before
     assert not (new / "checkpoints").exists() and (new / "preview.png").stat().st_size > 1000
     record = json.loads((newer / "edit.json").read_text())["edits"]
     assert [edit["selected"] == edit["of"] for edit in record] == [False, True]
     assert record[0]["where"] == "x > 0" and record[0]["set"] == ["roughness=0.5"]
-    assert f"{record[0]['selected']} of {record[0]['of']} surfels" in out and second["move"] == [0, 0, 0.125]
+    assert f"{record[0]['selected']} of {record[0]['of']} surfels" in out and second["set"] == [
+        "metallic=0.25"
+    ]
     scenes = [TrainedScene.read(folder) for folder in (finished, new, newer)]
     raw = [scene.surfels.to_numpy() for scene in scenes]
     chosen = raw[0]["position"][:, 0] > 0
@@ -422,7 +287,7 @@ def test_an_edited_run_is_a_run(finished: Path, tmp_path: Path, capsys: pytest.C
     np.testing.assert_allclose(raw[1]["roughness"][chosen], logit(0.5), atol=1e-6)
     np.testing.assert_array_equal(raw[1]["roughness"][~chosen], raw[0]["roughness"][~chosen])
     np.testing.assert_array_equal(raw[2]["roughness"], raw[1]["roughness"])
-    np.testing.assert_allclose(raw[2]["position"], raw[0]["position"] + (0, 0, 0.125), atol=1e-6)
+    np.testing.assert_allclose(raw[2]["metallic"], logit(0.25), atol=1e-6)
     for command in (["eval", str(newer)], ["export", str(newer)]):
         assert main(command) == 0
     assert main(["render", str(newer), "-o", str(tmp_path / "out.png")]) == 0
@@ -435,7 +300,7 @@ def test_a_reconstruction_is_edited_like_a_run(finished: Path, tmp_path: Path) -
     corrected.write_json("exposure.json", exposure)
     corrected.write_json("cameras.json", cameras)
     whole = load(corrected.path, write=False)
-    both = whole.edit(where="x > 0", set={"albedo": (1, 0, 0)}, move=(0, 0, 1)).edit(where="x < 0", cut=True)
+    both = whole.edit(where="x > 0", set={"albedo": (1, 0, 0)}).edit(where="x < 0", cut=True)
     assert whole.provenance.edits == () and both.folder is None
     first, second = both.provenance.edits
     assert first["of"] == second["of"] == whole.trained.surfels.count
@@ -461,7 +326,6 @@ def test_an_edited_run_is_not_resumed(finished: Path, data: Path, tmp_path: Path
     [
         (["--set", "roughness=0.5", "--where", "x > 1e9"], "choose a wider one"),
         (["--cut", "--data", "none"], "--data: no such folder"),
-        (["--rotate", "-1,0", "-90"], "no rotation"),
     ],
 )
 def test_a_bad_command_writes_nothing(

@@ -212,7 +212,7 @@ def by_layers(case: Case) -> Maps:
     path, camera = case.scratch / "layers.exr", Camera.from_sensor(sensor(case.crop))
     shots = [Shot("view", "test", camera)]
     options = {"view": 0, "samples": case.samples, "object": case.alone}
-    FORMATS["exr"].write(case.made.trained, path, shots, **options)
+    FORMATS["exr"].writer(case.made.trained, path, shots, **options)
     layers = read_exr(path)
     found = {IMAGE: np.stack([layers[letter] for letter in "RGBA"], axis=-1)}
     if "background.R" in layers:
@@ -311,16 +311,16 @@ def exported(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]
 def edited(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
     """In memory, and by `refgs edit`."""
     run, out = run_of(made, scratch / "fitted"), scratch / "edited"
-    changes = ["--where", "x > 0.2", "--rotate", "z", "20", "--scale", "1.2"]
+    changes = ["--where", "x > 0.2", "--set", "opacity*=0.5"]
     assert main(["edit", str(run), "-o", str(out), *changes]) == 0
-    return made.edit(where="x > 0.2", rotate=("z", 20), scale=1.2), out
+    return made.edit(where="x > 0.2", set=["opacity*=0.5"]), out
 
 
 def through_a_ply(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
     """Display-encoded 3D Gaussians as `refgs export --to` writes them; linear ones as every run has them."""
     path, run, encoded = scratch / "splats.ply", scratch / "imported", made.trained.shading.model.encoded
     if encoded:
-        FORMATS["3dgs-ply"].write(made.trained, path, [], degree=1, object=False)
+        FORMATS["3dgs-ply"].writer(made.trained, path, [], degree=1, object=False)
     else:
         write_ply(path, made.trained.surfels)
     assert main(["import", str(path), "-o", str(run), *([] if encoded else ["--linear"])]) == 0
