@@ -129,7 +129,7 @@ SCENES: dict[str, Callable[[Path], Any]] = {
 }
 
 
-SAMPLE = {"3D Gaussians", "surroundings at surfels", "traced bounces", "resampled envmap", "BSDF, prb"}
+SAMPLE = {"surroundings at surfels", "traced bounces", "resampled envmap", "BSDF, prb"}
 """Scenes that are tested without `-m slow`."""
 
 
