@@ -123,19 +123,6 @@ def test_the_world_has_no_preferred_direction(scene: Scene, seed: int) -> None:
     assert np.mean(np.any(np.abs(turned - still) > 5e-4, axis=2)) <= 0.01
 
 
-@given(scene=SCENES, quarters=st.integers(1, 3))
-def test_rotating_light_equals_rotating_scene_back(scene: Scene, quarters: int) -> None:
-    """To turn the light about the pole, to move its columns, and to turn surfels and camera back are one."""
-    turn = Rotation.from_rotvec([0, quarters * np.pi / 2, 0])
-    turned = picture(scene, envmap(sky(LIGHT_ROWS), turn.as_matrix()), diffuse="irradiance")
-    columns = np.roll(sky(LIGHT_ROWS), -quarters * LIGHT_ROWS // 2, axis=1)
-    moved = picture(scene, envmap(columns), diffuse="irradiance")
-    np.testing.assert_allclose(moved, turned, atol=1e-4)
-    back = picture(rotated(scene, turn.inv()), envmap(sky(LIGHT_ROWS)), diffuse="irradiance")
-    assert np.mean(np.any(np.abs(back - turned) > 5e-4, axis=2)) <= 0.01
-    assert np.abs(turned - picture(scene, envmap(sky(LIGHT_ROWS)), diffuse="irradiance")).max() > 1e-3
-
-
 @given(
     scene=SCENES,
     albedo=st.floats(0, 1),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -12,10 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs import constants
 from mi_refgs.constants import ALPHA_MIN
-from mi_refgs.kernels.device import upload
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import splat
-from mi_refgs.surfels.table import Surfels
 from tests.laws.law_scenes import (
     COUNT,
     DISCS,
@@ -153,19 +148,6 @@ def test_units_do_not_matter(shading: Shading, scene: Scene, decades: float) -> 
     scaled["depth"] /= factor
     # Positions and log scales are rounded anew; at a cut a pixel may change sides.
     assert differing(scaled, draw(scene, shading), 2e-4) <= 0.01
-
-
-@given(scene=SCENES, seed=SEEDS)
-def test_alpha_is_the_composited_feature_one(scene: Scene, seed: int) -> None:
-    """To the bit; and what is blended is linear in the features."""
-    f, g = np.random.default_rng(seed).normal(size=(2, COUNT)).astype(np.float32)
-    surfels, camera = Surfels.from_numpy(scene.raw), scene.view.camera()
-    columns = [dr.ones(mi.Float, COUNT), upload(f), upload(g), upload(2 * f - 3 * g)]
-    blended = splat(surfels, columns, camera)
-    one, by_f, by_g, mixed = (image.numpy() for image in blended.features)
-    np.testing.assert_array_equal(one, blended.alpha.numpy())
-    np.testing.assert_allclose(mixed, 2 * by_f - 3 * by_g, atol=2e-5)
-    assert one.min() >= 0 and one.max() <= 1
 
 
 @BOTH

@@ -98,20 +98,6 @@ def test_matches_the_float64_specification() -> None:
     assert (expected == -1).any() and (expected == 1).any() and (np.abs(expected) < 0.9).mean() > 0.05
 
 
-def test_inside_of_the_region_it_is_the_bounded_field() -> None:
-    """Equal voxels have equal values if everything that the views report is inside."""
-    poses = ring_of_views(6)
-    depths = [ref.depth_map(ref.sphere(tuple(BALL), BALL_RADIUS), pose, FOCAL, SIZE) for pose in poses]
-    opened = fuse(depths, poses, 40, REGION)
-    low, high = np.array(REGION.centre) - REGION.radius, np.array(REGION.centre) + REGION.radius
-    bounded = fuse(depths, poses, 40, None, (low, high))
-    inner = opened.volume[20:61, 20:61, 20:61]
-    corner = np.moveaxis(np.indices(inner.shape), 0, -1) / 20 - 1
-    well_inside = np.linalg.norm(corner, axis=-1) < 1
-    np.testing.assert_allclose(inner[well_inside], bounded.volume[well_inside], atol=2e-3)
-    assert (np.abs(inner[well_inside]) < 0.9).mean() > 0.1
-
-
 def test_near_and_far_surfaces_are_within_a_voxel(ball_mesh: Mesh) -> None:
     vertices = ball_mesh.vertices.astype(np.float64)
     assert ball_mesh.voxel == pytest.approx(REGION.radius / 32)

@@ -100,19 +100,6 @@ def test_matches_the_float64_specification(carve: bool) -> None:
     assert (expected == -1).any() and (expected == 1).any() and (np.abs(expected) < 0.9).any()
 
 
-def test_views_from_above_still_give_a_solid() -> None:
-    """The underside is nobody's: it is bounded by the visual hull, and there is no second wall behind the
-    surface."""
-    where = directions(24)
-    poses = ring_of_views(where[where[:, 2] > 0.05])
-    depths = [ref.depth_map(SHAPES["sphere"], p, FOCAL, SIZE) for p in poses]
-    mesh = meshes.extract_mesh(fuse(depths, poses))
-    solid = as_trimesh(mesh)
-    assert solid.is_watertight and len(solid.split()) == 1
-    top = mesh.vertices[mesh.vertices[:, 2] > 0.2]
-    assert np.abs(np.linalg.norm(top, axis=1) - 1).max() < mesh.voxel
-
-
 def test_one_leaking_view_drills_no_tunnel() -> None:
     """A hole in the alpha of one of 24 views would otherwise carve through the whole object."""
     poses = ring_of_views(directions(24))

@@ -88,19 +88,6 @@ def test_offset_is_what_prevents_self_occlusion(monkeypatch: pytest.MonkeyPatch)
     assert dr.mean(occluder.visible(*args))[0] < 0.01
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_independent_of_scene_size(scale: float) -> None:
-    """The same scene a thousand times smaller or larger: the same bits, wherever the blocker is."""
-    shape = SHAPES["facing plates"]
-    mesh = extracted(shape)
-    point, normal, mirror = mirror_rays(shape, 4000)
-    rays = vector(mirror), vector(normal)
-    here = np.array(Occluder(mesh).visible(point3(point), *rays))
-    scaled = Mesh(mesh.vertices * np.float32(scale), mesh.faces, mesh.voxel * scale)
-    there = np.array(Occluder(scaled).visible(point3(scale * point), *rays))
-    assert 0 < here.mean() < 1 and np.mean(here != there) < 2e-3
-
-
 def test_no_mesh_is_visible_and_traces_nothing() -> None:
     """Before the first extraction, and after one that found nothing."""
     origin, direction = dr.zeros(mi.Point3f, 5), mi.Vector3f(0, 0, 1)

@@ -85,33 +85,6 @@ def test_interpolation_against_the_reference(maps: dict[str, np.ndarray]) -> Non
     np.testing.assert_array_equal(centre, maps["visibility"][..., 0])
 
 
-@pytest.mark.parametrize("mode", ["forward", "backward"])
-def test_derivatives_against_differences(
-    mode: str, maps: dict[str, np.ndarray], rng: np.random.Generator
-) -> None:
-    """Normals and alpha, against central differences of the float64 reference; visibility has none."""
-    maps["alpha"] += 0.1
-    tangent = {name: rng.normal(size=maps[name].shape) for name in ("normal", "alpha")}
-    sides = [
-        expected(maps | {name: maps[name] + step * x for name, x in tangent.items()})
-        for step in (1e-6, -1e-6)
-    ]
-    slope, weight = (sides[0] - sides[1]) / 2e-6, rng.normal(size=(HEIGHT * WIDTH, 3))
-    normal, alpha = columns(maps["normal"]), columns(maps["alpha"])
-    leaves = [*normal, *alpha]
-    dr.enable_grad(leaves)
-    out = found(normal, alpha[0], *columns(maps["visibility"]))
-    along = columns(tangent["normal"]) + columns(tangent["alpha"])
-    if mode == "forward":
-        for leaf, value in zip(leaves, along, strict=True):
-            dr.set_grad(leaf, value)
-        np.testing.assert_allclose(dr.forward_to(out).numpy().T, slope, atol=2e-5)
-    else:
-        dr.backward(dr.sum(dr.sum(out * mi.Color3f(*columns(weight)))))
-        sums = [np.sum(dr.grad(leaf).numpy() * x.numpy()) for leaf, x in zip(leaves, along, strict=True)]
-        assert sum(sums) == pytest.approx(np.sum(slope * weight), rel=1e-4)
-
-
 def test_points_integrate_cubic_radiance_exactly() -> None:
     """With x in pixels, the mean of x² over a pixel is that at its centre and 1/12 more."""
     view = camera(5, 4.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,14 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.stability import exact
-from benchmarks.stability.cases import camera, plain
+from benchmarks.stability.cases import camera
 from mi_refgs.kernels.device import upload, upload_tensor
-from mi_refgs.reference import image as oracle
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.pipeline import SurfelScene, render
-from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.table import Surfels
 from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotation_of
 from tests.scenes.open_pair import CASES, MAPS, Pair, weighted
 
@@ -71,37 +65,6 @@ def test_derivatives_of_open_scene_are_those_of_float64(case: tuple[str, str, fl
     def total(leaf: mi.Float) -> mi.Float:
         params = {name: upload_tensor(x) for name, x in pair.values.items()}
         return weighted(pair.planes(params, displaced(eye, leaf)), weights)
-
-    require_slopes(total, define, MOTION)
-
-
-@pytest.mark.parametrize("primitive", ["surfel", "gaussian"])
-def test_derivatives_of_radiance_are_those_of_float64(primitive: str) -> None:
-    """Spherical harmonics of degree 1, which depend on the direction, on either primitive."""
-    case = plain("sh", at="surfel", reflectance="radiance", camera=camera()).rounded()
-    raw = {name: case.raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
-    if primitive == "gaussian":
-        raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1] - 1], axis=1)
-    start = np.linalg.inv(moved_pose(np.eye(4), MOTION.astype(np.float64))) @ case.camera.to_world
-    pixels = np.arange(case.camera.width * case.camera.height)
-    case = replace(case, raw=raw)
-    order = exact.product_order(case, pixels)
-
-    def maps(pose: np.ndarray) -> oracle.Image:
-        moved = replace(case, camera=replace(case.camera, to_world=pose))
-        return oracle.render(exact.scene_of(moved, pixels, order))
-
-    image = maps(case.camera.to_world)
-    weight = np.random.default_rng(3).normal(size=image.maps["radiance"].shape)
-    weight[image.band] = 0
-    eye, surfels = exact.fast_camera(case).moved(start), Surfels.from_numpy(raw)
-    scene = SurfelScene(surfels, Shading(at="surfel", reflectance="radiance"))
-
-    def total(leaf: mi.Float) -> mi.Float:
-        return weighted({"radiance": [*render(scene, displaced(eye, leaf)).radiance]}, {"radiance": weight})
-
-    def define(at: np.ndarray) -> float:
-        return float(np.sum(weight * maps(moved_pose(start, at)).maps["radiance"]))
 
     require_slopes(total, define, MOTION)
 

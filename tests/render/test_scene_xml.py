@@ -20,7 +20,6 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import QUALITY, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
-from mi_refgs.shade.reflection import TraceContext, mirror_visibility
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
@@ -149,32 +148,3 @@ def test_rays_start_at_covered_pixels_only(
     covered = int((frame.alpha.numpy() > 1e-3).sum())
     assert 0 < covered < 0.7 * WIDTH * HEIGHT
     assert hits == [covered]
-
-
-def test_mirror_rays_start_at_hits_only(tmp_path: Path) -> None:
-    mesh = read_mesh(plane_mesh(tmp_path))
-    occluder, asked = Occluder(mesh), []
-    test = occluder._scene.ray_test
-
-    class Counted:
-        """The occluder's scene, which notes how many rays it traces."""
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(scene, name)
-
-        def ray_test(self, ray: Any, active: Any) -> Any:
-            asked.append(int(dr.count(active)[0]))
-            return test(ray, active)
-
-    scene, occluder._scene = occluder._scene, Counted()
-    camera = view()
-    ray = camera.rays()
-    _, hit = occluder.first_hit(camera.origin, ray)
-    towards = -dr.normalize(ray)
-    covered = dr.arange(mi.UInt32, WIDTH * HEIGHT) % 2 == 0
-    nothing: Any = None
-    context = TraceContext(occluder, nothing, None, camera.origin, ray, covered)
-    answer = mirror_visibility(context, towards, towards)
-    assert 0 < int(dr.count(hit)[0]) < WIDTH * HEIGHT
-    assert asked == [int(dr.count(hit & covered)[0])]
-    assert dr.all((answer == 1) | (hit & covered))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,7 +11,6 @@ from benchmarks.stability import exact
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.render.display import displayed, srgb_from_linear
 from mi_refgs.render.pipeline import Frame, SurfelScene, render
-from mi_refgs.render.samples import box_mean, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
@@ -90,27 +87,6 @@ def test_what_lies_behind_is_exposed_as_the_rest_is() -> None:
         planes = displayed(frame, np.ones(3), linear, gain)
         for plane, value in zip(planes, (2 * (0.1 + 0.5 * 0.4), 0.1 + 0.5 * 0.2, 0.1), strict=True):
             np.testing.assert_allclose(plane, srgb_from_linear(mi.Float([value] * 2)), rtol=1e-6)
-
-
-def test_a_pixel_is_the_mean_of_its_samples() -> None:
-    """Maps of the object are weighted by its own opacity, not by that of everything; the background by what
-    it is seen through, so that compositing the mean is the mean of composites."""
-    pair = Pair("pixel", "sh")
-    params = {name: upload_tensor(x) for name, x in pair.values.items()}
-    eye = exact.fast_camera(pair.case)
-    fine = pair.frame(params, eye.supersampled(2))
-    frame = supersampled(lambda camera: pair.frame(params, camera), eye, 4)
-
-    def mean(value: Any) -> np.ndarray:
-        return np.array(box_mean(value, eye, 2))
-
-    np.testing.assert_allclose(np.array(frame.object_alpha), mean(fine.object_alpha), rtol=1e-6)
-    seen = mean(fine.object_alpha) > 0.01
-    rough = mean(fine.maps["roughness"] * fine.object_alpha)[seen] / mean(fine.object_alpha)[seen]
-    np.testing.assert_allclose(np.array(frame.maps["roughness"])[seen], rough, rtol=1e-4)
-    for plane, samples in zip(frame.background, fine.background, strict=True):
-        seen_behind = mean((1 - fine.alpha) * samples)
-        np.testing.assert_allclose(np.array((1 - frame.alpha) * plane), seen_behind, rtol=1e-4, atol=1e-3)
 
 
 def test_empty_models_render_nothing_and_screened_ones_skip_unusable_surfels() -> None:
