@@ -69,39 +69,32 @@ def assert_same(expected: Frame, found: Frame) -> None:
     np.testing.assert_allclose(got["alpha"], wanted["alpha"], atol=2e-6)
 
 
-@pytest.mark.parametrize(
-    "focal, offset", [(30.0, (0, 0)), (30.0, (3, 2)), (600.0, (5, 3)), (1100.0, (13, 6))]
-)
-def test_forward_only_image_is_the_same_with_every_tile_size(focal: float, offset: tuple[int, int]) -> None:
-    shading = Shading("pixel", "split_sum", "sh", occlusion=True)
-    assert_same(*both(things(), camera_at(focal, offset), shading))
+IRRADIANCE = Shading("pixel", "split_sum", "irradiance")
+TRACED = Shading("pixel", "split_sum", "sh", occlusion=True)
+CASES: dict[str, tuple[Shading, dict[str, Any]]] = {
+    "tiles of 8 × 8, with an offset": (TRACED, {"focal": 1100.0, "offset": (13, 6)}),
+    "tiles of 8 × 4, with an offset": (TRACED, {"focal": 600.0, "offset": (5, 3)}),
+    "tiles of 4 × 4": (TRACED, {}),
+    "at surfels": (replace(IRRADIANCE, at="surfel"), {}),
+    "Gaussians at pixels": (IRRADIANCE, {"gaussians": True}),
+    "Gaussians at surfels": (replace(IRRADIANCE, at="surfel"), {"gaussians": True}),
+    "surroundings": (IRRADIANCE, {"around": True}),
+    "surroundings at surfels": (replace(IRRADIANCE, at="surfel"), {"around": True}),
+    "lobe samples of the pixel": (replace(IRRADIANCE, occlusion=True, visibility_rays=4), {}),
+    "neighbours in the image": (Shading(antialias=True), {}),
+    "neighbours and rays": (Shading(antialias=True, occlusion=True), {}),
+}
 
 
-@pytest.mark.parametrize("at", ["surfel", "pixel"])
-@pytest.mark.parametrize("gaussians", [False, True])
-def test_forward_only_image_is_the_same_in_both_orders(at: Any, gaussians: bool) -> None:
-    assert_same(*both(things(gaussians), camera_at(30.0), Shading(at, "split_sum", "irradiance")))
-
-
-@pytest.mark.parametrize("at", ["surfel", "pixel"])
-def test_forward_only_image_is_the_same_with_surroundings(at: Any) -> None:
-    light = EnvironmentLight.from_radiance(sky())
+@pytest.mark.parametrize("case", CASES)
+def test_forward_only_image_is_the_same(case: str) -> None:
+    shading, more = CASES[case]
     near = scattered_discs()
-    near["position"] = near["position"] * 3
-    others = Surroundings(Surfels.from_numpy(near), light)
-    shading = Shading(at, "split_sum", "irradiance")
-    assert_same(*both(things(), camera_at(30.0), shading, surroundings=others))
-
-
-def test_forward_only_lobe_samples_are_those_of_the_pixel() -> None:
-    shading = Shading("pixel", "split_sum", "irradiance", occlusion=True, visibility_rays=4)
-    assert_same(*both(things(), camera_at(30.0), shading))
-
-
-@pytest.mark.parametrize("occlusion", [False, True])
-def test_forward_only_antialiasing_reads_neighbours_in_the_image(occlusion: bool) -> None:
-    shading = Shading(occlusion=occlusion, antialias=True)
-    assert_same(*both(things(), camera_at(30.0), shading))
+    others = Surroundings(
+        Surfels.from_numpy(near | {"position": 3 * near["position"]}), EnvironmentLight.from_radiance(sky())
+    )
+    view = camera_at(more.get("focal", 30.0), more.get("offset", (0, 0)))
+    assert_same(*both(things("gaussians" in more), view, shading, others if "around" in more else None))
 
 
 def test_nothing_in_view_is_black() -> None:
