@@ -35,10 +35,6 @@ ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_MIN = 1e-4
 """A pixel ends before the surfel that would bring T below this: 8 bits show no more. [3DGS, appendix C]"""
 
-DRAFT_TRANSMITTANCE = 3e-3
-"""A pixel of a draft ends behind the surfel that reduces T below this, so that its alpha is too small by less
-than an 8-bit step, 1/255. [docs/decisions.md has time and error of other values]"""
-
 LOW_PASS_INV_VARIANCE = 12.0
 """1/pixel²: the screen-space filter is a Gaussian of the variance of a pixel's box, 1/12. The 1/2 of 2DGS
 (§4.2) widens outlines by about a pixel. [docs/decisions.md]"""

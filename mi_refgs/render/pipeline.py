@@ -67,7 +67,6 @@ class Request:
 
     aovs: Collection[str] = ()  # materials, terms of the radiance, "visibility", "normal", "depth", by name
     forward_only: bool = False  # without derivatives: faster, equal to rounding
-    draft: bool = False  # if `forward_only`: pixels end at DRAFT_TRANSMITTANCE, faster, about 50 dB
     sh_degree: int | None = None  # highest SH degree of the radiance, for coarse-to-fine schedules
     attribution: Float | None = None  # (N,) zeros, which get Σ w δ for adjoints δ of the frame's
 
@@ -195,8 +194,8 @@ class _View:
             slots = joined_slots(slots, others, (own, beside))
         values = features(slots)
         if self.request.forward_only:
-            depth, draft = "depth" in self.asked or self.scene.near is not None, self.request.draft
-            blended = splat_compact(self.geometry, values, self.camera, depth=depth, draft=draft)
+            depth = "depth" in self.asked or self.scene.near is not None
+            blended = splat_compact(self.geometry, values, self.camera, depth)
         else:
             if self.request.attribution is not None:
                 values = [*values, self.request.attribution]

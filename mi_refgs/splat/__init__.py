@@ -67,10 +67,8 @@ def splat(
     return composite(footprints, features, lists)
 
 
-def splat_compact(
-    surfels: Tables, features: list[Float], camera: Camera, *, depth: bool, draft: bool = False
-) -> Composited:
+def splat_compact(surfels: Tables, features: list[Float], camera: Camera, depth: bool) -> Composited:
     """Splat features of surfels as `composite_compact` does: only pixels near surfels, no derivatives."""
     if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera, depth)
-    return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth, draft)
+    return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth)

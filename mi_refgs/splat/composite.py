@@ -28,7 +28,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import DRAFT_TRANSMITTANCE
 from mi_refgs.kernels.timing import boundary, phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.lanes import CompactedPixels, Lanes, advance, any_of, walk
@@ -66,18 +65,18 @@ def composite(footprints: Footprints, features: list[Float], lists: TileLists) -
 
 
 @phase("splat forward")
-def composite_compact(lists: TileLists, depth: bool, draft: bool = False) -> Composited:
+def composite_compact(lists: TileLists, depth: bool) -> Composited:
     """Maps of the pixels of patches that list a surfel, in the order of `pixels`, without derivatives.
 
     Shading the pixels is then faster. Depth only if `depth`. Alpha is 1 - T instead of one more sum, and
-    equal to rounding. Pixels of a `draft` end at DRAFT_TRANSMITTANCE.
+    equal to rounding.
     """
     if not lists.pairs:
         return Composited.nothing(lists.features, lists.camera, depth)
     dr.eval(lists.rows.data)
     chosen = Lanes.filled(lists)
     lanes = Lanes.of(lists, chosen)
-    transmittance, sums = _forward(lists, lanes, lists.features + depth, draft)
+    transmittance, sums = _forward(lists, lanes, lists.features + depth)
     values = [[*of_pixel, 1 - T] for of_pixel, T in zip(sums, transmittance, strict=True)]
     maps = CompactedPixels.scattered(values, dr.width(chosen))
     pixels = CompactedPixels.of(lists.camera, chosen, lanes)
@@ -89,9 +88,7 @@ def _values(lists: TileLists, row: list[Float], z: Float) -> list[Float]:
     return [*row[lists.primitive.columns :][: lists.features], z, mi.Float(1)]
 
 
-def _forward(
-    lists: TileLists, lanes: Lanes, maps: int, draft: bool = False
-) -> tuple[list[Float], list[list[Float]]]:
+def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], list[list[Float]]]:
     """Transmittance and the first `maps` maps, per pixel of the lanes."""
 
     def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
@@ -100,8 +97,6 @@ def _forward(
         for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
             sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-            if draft:
-                goes_on &= transmittance_after >= DRAFT_TRANSMITTANCE
             values = _values(lists, row, sample.z)[:maps]
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
             after.append((goes_on, transmittance_after, out))

@@ -90,7 +90,7 @@ class MitsubaScene(ViewerScene):
     def frame(self, sample: SampleRequest) -> Frame:
         """See `ViewerScene`; for the integrator `refgs`."""
         background = OBJECT_ONLY if sample.look.object_only else self._background
-        request = Request(sample.aovs, forward_only=True, draft=not sample.settled)
+        request = Request(sample.aovs, forward_only=True)
         frame: Frame = self.scene.integrator().frame(self.scene, request, background, sample.camera())
         return frame
 

@@ -147,7 +147,7 @@ class ReconstructionView(ViewerScene):
         return drawn._replace(planes=[*tinted, *drawn.planes[3:]])
 
     def frame(self, sample: SampleRequest) -> Frame:
-        """See `ViewerScene`; a draft, with ambient shadows that may be outdated, unless it is `settled`."""
+        """See `ViewerScene`; with ambient shadows that may be outdated unless it is `settled`."""
         light, scene = self.light, self.scene
         with dr.suspend_grad():
             if self._stale and (sample.settled or self._lacks_caches):
@@ -157,7 +157,7 @@ class ReconstructionView(ViewerScene):
             rendered = SurfelScene(
                 scene.surfels, scene.shading, light, self._occluder, background, self._near
             )
-            request = Request(sample.aovs, forward_only=True, draft=not sample.settled)
+            request = Request(sample.aovs, forward_only=True)
             return render(rendered, sample.camera(), request)
 
     @property

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mi_refgs import splat
-from mi_refgs.constants import DRAFT_TRANSMITTANCE
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
@@ -114,9 +113,9 @@ def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pyt
     """And blends no more channels than that takes."""
     composite, blended = splat.composite_compact, []
 
-    def counted(lists: splat.TileLists, depth: bool, draft: bool) -> Any:
+    def counted(lists: splat.TileLists, depth: bool) -> Any:
         blended.append(lists.features + depth)
-        return composite(lists, depth, draft)
+        return composite(lists, depth)
 
     monkeypatch.setattr(splat, "composite_compact", counted)
     light = EnvironmentLight.from_radiance(sky())
@@ -144,26 +143,6 @@ def test_compacted_pixels_contain_each_pixel_of_chosen_patches_once() -> None:
     np.testing.assert_array_equal(back, np.flatnonzero(there))
     alpha = np.array(splat.splat(things(), [], view).alpha)
     assert not alpha[~there].any() and alpha[there].any()
-
-
-@pytest.mark.parametrize("gaussians", [False, True])
-def test_draft_ends_where_little_shows(gaussians: bool) -> None:
-    """A draft equals the image until a pixel's transmittance is below the limit, and lacks the rest."""
-    raw = raw_channels(200)
-    if gaussians:
-        raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
-    many, view = Surfels.from_numpy(raw), camera_at(30.0)
-    columns = [dr.abs(x) for x in many.position()]
-    exact, draft = (splat.splat_compact(many, columns, view, depth=True, draft=d) for d in (False, True))
-    lacking = np.array(exact.alpha) - np.array(draft.alpha)
-    through = 1 - np.array(draft.alpha)
-    np.testing.assert_array_equal(lacking[through >= DRAFT_TRANSMITTANCE], 0)
-    assert 0.9 * lacking.max() < DRAFT_TRANSMITTANCE < 5 * lacking.max()
-    assert (lacking > 0).mean() > 0.05
-    furthest = float(dr.max(dr.maximum(columns[0], dr.maximum(columns[1], columns[2])))[0])
-    for whole, part in zip(exact.features, draft.features, strict=True):
-        difference = np.array(whole) - np.array(part)
-        assert difference.min() > -1e-6 and difference.max() < DRAFT_TRANSMITTANCE * furthest
 
 
 def test_second_view_reuses_kernels() -> None:
