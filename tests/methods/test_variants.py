@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mi_refgs import methods
 from mi_refgs.cli import main
 from tests.helpers import ROOT
+from tests.laws.covering import marked
 from tests.scenes.tiny import SETTINGS, write_data
 
 FULL = "ref_gaussian"
@@ -48,7 +51,19 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_data(tmp_path_factory.mktemp("variants") / "ball", views=6)
 
 
-@pytest.mark.parametrize("variant", methods.names())
+def fits() -> Iterator[Any]:
+    """Every method; slow if its shadings, its primitive and whether it has a mesh occur in those before."""
+    cases: list[dict[str, Any]] = []
+    for name in methods.names():
+        method = methods.load(name)
+        shadings = [f"{stage.shading.reflectance} at {stage.shading.at}" for _, stage in method.stages()]
+        cases.append({"primitive": method.surfels.primitive, "mesh": method.mesh is not None})
+        cases[-1] |= dict.fromkeys(shadings)
+    for name, marks in zip(methods.names(), marked(cases), strict=True):
+        yield pytest.param(name, marks=marks)
+
+
+@pytest.mark.parametrize("variant", [*fits()])
 def test_every_method_fits_and_evaluates(variant: str, data: Path, tmp_path: Path) -> None:
     """A few steps in every stage, with a mesh where the method has one."""
     run = tmp_path / "run"
