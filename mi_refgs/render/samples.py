@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -58,6 +57,11 @@ def supersampled(
     def by_alpha(value: Float) -> Float:
         return mean(value * fine.alpha) * inverse
 
+    def behind(background: Color3f) -> Color3f:
+        through = 1 - alpha
+        weighted = mean(background * (1 - fine.alpha)) * inverse_alpha(through)
+        return dr.select(through <= COVERAGE_FLOOR, mean(background), weighted)
+
     distance = None
     if details and fine.depth is not None:
         distance = by_alpha(ray_distance(fine.depth, fine_camera))
@@ -72,19 +76,11 @@ def supersampled(
             name: mean(value * fine.object_alpha) * inverse_alpha(object_alpha)
             for name, value in fine.maps.items()
         },
-        background=None if fine.background is None else mean_behind(mean, fine.background, fine.alpha),
+        background=None if fine.background is None else behind(fine.background),
         object_alpha=object_alpha,
         distance=distance,
         attribution=None if fine.attribution is None else mean(fine.attribution),
     )
-
-
-def mean_behind(mean: Callable[[Any], Any], background: Color3f, alpha: Float) -> Color3f:
-    """Mean background weighted by 1 - alpha; the plain mean where alpha is 1."""
-    through = 1 - mean(alpha)
-    hidden = through <= COVERAGE_FLOOR
-    weighted = mean(background * (1 - alpha)) * inverse_alpha(through)
-    return dr.select(hidden, mean(background), weighted)
 
 
 def ray_distance(depth: Float, camera: Camera) -> Float:

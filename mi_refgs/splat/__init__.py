@@ -6,28 +6,14 @@ from collections.abc import Sequence
 from functools import reduce
 
 from mi_refgs.kernels.timing import phase
-from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.composite import Composited, composite, composite_compact
-from mi_refgs.splat.tiles import TileLists, list_by_tile
+from mi_refgs.splat.camera import Camera as Camera
+from mi_refgs.splat.composite import Composited as Composited
+from mi_refgs.splat.composite import composite, composite_compact
+from mi_refgs.splat.tiles import TileLists as TileLists
+from mi_refgs.splat.tiles import list_by_tile
 from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
-
-__all__ = [
-    "Camera",
-    "Composited",
-    "Footprints",
-    "Tables",
-    "TileLists",
-    "composite",
-    "list_by_tile",
-    "project",
-    "splat",
-    "splat_compact",
-    "surfel_count",
-    "tables_of",
-]
-
 
 Tables = Surfels | Sequence[Surfels]
 """One table of surfels, or several that are splatted in one sort, such as an object and its surroundings."""

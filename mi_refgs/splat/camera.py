@@ -75,11 +75,11 @@ class Camera:
         cx: float,
         cy: float,
         to_world: np.ndarray,
-        near: float = 0.0,
+        near: float = 0,
     ) -> Camera:
-        """Camera from signed focal lengths in pixels and a rigid (4, 4) world-from-camera matrix.
+        """Camera from a rigid (4, 4) world-from-camera matrix, signed focal lengths and a principal point, pixels.
 
-        Raises InputError if the matrix is not rigid.
+        near: scene units. Raises InputError if the matrix is not rigid.
         """
         matrix = np.asarray(to_world, dtype=np.float64)
         rotation = matrix[:3, :3]
@@ -87,23 +87,14 @@ class Camera:
         if not finite or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
             raise InputError("camera: to_world: must be a rotation and a translation; remove scale and shear")
 
-        def opaque(x: float) -> Float:
-            return dr.opaque(mi.Float, float(x))
+        def opaque(*numbers: float) -> list[Float]:
+            return [dr.opaque(mi.Float, float(x)) for x in numbers]
 
+        turn = mi.Matrix3f([opaque(*row) for row in rotation.T])
         origin = matrix[:3, 3].astype(np.float32)
-        return Camera(
-            width,
-            height,
-            opaque(fx),
-            opaque(fy),
-            opaque(cx),
-            opaque(cy),
-            mi.Matrix3f([[opaque(x) for x in row] for row in rotation.T]),
-            mi.Point3f(*(opaque(x) for x in origin)),
-            mi.Vector3f(*(opaque(x) for x in matrix[:3, 3] - origin)),
-            opaque(near),
-            abs(float(fx)),
-        )
+        place, rest = mi.Point3f(*opaque(*origin)), mi.Vector3f(*opaque(*(matrix[:3, 3] - origin)))
+        lens = opaque(fx, fy, cx, cy)
+        return Camera(width, height, *lens, turn, place, rest, *opaque(near), abs(float(fx)))
 
     @staticmethod
     def look_at(
@@ -181,12 +172,9 @@ class Camera:
             camera = replace(camera, motion=_motion_of(turned, moved))
         if dr.grad_enabled(angle):
             slope = dr.tan(dr.deg2rad(0.5 * angle))
-            camera = camera.zoomed(dr.detach(slope) / slope)
+            factor = dr.detach(slope) / slope
+            camera = replace(camera, fx=self.fx * factor, fy=self.fy * factor)
         return camera
-
-    def zoomed(self, factor: Float) -> Camera:
-        """The camera with both focal lengths times a factor of width 1, under AD; the tiles stay."""
-        return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
     def towards(self, point: Point3f) -> Vector3f:
         """Vector in the world from the camera to a point, with the precision of float32 of the vector."""
