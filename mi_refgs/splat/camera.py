@@ -77,7 +77,7 @@ class Camera:
         to_world: np.ndarray,
         near: float = 0,
     ) -> Camera:
-        """Camera from a rigid (4, 4) world-from-camera matrix, and from signed focal lengths and centre, pixels.
+        """Camera from a rigid (4, 4) world-from-camera matrix, signed focal lengths and centre, pixels.
 
         near: scene units. Raises InputError if the matrix is not rigid.
         """
