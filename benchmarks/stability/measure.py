@@ -21,7 +21,7 @@ from benchmarks.stability.exact import (
 from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import image as reference
-from mi_refgs.reference import surfel
+from mi_refgs.reference.footprint import Surfel
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -315,7 +315,7 @@ def condition(
 def inversion(case: Case, scene: reference.Scene, truth: reference.Image) -> float:
     """Largest relative difference of depths in the wrong order, among the surfels that a pixel shows."""
     phase = fast_camera(case).tile_offset
-    key = surfel.sort_key(scene.raw, scene.camera, scene.pixels, phase)
+    key = Surfel.sort_key(scene.raw, scene.camera, scene.pixels, phase)
     key, shown = (np.take_along_axis(x, scene.order, 0) for x in (key, truth.shown))
     key = np.where(shown, key, 0)
     late = np.where(shown, (np.maximum.accumulate(key) - key) / np.where(shown, key, 1), 0)

@@ -1,4 +1,4 @@
-"""What the footprints of surfels and of 3D Gaussians share: each primitive is a module with four functions.
+"""Footprints of surfels and of 3D Gaussians in float64: each primitive is a class of four functions.
 
     culled(raw, camera, rules)           which rows (N,) cover no pixel
     footprint(raw, camera, rules, x, y)  Sample (N, P) at pixel centres x, y (P,)
@@ -18,9 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.camera import PinholeCamera
+from mi_refgs.reference.camera import PinholeCamera, camera_frame, intrinsics, ray_slopes, sigmoid
+from mi_refgs.reference.light import clip
 
 Array = np.ndarray
+Corner = tuple[int, int]
 GEOMETRY = ("position", "rotation", "scale", "opacity")
 
 
@@ -51,3 +53,123 @@ def tile_centres(camera: PinholeCamera, pixels: Array, corner: tuple[int, int]) 
     x = (pixels % camera.width + corner[0]) // width * width + width / 2 - corner[0]
     y = (pixels // camera.width + corner[1]) // height * height + height / 2 - corner[1]
     return x, y
+
+
+class Surfel:
+    """Ray-plane intersection with a low-pass. [2DGS, Huang 2024, §4]"""
+
+    @staticmethod
+    def culled(raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
+        centre, axes = camera_frame(raw, camera)
+        facing = np.abs(np.sum(centre * axes[:, 2], axis=1))
+        out = ~(centre[:, 2] > camera.near) | ~(facing > rules.edge_on * np.linalg.norm(centre, axis=1))
+        return out | (sigmoid(raw["opacity"][:, 0]) < rules.alpha_min)
+
+    @staticmethod
+    def footprint(raw: dict[str, Array], camera: PinholeCamera, rules: Rules, x: Array, y: Array) -> Sample:
+        p, axes = camera_frame(raw, camera)
+        σ = np.exp(raw["scale"])
+        ray = ray_slopes(camera, x, y)
+        with np.errstate(all="ignore"):
+            t = np.sum(p * axes[:, 2], axis=1)[:, None] / (axes[:, 2] @ ray)
+            _, across = _from_centre(p, axes, ray)
+            plane = sum((t * across[i] / σ[:, i : i + 1]) ** 2 for i in range(2))
+            middle = [f * p[:, i : i + 1] / p[:, 2:] + m for i, (f, m) in enumerate(intrinsics(camera))]
+            screen = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
+            screen = screen * rules.low_pass if rules.low_pass else np.full_like(screen, np.inf)
+            low_pass = ~(t.real > 0) | ~(screen.real >= plane.real)
+            opacity = sigmoid(raw["opacity"])
+            unclamped = opacity * np.exp(-0.5 * np.where(low_pass, screen, plane))
+        alpha = np.where(unclamped.real > rules.alpha_max, rules.alpha_max, unclamped)
+        z = np.where(low_pass, p[:, 2:], t)
+        with np.errstate(all="ignore"):
+            jump = np.abs(screen.real - plane.real) / screen.real
+        return Sample(alpha, z, unclamped.real, jump)
+
+    @staticmethod
+    def normal(raw: dict[str, Array]) -> Array:
+        """The third axis."""
+        return np.full(len(raw["position"]), 2)
+
+    @staticmethod
+    def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
+        """The depth of the plane, SORT_REACH σ from the centre at most."""
+        p, axes = camera_frame(raw, camera)
+        σ = np.exp(raw["scale"])
+        x, y = tile_centres(camera, pixels, corner)
+        ray = ray_slopes(camera, x, y)
+        with np.errstate(all="ignore"):
+            k = 1 / p[:, 2:]
+            lift, across = _from_centre(p, axes, ray)
+            across = [across[i] / σ[:, i : i + 1] for i in range(2)]
+            share = np.minimum(1, c.SORT_REACH * k / np.hypot(*across))
+            return 1 / np.maximum(k + share * lift, k / c.SORT_DEPTH_RANGE)
+
+
+class Gaussian:
+    """3D Gaussians by EWA. [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]
+
+    Σ' = J W Σ Wᵀ Jᵀ + λ I, with J the derivative of the projection at the centre, whose slope is clamped to
+    the neighbourhood of the image.
+    """
+
+    @staticmethod
+    def culled(raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
+        depth = camera_frame(raw, camera)[0][:, 2]
+        return ~(depth > camera.near) | (sigmoid(raw["opacity"][:, 0]) < rules.alpha_min)
+
+    @staticmethod
+    def footprint(raw: dict[str, Array], camera: PinholeCamera, rules: Rules, x: Array, y: Array) -> Sample:
+        p, axes = camera_frame(raw, camera)
+        σ, z = np.exp(raw["scale"]), p[:, 2]
+        along = []  # pixels on the screen of one standard deviation along each axis, (N, 3) in x and in y
+        for i, ((focal, _), limits) in enumerate(zip(intrinsics(camera), _limits(camera), strict=True)):
+            slope = clip(p[:, i] / np.where(z == 0, 1, z), *limits)
+            along.append(focal * σ * (axes[:, :, i] - slope[:, None] * axes[:, :, 2]) / z[:, None])
+        covariance = [[np.sum(a * b, axis=1) for b in along] for a in along]
+        low_pass = c.GAUSSIAN_LOW_PASS if rules.low_pass else 0.0
+        xx, yy, xy = covariance[0][0] + low_pass, covariance[1][1] + low_pass, covariance[0][1]
+        determinant = (xx * yy - xy**2)[:, None]
+        δx, δy = (
+            at - (focal * p[:, i] / z + middle)[:, None]
+            for i, (at, (focal, middle)) in enumerate(zip((x, y), intrinsics(camera), strict=True))
+        )
+        with np.errstate(over="ignore"):
+            rho = (yy[:, None] * δx**2 - 2 * xy[:, None] * δx * δy + xx[:, None] * δy**2) / determinant
+            unclamped = sigmoid(raw["opacity"]) * np.exp(-0.5 * rho)
+        alpha = np.where(unclamped.real > rules.alpha_max, rules.alpha_max, unclamped)
+        depth = np.broadcast_to(p[:, 2:], alpha.shape)
+        return Sample(alpha, depth, unclamped.real, np.full(alpha.shape, np.inf))
+
+    @staticmethod
+    def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
+        """The depth of the centre, in every tile."""
+        return np.repeat(camera_frame(raw, camera)[0][:, 2:], len(pixels), axis=1)
+
+    @staticmethod
+    def normal(raw: dict[str, Array]) -> Array:
+        """The shortest axis, the third of equal ones."""
+        shortest = np.argmin(raw["scale"], axis=1)
+        return np.where(raw["scale"][:, 2] <= raw["scale"].min(axis=1), 2, shortest)
+
+
+def _from_centre(p: Array, axes: Array, ray: Array) -> tuple[Array, list[Array]]:
+    """Where rays (3, P) meet the planes, relative to their centres p, over the depth there.
+
+    Returns the difference (N, P) of 1 / depth to the centre's, and the offsets (N, P) along t_u and t_v. Only
+    the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
+    """
+    beside = ray[None] - (p / p[:, 2:])[:, :, None]
+    lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]
+    along = [np.einsum("nk,nkp->np", axes[:, i], beside) for i in range(2)]
+    return lift, [along[i] - lift * np.sum(p * axes[:, i], 1)[:, None] for i in range(2)]
+
+
+def _limits(camera: PinholeCamera) -> list[tuple[float, float]]:
+    """Slopes p_x / p_z and p_y / p_z of the neighbourhood of the image."""
+    limits = []
+    for (focal, middle), (first, last) in zip(intrinsics(camera), camera.borders, strict=True):
+        margin = c.GAUSSIAN_SLOPE_MARGIN * (last - first)
+        ends = [(first - margin - middle) / focal, (last + margin - middle) / focal]
+        limits.append((min(ends), max(ends)))
+    return limits

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.reference import gaussian, surfel
 from mi_refgs.reference.camera import PinholeCamera
-from mi_refgs.reference.footprint import GEOMETRY, Rules, Sample
+from mi_refgs.reference.footprint import GEOMETRY, Gaussian, Rules, Sample, Surfel
 
 Array = np.ndarray
 STEP = 1e-40
@@ -24,7 +23,7 @@ STEP = 1e-40
 
 def primitive_of(raw: dict[str, np.ndarray]) -> Any:
     """3D Gaussians have a third standard deviation."""
-    return gaussian if raw["scale"].shape[1] == 3 else surfel
+    return Gaussian if raw["scale"].shape[1] == 3 else Surfel
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import ModuleType
 
 import drjit as dr
 import numpy as np
@@ -13,11 +12,9 @@ import pytest
 from mi_refgs import constants
 from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.errors import InputError
-from mi_refgs.reference import gaussian as exact_gaussian
 from mi_refgs.reference import splat as oracle
-from mi_refgs.reference import surfel as exact_surfel
 from mi_refgs.reference.camera import look_at, rotation_axes
-from mi_refgs.reference.footprint import Rules
+from mi_refgs.reference.footprint import Gaussian, Rules, Surfel
 from mi_refgs.splat import Camera, list_by_tile, project, splat, tiles
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.splats import (
@@ -43,7 +40,7 @@ class Primitive:
 
     name: str
     make: Callable[[int], Scene]
-    exact: ModuleType
+    exact: type
     image: float  # tolerance
     gradient: float  # relative L2
 
@@ -52,8 +49,8 @@ class Primitive:
 
 
 PRIMITIVES = [
-    Primitive("surfel", make_scene, exact_surfel, 1e-4, 3e-4),  # observed 2e-6 … 3e-5, and 1e-6 … 1.4e-4
-    Primitive("gaussian", make_gaussians, exact_gaussian, 1e-5, 1e-3),  # observed 2e-6
+    Primitive("surfel", make_scene, Surfel, 1e-4, 3e-4),  # observed 2e-6 … 3e-5, and 1e-6 … 1.4e-4
+    Primitive("gaussian", make_gaussians, Gaussian, 1e-5, 1e-3),  # observed 2e-6
 ]
 BOTH = pytest.mark.parametrize("kind", PRIMITIVES, ids=str)
 MANY = pytest.mark.parametrize(
@@ -153,9 +150,9 @@ def test_reference_footprints_match_textbook_intersections() -> None:
     to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
     at = np.stack([v.ravel() + 0.5 for v in np.meshgrid(range(camera.width), range(camera.height))], axis=1)
     focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    sample = exact_surfel.footprint(raw, camera, Rules(), *at.T)
+    sample = Surfel.footprint(raw, camera, Rules(), *at.T)
     axes = np.stack(rotation_axes(raw["rotation"]), axis=2)
-    for i in np.flatnonzero(~exact_surfel.culled(raw, camera, Rules())):
+    for i in np.flatnonzero(~Surfel.culled(raw, camera, Rules())):
         p, (u, v, _) = to_camera @ (raw["position"][i] - origin), (to_camera @ axes[i]).T
         σ, opacity = np.exp(raw["scale"][i]), 1 / (1 + np.exp(-raw["opacity"][i, 0]))
         pixel = np.argmax(sample.unclamped[i] * (sample.jump[i] > 1e-6))

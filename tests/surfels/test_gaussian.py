@@ -10,11 +10,10 @@ import pytest
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS
 from mi_refgs.fitting import refine
 from mi_refgs.methods import Refine
-from mi_refgs.reference import gaussian as exact
 from mi_refgs.reference import image
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import rotation_axes
-from mi_refgs.reference.footprint import Rules
+from mi_refgs.reference.footprint import Gaussian, Rules
 from mi_refgs.render.pipeline import Request, Shading, SurfelScene, render
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
@@ -29,11 +28,11 @@ def test_reference_footprints_match_textbook_matrices() -> None:
     scene, compared = make_gaussians(8), 0
     camera = scene.camera
     at = np.stack([v.ravel() + 0.5 for v in np.meshgrid(range(camera.width), range(camera.height))], axis=1)
-    sample = exact.footprint(scene.raw, camera, Rules(), *at.T)
+    sample = Gaussian.footprint(scene.raw, camera, Rules(), *at.T)
     position, scale, opacity = (scene.raw[n] for n in ("position", "scale", "opacity"))
     axes = np.stack(rotation_axes(scene.raw["rotation"]), axis=2)
     focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    for i in np.flatnonzero(~exact.culled(scene.raw, camera, Rules())):
+    for i in np.flatnonzero(~Gaussian.culled(scene.raw, camera, Rules())):
         p = camera.to_world[:3, :3].T @ (position[i] - camera.to_world[:3, 3])
         centre = focal * p[:2] / p[2] + middle
         if (centre < 0).any() or (centre > [camera.width, camera.height]).any():
