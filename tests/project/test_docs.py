@@ -1,5 +1,4 @@
-"""README and pages stay true: their Python blocks run, their commands exist, their links lead somewhere, and
-the site is built of them without a warning."""
+"""README and pages: Python blocks run, commands exist, links resolve, the site builds without a warning."""
 
 from __future__ import annotations
 
@@ -15,7 +14,6 @@ import pytest
 
 from tests.helpers import ROOT, command_names, command_options, run_process, run_python
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [*ROOT.glob("*.md"), ROOT / "scenes" / "README.md", *(ROOT / "docs").rglob("*.md")]
 """Every hand-written page."""
 MADE = {
@@ -27,9 +25,8 @@ MADE = {
 
 def blocks(page: Path, language: str) -> list[str]:
     """The code blocks of a language, outside of lists."""
-    return re.findall(
-        rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
-    )
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
 
 
 def name(page: Path) -> str:
@@ -37,7 +34,7 @@ def name(page: Path) -> str:
 
 
 PYTHON = [
-    pytest.param(code, id=f"{name(page)}-{i}")
+    pytest.param(code, id=f"{name(page)}-{i}", marks=() if page.name == "README.md" else pytest.mark.slow)
     for page in PAGES
     for i, code in enumerate(blocks(page, "python"))
 ]
@@ -71,13 +68,9 @@ def test_commands_exist(page: Path) -> None:
 
 
 def test_readme_setup_commands_match_ci() -> None:
-    assert "bash setup.sh test" in README and "bash setup.sh demo" in README
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "bash setup.sh test" in readme and "bash setup.sh demo" in readme
     assert "bash setup.sh test" in (ROOT / ".ci" / "run").read_text()
-
-
-def test_pages_stay_short() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 110
-    assert len((ROOT / "docs" / "decisions.md").read_text().split()) <= 5000
 
 
 @pytest.mark.parametrize("page", [pytest.param(page, id=name(page)) for page in PAGES])
@@ -110,104 +103,51 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def headings(page: Path) -> set[str]:
-    """Anchors of a built page."""
-    return set(re.findall(r'<h[1-6] id="([^"]+)"', page.read_text(encoding="utf-8")))
+def built(site: Path, page: str) -> tuple[str, set[str]]:
+    """Text of a page of the site, and its anchors."""
+    text = (site / page / "index.html").read_text(encoding="utf-8")
+    return text, set(re.findall(r'<h[1-6] id="([^"]+)"', text))
 
 
 def test_site_has_every_page(site: Path) -> None:
     expected = {page.stem for page in (ROOT / "docs").glob("*.md")} | {Path(made).stem for made in MADE}
     assert {page.parent.name for page in site.glob("*/index.html")} >= expected - {"index"}
-    assert (site / "index.html").is_file()
+    assert "https://www.mitsuba-renderer.org" in (site / "external_links.txt").read_text().split()
 
 
-def test_site_has_every_command(site: Path) -> None:
-    page = site / "cli" / "index.html"
-    assert {*command_names()} <= headings(page)
-    text = page.read_text(encoding="utf-8")
-    for name in command_names():
-        for option in command_options(name):
-            assert option in text or not option.startswith("--"), option
-
-
-def test_site_has_every_public_name(site: Path) -> None:
+def test_generated_pages_are_complete(site: Path) -> None:
+    """Every command and option, public name, plugin, method with its deviations, and setting."""
     import mi_refgs
-
-    page = (site / "api" / "index.html").read_text(encoding="utf-8")
-    for public in mi_refgs.__all__:
-        assert re.search(rf"<h3[^>]*>.*?\b{public}\b.*?</h3>", page, flags=re.DOTALL), public
-
-
-def test_site_has_every_plugin_and_parameter(site: Path) -> None:
+    from mi_refgs.methods.method import LOSS_WEIGHTS
     from mi_refgs.plugins import PLUGINS
 
-    page = site / "plugins" / "index.html"
-    assert set(PLUGINS) <= headings(page)
-    text = page.read_text(encoding="utf-8")
-    for parameter in ("filename", "shade_at", "visibility_rays", "surroundings", "background", "albedo"):
-        assert f"<code>{parameter}</code>" in text
-
-
-def test_site_has_every_method_with_its_deviations(site: Path) -> None:
-    page = site / "methods" / "index.html"
-    text = page.read_text(encoding="utf-8")
+    text, anchors = built(site, "cli")
+    assert {*command_names()} <= anchors
+    for command in command_names():
+        for option in command_options(command):
+            assert option in text or not option.startswith("--"), option
+    text, _ = built(site, "api")
+    for public in mi_refgs.__all__:
+        assert re.search(rf"<h3[^>]*>.*?\b{public}\b.*?</h3>", text, flags=re.DOTALL), public
+    text, anchors = built(site, "plugins")
+    assert set(PLUGINS) <= anchors and "<code>visibility_rays</code>" in text
+    text, anchors = built(site, "methods")
     for path in (ROOT / "variants").glob("*.toml"):
-        assert path.stem in headings(page)
+        assert path.stem in anchors
         for deviation in tomllib.loads(path.read_text())["about"]["deviations"]:
-            assert deviation.split(",")[0].split("<")[0].split("&")[0] in text, deviation
-
-
-def test_site_has_every_setting(site: Path) -> None:
-    from mi_refgs.methods.method import LOSS_WEIGHTS
-
-    text = (site / "settings" / "index.html").read_text(encoding="utf-8")
-    for name in LOSS_WEIGHTS:
-        assert f"<code>{name}</code>" in text
+            assert re.split("[,<&]", deviation)[0] in text, deviation
+    text, _ = built(site, "settings")
+    assert all(f"<code>{loss}</code>" in text for loss in LOSS_WEIGHTS)
     without = re.findall(r"<tr>\s*<td><code>([^<]*)</code></td>(?:\s*<td>.*?</td>){2}\s*<td></td>", text)
-    assert "<code>height</code>" in text and not without, f"settings without a description: {without}"
+    assert not without, f"settings without a description: {without}"
 
 
-def test_site_loads_nothing_from_other_servers(site: Path) -> None:
-    """Neither scripts nor styles, fonts or images: it works without a network."""
+def test_site_works_without_a_network(site: Path) -> None:
+    """Neither scripts nor styles, fonts or images from other servers; sliders have two labelled images."""
+    sliders = []
     for page in site.rglob("*.html"):
         text = re.sub(r'<link rel="canonical"[^>]*>', "", page.read_text(encoding="utf-8"))
-        assert not re.findall(r'<(?:script|img|iframe|source|video)[^>]*src="(?:https?:)?//[^"]*"', text), (
-            page
-        )
-        assert not re.findall(r'<link[^>]*href="(?:https?:)?//[^"]*"', text), page
-
-
-def test_sliders_have_two_labelled_images(site: Path) -> None:
-    """What theme/site.js makes a slider of; its labels are the alternative texts."""
-    found = [
-        box
-        for page in site.rglob("*.html")
-        for box in re.findall(r'<div class="compare">(.*?)</div>', page.read_text("utf-8"), flags=re.DOTALL)
-    ]
-    assert found
-    for box in found:
-        assert len(re.findall(r'<img alt="[^"]+" src="[^"]+" ?/?>', box)) == 2, box
-
-
-def test_site_lists_external_links(site: Path) -> None:
-    listed = (site / "external_links.txt").read_text().split()
-    assert "https://www.mitsuba-renderer.org" in listed
-
-
-BROKEN = ["[a](nowhere.md)", "[a](#nowhere)", "![a](nowhere.png)", "[a](/absolute.md)"]
-
-
-def test_broken_links_fail_the_build(tmp_path: Path) -> None:
-    """With the settings of the real site: each of them is a warning."""
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "index.md").write_text("# Title\n\n" + "\n\n".join(BROKEN))
-    config = tmp_path / "mkdocs.yml"
-    config.write_text(
-        f"INHERIT: {ROOT / 'mkdocs.yml'}\ndocs_dir: docs\nhooks: []\nplugins: []\nnav: [index.md]\n"
-        "theme: {name: mkdocs, icon: null, palette: null}\n"
-    )
-    done = build(config, tmp_path / "site")
-    assert done.returncode != 0
-    for text in BROKEN:
-        target = re.search(r"\((.*)\)", text)
-        assert target and f"'{target[1]}'" in done.stderr, text
+        elsewhere = r'<(?:script|img|iframe|source|video|link)[^>]*(?:src|href)="(?:https?:)?//[^"]*"'
+        assert not re.findall(elsewhere, text), page
+        sliders += re.findall(r'<div class="compare">(.*?)</div>', text, flags=re.DOTALL)
+    assert sliders and all(len(re.findall(r'<img alt="[^"]+" src="[^"]+" ?/?>', x)) == 2 for x in sliders)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from argparse import Namespace
 from collections import Counter
 from dataclasses import fields
 from pathlib import Path
@@ -119,15 +118,6 @@ def test_data_files_have_the_planned_fits(group: str) -> None:
 
 def _rows(group: str) -> list[dict[str, Any]]:
     return list(read_result(RESULTS / f"{group}.json")["rows"])
-
-
-def test_printed_json_becomes_a_data_file(tmp_path: Path) -> None:
-    printed, options = tmp_path / "printed", Namespace(small=False, data=None, output=None)
-    part = everything.Part("frames", 1, f"json.tool {printed}")
-    assert not everything.run(part, options, tmp_path)
-    printed.write_text('{"steps": 1000}')
-    assert everything.run(part, options, tmp_path)
-    assert pages.filled("<!-- frames.steps -->?<!-- / -->", tmp_path).endswith("-->1,000<!-- / -->")
 
 
 @pytest.mark.slow

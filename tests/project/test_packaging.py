@@ -1,9 +1,8 @@
-"""Sdist and wheel hold what they should, install in clean environments, and declare command and plugins."""
+"""Sdist and wheel contain what they should, install in a clean environment, declare command and plugins."""
 
 from __future__ import annotations
 
 import configparser
-import importlib.metadata
 import json
 import re
 import shutil
@@ -34,41 +33,27 @@ LEFT_OUT = {".git", ".venv", "runs", "data", "site", "build", "dist"}
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the sdist, and the wheel that was built of the sdist; without a network, from a copy."""
-    needed = 77  # the first setuptools with licence expressions, as pyproject.toml requires
-    if int(importlib.metadata.version("setuptools").split(".")[0]) < needed:
-        pytest.skip(f"building needs setuptools {needed} (the dev extra installs it)")
     source = tmp_path_factory.mktemp("source") / "checkout"
-    ignore = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*_cache", ".hypothesis")
-    source.mkdir()
-    for path in ROOT.iterdir():
-        if path.is_dir() and path.name not in LEFT_OUT:
-            shutil.copytree(path, source / path.name, ignore=ignore)
-        elif path.is_file() and path.name not in LEFT_OUT:
-            shutil.copy(path, source)
+    made = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*_cache", ".hypothesis")
+    shutil.copytree(ROOT, source, ignore=lambda folder, names: made(folder, names)
+                    | (LEFT_OUT if Path(folder) == ROOT else set()))  # fmt: skip
     target = tmp_path_factory.mktemp("dist")
     done = run_process("-m", "build", "--no-isolation", "-o", target, ".", folder=source, package=source)
     assert done.returncode == 0, done.stdout + done.stderr
     return target
 
 
-@pytest.fixture(scope="module", params=["*.whl", "*.tar.gz"])
-def environment(
-    request: pytest.FixtureRequest, built: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """A clean environment with the wheel or the sdist installed by pip; what they depend on is this one's."""
-    [package] = built.glob(request.param)
+@pytest.fixture(scope="module")
+def environment(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clean environment with the wheel installed by pip; what it depends on is this one's."""
+    [package] = built.glob("*.whl")
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, symlinks=True)
-    here = Path(sysconfig.get_path("purelib"))
-    backend = tmp_path_factory.mktemp("backend")  # setuptools alone: pip must see no other mi_refgs
-    for path in [here / "setuptools", here / "_distutils_hack", *here.glob("setuptools-*.dist-info")]:
-        (backend / path.name).symlink_to(path)
-    options = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "-qq"]
-    done = run_process("-m", "pip", "--python", folder, "install", *options, package, package=backend)
+    options = ["--no-index", "--no-deps", "--disable-pip-version-check", "-qq"]
+    done = run_process("-m", "pip", "--python", folder, "install", *options, package, package=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     [site] = folder.glob("lib/python*/site-packages")
-    others = {str(here), sysconfig.get_path("platlib")}
-    (site / "others.pth").write_text("\n".join(others))
+    (site / "others.pth").write_text(f"{sysconfig.get_path('purelib')}\n{sysconfig.get_path('platlib')}")
     return folder
 
 
@@ -81,33 +66,23 @@ def run_in(environment: Path, *command: str) -> str:
     return done.stdout
 
 
-def test_installed_package_finds_its_modules_and_data(environment: Path) -> None:
+def test_installed_package_works(environment: Path) -> None:
+    """It finds its modules and data, registers its plugins, and its command examines the installation."""
     code = """
-import mi_refgs, json
+import mi_refgs, json, mitsuba as mi
 from mi_refgs.methods.read import load
 from mi_refgs.io.resources import resource_dir
-scenes = resource_dir("scenes")
-scene = (scenes / "glossy_demo.xml").is_file()
-print(json.dumps([mi_refgs.__file__, str(scenes), load("relighting").name, scene]))
+mi.set_variant("llvm_ad_rgb")
+plugin = type(mi.load_dict({"type": "refgs_bsdf"})).__name__
+print(json.dumps([mi_refgs.__file__, str(resource_dir("scenes")), load("relighting").name, plugin]))
 """
-    module, scenes, variant, scene = json.loads(run_in(environment, "python", "-c", code))
+    module, scenes, name, plugin = json.loads(run_in(environment, "python", "-W", "error", "-c", code))
     package = Path(module).parent
     assert environment in package.parents and environment in Path(scenes).parents
-    assert (package / "py.typed").is_file() and variant == "relighting" and scene
-
-
-def test_installed_command_examines_the_installation(environment: Path) -> None:
+    assert (Path(scenes) / "glossy_demo.xml").is_file() and (package / "py.typed").is_file()
+    assert (name, plugin) == ("relighting", "RefGSBSDF")
     found = json.loads(run_in(environment, "refgs", "doctor", "--json"))
     assert found["usable"] and found["mi_refgs"] == mi_refgs.__version__
-
-
-def test_installed_package_registers_its_plugins(environment: Path) -> None:
-    code = """
-import mi_refgs, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-print(type(mi.load_dict({"type": "refgs_bsdf"})).__name__)
-"""
-    assert run_in(environment, "python", "-W", "error", "-c", code).strip() == "RefGSBSDF"
 
 
 def test_sdist_contains_all_that_checks_need(built: Path) -> None:
@@ -146,20 +121,14 @@ def test_wheel_contains_the_package_and_nothing_else(built: Path) -> None:
     assert points["mitsuba"]["refgs"] == "mi_refgs.plugins.integrator"
 
 
-def test_plugins_and_entry_points_name_the_same_modules() -> None:
+def test_plugins_and_packages_are_listed() -> None:
     from mi_refgs.plugins import PLUGINS
 
     modules = {name: module for name, (_, module) in PLUGINS.items()}
     assert modules == PROJECT["project"]["entry-points"]["mitsuba"]
-
-
-def test_every_package_is_listed() -> None:
-    packages = {
-        ".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "mi_refgs").rglob("__init__.py")
-    }
-    assert packages | {"mi_refgs.variants", "mi_refgs.scenes"} == set(
-        PROJECT["tool"]["setuptools"]["packages"]
-    )
+    found = {path.parent.relative_to(ROOT) for path in (ROOT / "mi_refgs").rglob("__init__.py")}
+    packages = {".".join(path.parts) for path in found} | {"mi_refgs.variants", "mi_refgs.scenes"}
+    assert packages == set(PROJECT["tool"]["setuptools"]["packages"])
 
 
 IMPORT_NAMES = {
@@ -201,16 +170,7 @@ def test_doctor_checks_modules_of_the_extras() -> None:
         assert any(line.startswith(distribution) for line in extras[name]), name
 
 
-def test_version_is_stated_once() -> None:
-    assert re.fullmatch(r"\d+\.\d+\.\d+", mi_refgs.__version__)
-    assert PROJECT["project"]["dynamic"] == ["version"]
-
-
-@pytest.mark.parametrize("name", ["variants", "scenes"])
-def test_checkout_finds_its_data(name: str) -> None:
-    assert resource_dir(name) == ROOT / name
-
-
-def test_missing_data_is_refused() -> None:
+def test_checkout_finds_its_data() -> None:
+    assert [resource_dir(name) for name in ("variants", "scenes")] == [ROOT / "variants", ROOT / "scenes"]
     with pytest.raises(InputError, match="absent: the folder is missing from this installation"):
         resource_dir("absent")
