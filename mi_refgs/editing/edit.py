@@ -17,9 +17,8 @@ from mi_refgs.editing.values import COLOUR
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import contact_sheet, image_array
 from mi_refgs.render.display import displayed
-from mi_refgs.runs.relightable import relightable
+from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.splat import Camera
 
 PREVIEWS = 4
@@ -85,7 +84,7 @@ def notes_of(scene: TrainedScene, change: Change) -> list[str]:
         if ("radiance_sh" if name == COLOUR else name) not in read
     ]
     lit = shading.model.light != "none" and "radiance_sh" in read
-    has_materials = scene.light is not None and all(surfels.has(name) for name in MATERIALS)
+    has_materials = not lacking(scene)
     convert = "; --materials computes an albedo instead" if has_materials and lit else ""
     if lit and {*names} & {"albedo", "metallic"}:
         notes.append(

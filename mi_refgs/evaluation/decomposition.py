@@ -21,7 +21,7 @@ from mi_refgs.evaluation.surface import NO_SURFACE
 from mi_refgs.io.images import psnr_of
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.reflectance import Reflectance
 from mi_refgs.splat import Camera
 
 KNOWN_SHARE = 0.5  # fraction of a pixel that a true material must cover for it to count
@@ -132,11 +132,18 @@ def material_maps(
     Where the diffuse part was fitted as a colour, albedo is rendered from the materials that `relightable`
     makes of it, with `samples` per pixel: the fitted attribute is only the colour of metals.
     """
-    if fitted.shading.diffuse != "sh":
-        return lambda camera, rendered: rendered.maps
+    if "radiance_sh" not in fitted.shading.required_attributes:
+        return lambda camera, rendered: _comparable(fitted.shading.model, rendered.maps)
     try:
         scene = relightable(fitted)
     except InputError:  # without light or materials there is no albedo
         return lambda camera, rendered: {n: m for n, m in rendered.maps.items() if n != "albedo"}
-    render = replace(scene, shading=Shading("pixel", "split_sum", "irradiance")).renderer(samples=samples)
+    render = replace(scene, shading=scene.shading.untraced()).renderer(samples=samples)
     return lambda camera, rendered: RenderedView.maps_of(render(camera), *rendered.alpha.shape)
+
+
+def _comparable(model: Reflectance, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return maps with NAMES as `Reflectance.textures` converts them; without them if it does not."""
+    made = model.textures(maps) or {}
+    others = {name: shown for name, shown in maps.items() if name not in NAMES}
+    return others | {name: made[name] for name in NAMES if name in maps and name in made}

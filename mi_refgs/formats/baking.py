@@ -6,7 +6,7 @@ point of the mesh. Points that no view sees get those of the surfels around the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -27,10 +27,9 @@ from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import safe_normalize
-from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.reflectance import Reflectance
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Float, Point2f, Point3f, UInt32, Vector3f
+from mi_refgs.types import Array, Float, Point2f, Point3f, UInt32, Vector3f
 
 PACKAGES = "fast_simplification", "xatlas"
 """Packages of the extra that baking needs; trimesh calls the former."""
@@ -82,9 +81,12 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
         raise SceneError("mesh: the run has none; fit one with occlusion, as `--for relighting` does")
+    model = scene.shading.model
+    if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
+        raise SceneError(f"reflectance: {model.name} has no textures; export `scene.xml`, or another model")
 
     # Views that show the object's materials.
-    plain = replace(scene, shading=Shading("pixel", "split_sum", "irradiance", False))
+    plain = replace(scene, shading=scene.shading.untraced())
     views = [shots[i].camera.resized(VIEW_SIZE) for i in evenly_spread(len(shots), VIEWS)]
     with dr.suspend_grad():
         renderer = plain.renderer()
@@ -93,8 +95,13 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
         vertex, cut_faces, uv = unwrap(mesh, texture)
         covered, triangle, barycentric = texels(cut_faces, uv, texture)
         # Materials and normals at vertices and texels.
-        points, start = _points(mesh, scene.surfels, triangle, barycentric)
-        found = _mean_of_views(views, renderer, points, start, OFFSET_VOXELS * mesh.voxel)
+        points, start = _points(mesh, scene, triangle, barycentric)
+
+        def rendered(view: Camera) -> tuple[Frame, list[Float]]:
+            frame = renderer(view)
+            return frame, _columns(model, frame.maps)
+
+        found = _mean_of_views(views, rendered, points, start, OFFSET_VOXELS * mesh.voxel)
     count = len(mesh.vertices)
     maps = _padded(covered, found[count:, :5])
     return TexturedMesh(
@@ -200,9 +207,16 @@ def _normals(mesh: Mesh) -> np.ndarray:
 # ---------------- materials and normals ----------------
 
 
+def _columns(model: Reflectance, values: Mapping[str, Array]) -> list[Float]:
+    """Return albedo, metallic and roughness of attributes by name."""
+    made = model.textures(values)
+    assert made is not None  # `bake` refuses others
+    return [*made["albedo"], made["metallic"], made["roughness"]]
+
+
 def _points(
     mesh: Mesh,
-    surfels: Surfels,
+    scene: TrainedScene,
     triangle: UInt32,  # (T,)
     barycentric: Point2f,  # (T,)
 ) -> tuple[Point3f, list[Float]]:
@@ -210,7 +224,7 @@ def _points(
 
     Materials are those of the surfels around the vertices, normals those of the mesh.
     """
-    nearby = VertexSurfels.of(mesh, surfels)
+    nearby = VertexSurfels.of(mesh, scene.surfels)
     vertices = dr.arange(mi.UInt32, len(mesh.vertices))
     corners = [dr.gather(mi.UInt32, nearby.faces, 3 * triangle + i) for i in range(3)]
     weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
@@ -219,8 +233,9 @@ def _points(
         mixed = sum(w * dr.gather(mi.Float, column, c) for w, c in zip(weights, corners, strict=True))
         return dr.concat((dr.gather(mi.Float, column, vertices), mixed))
 
-    rows = nearby.surface(surfels).rows
-    materials = [interpolated(dr.gather(mi.Float, rows, COLUMNS * vertices + i)) for i in range(5)]
+    columns = nearby.values(scene.surfels, scene.shading.required_attributes)
+    values = {name: own[0] if len(own) == 1 else mi.Color3f(*own) for name, own in columns.items()}
+    materials = [interpolated(column) for column in _columns(scene.shading.model, values)]
     normal = mi.Vector3f(*(interpolated(upload(column)) for column in _normals(mesh).T))
     points = mi.Point3f(*(interpolated(upload(column)) for column in mesh.vertices.T))
     return points, [*materials, *safe_normalize(normal)]
@@ -228,7 +243,7 @@ def _points(
 
 def _mean_of_views(
     views: Sequence[Camera],
-    renderer: Callable[[Camera], Frame],
+    renderer: Callable[[Camera], tuple[Frame, list[Float]]],
     points: Point3f,  # (P,)
     start: list[Float],  # COLUMNS × (P,)
     reach: float,  # scene units
@@ -242,7 +257,7 @@ def _mean_of_views(
     weight = dr.full(mi.Float, UNSEEN, dr.width(points))
     total = [UNSEEN * column for column in start]
     for view in views:
-        own, values = _sample_view(view, renderer(view), points, outward, dr.opaque(mi.Float, reach))
+        own, values = _sample_view(view, *renderer(view), points, outward, dr.opaque(mi.Float, reach))
         weight += own
         total = [a + b for a, b in zip(total, values, strict=True)]
         dr.eval(weight, total)
@@ -256,6 +271,7 @@ def _mean_of_views(
 def _sample_view(
     camera: Camera,
     frame: Frame,
+    materials: list[Float],  # albedo, metallic, roughness of its pixels
     points: Point3f,  # (P,)
     outward: Vector3f,  # (P,) unit normals
     reach: Float,  # scene units
@@ -263,8 +279,7 @@ def _sample_view(
     """Return a view's weight at points (P,), and the weighted COLUMNS: bilinear, of pixels at their depth."""
     # Interleaved rows of pixels: COLUMNS, alpha, depth.
     normal = safe_normalize(frame.normal)
-    rows = [*frame.maps["albedo"], frame.maps["metallic"], frame.maps["roughness"], *normal]
-    table = dr.ravel(mi.ArrayXf([*rows, frame.alpha, frame.depth]))
+    table = dr.ravel(mi.ArrayXf([*materials, *normal, frame.alpha, frame.depth]))
     # Raster positions of the points, and the cosines at which the view sees them.
     local = camera.to_camera(points)
     before = local.z > camera.near

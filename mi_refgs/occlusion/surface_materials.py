@@ -6,7 +6,7 @@ materials are gathered for every render, so that the surfels' own parameters rec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -19,7 +19,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Bool, Color3f, Float, Point2f, UInt32, Vector3f
+from mi_refgs.types import Array, Bool, Color3f, Float, Point2f, UInt32, Vector3f
 
 NEIGHBOURS = 4  # surfels per vertex: those that overlap at a point of a fitted surface with visible weight
 
@@ -30,16 +30,14 @@ NORMAL_AGREEMENT = 0.5
 """Cosine between the neighbours' mean normal and the mesh's from which the former, which a fit has smoothed,
 is used: at a rim the neighbours belong to another face."""
 
-MATERIALS = ("albedo", "metallic", "roughness")  # attributes that hits are shaded with
+GROUP = 4  # columns that one access reads
 
 
 @dataclass(frozen=True)
 class SurfaceSample:
     """The surface where N rays meet it; the normal is detached."""
 
-    albedo: Color3f
-    metallic: Float
-    roughness: Float
+    values: dict[str, Array]  # attributes by name, interpolated: mi.Float, mi.Color3f or a list of columns
     normal: Vector3f  # interpolated, outward, not unit
     surfel: UInt32  # the surfel nearest to the nearest vertex
 
@@ -59,13 +57,8 @@ class VertexSurfels:
         """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
 
         The footprint is the surfel's own Gaussian, wider by a voxel along its normal. Detached. Raises
-        InputError if there are no surfels, or an attribute of MATERIALS is missing.
+        InputError if there are no surfels.
         """
-        for name in MATERIALS:
-            if not surfels.has(name):
-                raise InputError(
-                    f"occluder: {name}: surfels have no such attribute; add it, or trace nothing"
-                )
         if not surfels.count:
             raise InputError("occluder: surfels: there are none to take materials from")
         usable, surfels = np.flatnonzero(surfels.usable().numpy()), surfels.detach().cleaned()
@@ -111,20 +104,36 @@ class VertexSurfels:
             mi.Vector3f(*(upload(row) for row in arrays["normals"])),
         )
 
-    def surface(self, surfels: Surfels) -> Surface:
-        """The mesh with the present materials of the surfels, under AD.
+    def values(self, surfels: Surfels, names: Sequence[str]) -> dict[str, list[Float]]:
+        """The present values of attributes of the surfels at the vertices, by name: columns (V,), under AD.
 
-        Raises InputError for another number of surfels than `of` has seen.
+        Raises InputError for another number of surfels than `of` has seen, and for an absent attribute.
         """
+        for name in names:
+            if not surfels.has(name):
+                raise InputError(
+                    f"occluder: {name}: surfels have no such attribute; add it, or trace nothing"
+                )
         if surfels.count != self.count:
             numbers = f"there are {surfels.count}, but the mesh was given {self.count}"
             raise InputError(f"occluder: surfels: {numbers}; call Occluder.set_materials after each change")
-        columns = [*surfels.value("albedo"), surfels.value("metallic"), surfels.value("roughness")]
-        mixed = [mi.Float(0) for _ in columns]
-        for surfel, weight in zip(self.surfel, self.weight, strict=True):
-            for i, column in enumerate(columns):
-                mixed[i] += weight * dr.gather(mi.Float, column, surfel)
-        return Surface(self, dr.ravel(mi.ArrayXf([*mixed, *self.normal])))
+        found = {}
+        for name in names:
+            value = surfels.value(name)
+            columns = [value] if surfels.raw[name].shape[1] == 1 else [*value]
+            mixed = found[name] = [mi.Float(0) for _ in columns]
+            for surfel, weight in zip(self.surfel, self.weight, strict=True):
+                for i, column in enumerate(columns):
+                    mixed[i] += weight * dr.gather(mi.Float, column, surfel)
+        return found
+
+    def surface(self, surfels: Surfels, names: Sequence[str]) -> Surface:
+        """The mesh with the present `values`, to look up at hits."""
+        values = self.values(surfels, names)
+        columns = [column for own in values.values() for column in own] + [*self.normal]
+        columns += [mi.Float(0)] * (-len(columns) % GROUP)
+        widths = {name: len(own) for name, own in values.items()}
+        return Surface(self, dr.ravel(mi.ArrayXf(columns)), widths)
 
 
 @dataclass(frozen=True)
@@ -132,20 +141,30 @@ class Surface:
     """A mesh with materials, to look up at hits."""
 
     vertex_surfels: VertexSurfels
-    rows: Float  # (8 V,): albedo, metallic | roughness, normal
+    rows: Float  # by vertices: columns of the attributes, normal, zeros up to a multiple of GROUP
+    widths: dict[str, int]  # columns of each attribute
+
+    @property
+    def groups(self) -> int:
+        """Groups of a vertex."""
+        return -(-(sum(self.widths.values()) + 3) // GROUP)
 
     def at(self, triangle: UInt32, barycentric: Point2f, active: Bool) -> SurfaceSample:
         """Attributes at barycentric coordinates of the second and third corner."""
-        near, far = mi.Vector4f(0), mi.Vector4f(0)
+        mixed = [mi.Vector4f(0) for _ in range(self.groups)]
         closest, largest = mi.UInt32(0), mi.Float(-1)
         for vertex, share in _corners(self.vertex_surfels.faces, triangle, barycentric, active):
-            near += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex, active)
-            far += share * dr.gather(mi.Vector4f, self.rows, 2 * vertex + 1, active)
+            for i in range(self.groups):
+                mixed[i] += share * dr.gather(mi.Vector4f, self.rows, self.groups * vertex + i, active)
             closest = dr.select(share > largest, vertex, closest)
             largest = dr.maximum(share, largest)
         surfel = dr.gather(mi.UInt32, self.vertex_surfels.surfel[0], closest, active)
-        normal = mi.Vector3f(far.y, far.z, far.w)
-        return SurfaceSample(mi.Color3f(near.x, near.y, near.z), near.w, far.x, normal, surfel)
+        columns = (column for group in mixed for column in group)
+        values = {}
+        for name, width in self.widths.items():
+            own = [next(columns) for _ in range(width)]
+            values[name] = own[0] if width == 1 else mi.Color3f(*own) if width == 3 else own
+        return SurfaceSample(values, mi.Vector3f(*(next(columns) for _ in range(3))), surfel)
 
 
 @dataclass(frozen=True)

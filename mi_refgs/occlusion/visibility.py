@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,23 +73,24 @@ class Occluder:
         return self._mesh is None or not len(self._mesh.faces)
 
     def set_materials(self, surfels: Surfels) -> None:
-        """Find the surfels around every vertex, whose materials `surface` then reads, under AD.
+        """Find the surfels around every vertex, whose attributes `surface` then reads, under AD.
 
         Call it again after `update`, and whenever surfels move or their number changes; new values of their
-        materials need no call. Raises InputError without surfels or without their material attributes.
+        materials need no call. Raises InputError without surfels.
         """
         self.vertex_surfels = None
         if self._mesh is not None and not self.empty:
             self.vertex_surfels = VertexSurfels.of(self._mesh, surfels)
 
-    def surface(self, surfels: Surfels) -> Surface:
-        """The mesh with the present materials of `surfels`, to look up where `closest` hits it.
+    def surface(self, surfels: Surfels, names: Sequence[str] = ()) -> Surface:
+        """The mesh with the present values of attributes of `surfels`, to look up where `closest` hits it.
 
-        Raises InputError without a `set_materials` for this mesh and this number of surfels.
+        Raises InputError without a `set_materials` for this mesh and this number of surfels, and for an
+        attribute that is absent.
         """
         if self.vertex_surfels is None:
             raise InputError("occluder: materials: none are set; call Occluder.set_materials after update")
-        return self.vertex_surfels.surface(surfels)
+        return self.vertex_surfels.surface(surfels, names)
 
     def visible(
         self, origin: Point3f, direction: Vector3f, normal: Vector3f = None, active: Bool = True

@@ -29,7 +29,7 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.near_field import LocalLight, NearField
 from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
-from mi_refgs.shade.shading import Shading, shade
+from mi_refgs.shade.shading import Shading, shade, trace
 from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives import primitive_of
@@ -226,7 +226,7 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
         points = points.replaced(position=scene.surfels.position())
         origin, ray = view.camera.origin, -points.view
         context = TraceContext(scene.occluder, scene.surfels, scene.light, origin, ray)
-        points = scene.shading.model.trace(points, context, scene.shading)
+        points = trace(points, context, scene.shading)
     terms = shade(points, scene.light_at(scene.surfels.position()), scene.shading)
 
     # Slots: the radiance and the requested AOVs only, since each costs time in every surfel-tile pair.
@@ -278,7 +278,7 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
         assert scene.occluder is not None  # by `Shading.require_inputs`
         covered = dr.detach(alpha) > COVERAGE_FLOOR
         context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
-        points = shading.model.trace(points, context, shading)
+        points = trace(points, context, shading)
         maps["visibility"] = points.visibility
 
     # Radiance, premultiplied.

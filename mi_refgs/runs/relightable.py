@@ -21,9 +21,10 @@ from mi_refgs.shade.ambient import ambient
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.shade.reflectance.split_sum import MATERIALS
+from mi_refgs.shade.reflectance.model import LIT
+from mi_refgs.shade.reflectance.split_sum import SplitSum
 from mi_refgs.shade.sh import sh_basis
-from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.shading import RELIT_RAYS
 from mi_refgs.shade.split_sum import DIELECTRIC_F0
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
@@ -33,53 +34,40 @@ COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)
 over π]"""
 IRRADIANCE_FLOOR = 1e-4
 """Fraction of the brightest irradiance below which a surfel is dark whatever its albedo."""
-RELIGHT_RAYS = 16
-"""Specular-lobe samples per pixel. PSNR of two balls of known materials, relit at 128² with 2 × 2 samples,
-against the path tracer: 33.6 dB with one, 34.2 with 4, 34.4 with 16 and 34.5 with 64."""
-RELIGHT_BOUNCES = 2
-"""Traced bounces. In a self-reflecting bowl of `benchmarks.visibility`, one bounce misses 27 % of the light,
-two 9 %, four 3 %."""
-AMBIENT_RAYS = 128  # per vertex of the mesh
 
 
 def lacking(scene: TrainedScene) -> str:
-    """Names of the materials, or "light", that a scene lacks to be `relightable`; empty if it is."""
-    missing = [name for name in MATERIALS if not scene.surfels.has(name)]
-    return ", ".join(missing) or ("light" if scene.light is None else "")
+    """Why a scene is not `relightable`; empty if it is."""
+    fitted, shading = scene.shading, scene.shading.relit(scene.mesh is not None)
+    if shading is None:
+        return f"reflectance: {fitted.reflectance} shows the light of the fit only"
+    if fitted.required_attributes != shading.required_attributes and not isinstance(fitted.model, SplitSum):
+        return f"diffuse: no albedo follows from what {fitted.reflectance} fitted to the light"
+    missing = [name for name in shading.required_attributes if not scene.surfels.has(name)]
+    what = ", ".join(missing) or ("light" if scene.light is None else "")
+    return f"{what}: the run has none" if what else ""
 
 
 def relightable(scene: TrainedScene) -> TrainedScene:
-    """Reduce a scene to albedo, metallic and roughness, so that any light can replace its own.
+    """Reduce a scene to attributes that do not depend on its light, so that another can replace it.
 
-    A diffuse part that was fitted as an SH colour becomes an albedo (`albedo_from_radiance`). Attributes that
-    are fitted to the light (radiance, indirect) are removed; interreflection is traced instead, if the scene
-    has a mesh. The light stays, infinitely far, and so do other shading options. Any reflectance model is
-    replaced by `split_sum`. The background is removed: its brightness is that of the photographs. A scene
-    that has only materials keeps them as they are.
+    The reflectance model stays, with the options of its `relit`. A diffuse part that `split_sum` fitted as an
+    SH colour becomes an albedo (`albedo_from_radiance`). Attributes that are fitted to the light (radiance,
+    indirect) are removed; interreflection is traced instead, if the scene has a mesh. The light stays,
+    infinitely far. The background is removed: its brightness is that of the photographs.
 
-    Raises InputError for a scene without light or one of the materials.
+    Raises InputError for a scene without light, or whose model has no such attributes.
     """
-    if what := lacking(scene):
-        raise SceneError(
-            f"{what}: the run has none; fit one with materials and a light, as `--for relighting` does"
-        )
-    assert scene.light is not None
+    if why := lacking(scene):
+        raise SceneError(f"{why}; fit one with materials and a light, as `--for relighting` does")
+    shading = scene.shading.relit(scene.mesh is not None)
+    assert scene.light is not None and shading is not None  # by `lacking`
     surfels, mesh = scene.surfels.detach(), scene.mesh
     if mesh is not None and scene.surroundings is not None:
         mesh = _near(mesh, surfels)
-    if scene.shading.diffuse == "sh" and "radiance_sh" in scene.shading.required_attributes:
+    if scene.shading.required_attributes != shading.required_attributes:
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
-    kept = {name: raw for name, raw in surfels.raw.items() if name not in ("radiance_sh", "indirect_sh")}
-    rays, bounces, ambient_rays = (1, 0, 0) if mesh is None else (RELIGHT_RAYS, RELIGHT_BOUNCES, AMBIENT_RAYS)
-    shading = replace(
-        scene.shading if scene.shading.reflectance == "split_sum" else Shading(),
-        at="pixel",
-        diffuse="irradiance",
-        occlusion=mesh is not None,
-        visibility_rays=rays,
-        traced_bounces=bounces,
-        ambient_rays=ambient_rays,
-    )
+    kept = {name: raw for name, raw in surfels.raw.items() if name not in LIT}
     return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None, near=None)
 
 
@@ -126,7 +114,9 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         # Interreflection depends on the albedo of other parts: that without shadows is close enough.
         occluder = Occluder(mesh)
         occluder.set_materials(found)
-        ratios = ambient(occluder, found, light, ShadingOptions(ambient_rays=AMBIENT_RAYS)).numpy()
+        ratios = ambient(
+            occluder, found, light, ShadingOptions(ambient_rays=RELIT_RAYS["ambient_rays"])
+        ).numpy()
         return with_shadows(ratios[vertex])
 
 

@@ -16,7 +16,7 @@ first: each of BOUNCES rounds adds a bounce. Ratios are detached and kept until 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields
 from typing import Any
 
 import drjit as dr
@@ -29,7 +29,8 @@ from mi_refgs.shade.ggx_sampling import lobe_point, lobe_turn
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import safe_normalize
-from mi_refgs.shade.reflection import MeshRadiance, TraceContext
+from mi_refgs.shade.reflectance.model import TraceContext
+from mi_refgs.shade.reflection import MeshRadiance
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, UInt32, Vector3f
 
@@ -65,7 +66,8 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     rays = dr.opaque(mi.UInt32, options.ambient_rays)
     blur = dr.opaque(mi.Float, ray_roughness(options.ambient_rays))
-    traced = replace(options, traced_bounces=1, diffuse="irradiance")
+    given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
+    traced = ShadingOptions(**given | {"traced_bounces": 1, "diffuse": "irradiance"})  # whatever is honoured
     ratios: VertexColours | None = None  # the first round is unoccluded
     for _bounce in range(BOUNCES):
         scene = MeshRadiance.of(occluder, surfels, light, traced, ratios)

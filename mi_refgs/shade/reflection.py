@@ -20,37 +20,16 @@ from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
-from mi_refgs.shade.sh import clamp_positive, eval_sh
-from mi_refgs.shade.split_sum import base_reflectance, lookup_direction, shade
+from mi_refgs.shade.reflectance.model import MODELS, Reflectance, SurfelView, TraceContext
+from mi_refgs.shade.split_sum import lookup_direction
+from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Bool, Color3f, Float, Point2f, Point3f, UInt32, Vector3f
+from mi_refgs.types import Array, Bool, Color3f, Float, Point2f, Point3f, UInt32, Vector3f
 
 CLAMP_MAX_ALPHA = 1 / 3
 """α of a lobe from which single bright rays are not clamped. In the concave scenes of
 `benchmarks.visibility`, 4 rays and 6 bounces, the clamp takes 17 to 42 % off relMSE at α = 0.01, 0 to 33 % at
 0.09, and adds up to 15 % at 0.36."""
-
-
-@dataclass(frozen=True)
-class TraceContext:
-    """The scene that rays from N shading points are traced in, and the primary rays to the points."""
-
-    occluder: Occluder
-    surfels: Surfels
-    light: Light | None  # None if the model looks none up
-    origin: Point3f  # (1,) the camera
-    ray: Vector3f  # (N,) from the camera to the points, of any length
-    covered: Bool = True  # (N,) or a literal; nothing is traced for the other points
-    pixel: UInt32 = None  # (N,) image index that seeds the random numbers; None: 0 … N - 1
-
-    def start(self, normal: Vector3f) -> tuple[Point3f, Vector3f, Bool]:
-        """Where the primary rays meet the mesh, the unit normals there, and whether they do; detached.
-
-        Not the blended depth: at a silhouette, and between two layers, that lies inside the object and every
-        ray from there is blocked, which draws a dark outline.
-        """
-        distance, hit = self.occluder.first_hit(self.origin, self.ray, self.covered)
-        return mi.Point3f(mi.Vector3f(self.origin) + distance * self.ray), safe_normalize(normal), hit
 
 
 def mirror_visibility(context: TraceContext, normal: Vector3f, view: Vector3f) -> Float:
@@ -75,8 +54,21 @@ class MeshHit:
 
 
 @dataclass(frozen=True)
+class HitSurfels:
+    """The surfels at hits, as `Reflectance.values` reads them."""
+
+    values: dict[str, Array]  # activated, by attribute
+
+    def has(self, name: str) -> bool:
+        return name in self.values
+
+    def value(self, name: str) -> Array:
+        return self.values[name]
+
+
+@dataclass(frozen=True)
 class MeshRadiance:
-    """Radiance of the mesh, shaded by `split_sum.shade` with the materials of the surfels.
+    """Radiance of the mesh, shaded by the reflectance model with the attributes of the surfels.
 
     The specular light of a hit requires visibility in its own mirror direction, which is traced once more.
     Without that, a hit deep in a bowl shines as if it were in the open, and the image is worse than without
@@ -86,16 +78,15 @@ class MeshRadiance:
     bowl is 0.10 with none, 0.98 with the unblocked light and 3.8 with the irradiance.) The recursion is
     unrolled: every number of bounces is a kernel of its own, and its length grows with them.
 
-    With diffuse="sh" the diffuse part is the SH radiance of the surfel nearest to the hit, along the ray: the
-    quantity that pixels blend, tied to the light it was fitted under. Relighting requires "irradiance".
+    Spherical harmonics are those of the surfel nearest to the hit, along the ray, other attributes means of
+    the surfels around it.
     """
 
     occluder: Occluder
     surface: Surface
     light: Light
     options: ShadingOptions
-    harmonics: Float  # (3 C N,) radiance_sh by rows; empty unless diffuse="sh"
-    count: int  # C
+    harmonics: dict[str, tuple[Float, int]]  # by attribute: coefficients (3 C N,) by rows, and C
     ambient: VertexColours | None  # ratios of irradiance that arrive, see `shade.ambient`
 
     @staticmethod
@@ -108,13 +99,22 @@ class MeshRadiance:
     ) -> MeshRadiance:
         """Take the present values of all arguments, and evaluate them."""
         surfels = surfels.cleaned()  # one that became unusable after `set_materials` may still be looked up
-        surface = occluder.surface(surfels)
-        coefficients = surfels.value("radiance_sh") if options.diffuse == "sh" else []
-        # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose adjoint
-        # writes several columns at a time, must not be written to in the same kernel.
-        harmonics = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c])) if coefficients else mi.Float()
+        names = MODELS[options.reflectance].required_attributes(options)
+        surface = occluder.surface(surfels, [name for name in names if not attribute(name).harmonics])
+        harmonics = {}
+        for name in (name for name in names if attribute(name).harmonics):
+            # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose
+            # adjoint writes several columns at a time, must not be written to in the same kernel.
+            coefficients = surfels.value(name)
+            rows = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c]))
+            harmonics[name] = rows, len(coefficients)
         dr.eval(surface.rows, harmonics)
-        return MeshRadiance(occluder, surface, light, options, harmonics, len(coefficients), ambient)
+        return MeshRadiance(occluder, surface, light, options, harmonics, ambient)
+
+    @property
+    def model(self) -> Reflectance:
+        """The reflectance model."""
+        return MODELS[self.options.reflectance]
 
     def trace(
         self, point: Point3f, direction: Vector3f, normal: Vector3f, active: Bool, bounces: int
@@ -135,28 +135,20 @@ class MeshRadiance:
         """Radiance that leaves the hits against the rays, under AD."""
         sample = self.surface.at(hit.triangle, hit.barycentric, hit.valid)
         normal = self._facing(sample, direction)
-        own = ambient = indirect = None
-        if self.count:
-            row = sample.surfel * self.count
-            rows = (row + i for i in range(self.count))
-            coefficients = [dr.gather(mi.Color3f, self.harmonics, i, hit.valid) for i in rows]
-            own = clamp_positive(eval_sh(coefficients, direction) + 0.5)
+        ambient = indirect = None
+        attributes = dict(sample.values)
+        for name, (rows, count) in self.harmonics.items():
+            row = sample.surfel * count
+            attributes[name] = [dr.gather(mi.Color3f, rows, row + i, hit.valid) for i in range(count)]
+        surfels: Any = HitSurfels(attributes)
+        values = {**self.model.values(surfels, SurfelView(direction, normal), self.options)}
         if self.options.ambient_rays and self.ambient is not None:
             ambient = self.ambient.at(hit.triangle, hit.barycentric, hit.valid)
         if hit.next is not None:
             indirect = self.radiance(hit.next, reflect(view=-direction, normal=normal))
-        points = ShadingPoints(
-            normal=normal,
-            view=-direction,
-            albedo=sample.albedo,
-            metallic=sample.metallic,
-            roughness=sample.roughness,
-            radiance=own,
-            visibility=hit.visibility,
-            indirect=indirect,
-            ambient=ambient,
-        )
-        return shade(points, self.light, self.options).total()
+        traced = {"visibility": hit.visibility, "indirect": indirect, "ambient": ambient}
+        points = ShadingPoints(values.pop("normal", normal), -direction, values | traced)
+        return self.model.shade(points, self.light, self.options).total()
 
     def _facing(self, sample: SurfaceSample, direction: Vector3f) -> Vector3f:
         """Unit normal on the ray's side, unless it only leans away (see `FACING_TOLERANCE`)."""
@@ -184,7 +176,7 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
     with dr.suspend_grad():
         start = context.start(normal)
     if options.visibility_rays > 1:
-        visibility, indirect = _average(points, context, scene, start, options.visibility_rays)
+        visibility, indirect = _average(points, context, scene, start, options)
     else:
         assert scene is not None
         point, facing, seen = start
@@ -203,18 +195,19 @@ def _average(
     context: TraceContext,
     scene: MeshRadiance | None,
     start: tuple[Point3f, Vector3f, Bool],
-    rays: int,
+    options: ShadingOptions,
 ) -> tuple[Float, Color3f | None]:
     """Mean visibility over samples of the lobe, weighted by the specular integrand, and the mean radiance of
     the blocked ones (None without a `scene`), in one loop."""
     point, facing, seen = start
-    count = dr.opaque(mi.UInt32, rays)
+    count = dr.opaque(mi.UInt32, options.visibility_rays)
     with dr.suspend_grad():
-        lobe = Lobe.of(facing, points.view, points.roughness, base_reflectance(points), context.pixel)
+        roughness, f0 = MODELS[options.reflectance].lobe(points)
+        lobe = Lobe.of(facing, points.view, roughness, f0, context.pixel)
         unblocked = None  # mean radiance of the others
         if scene is not None:
-            towards = lookup_direction(facing, points.view, points.roughness, scene.options)
-            unblocked = scene.light.specular(towards, points.roughness)
+            towards = lookup_direction(facing, points.view, roughness, options)
+            unblocked = scene.light.specular(towards, roughness)
 
     def body(index: Any, free: Any, blocked: Any, total: Any, largest: Any) -> tuple[Any, ...]:
         with dr.suspend_grad():
@@ -222,7 +215,7 @@ def _average(
             if scene is None:
                 stopped = context.occluder.visible(point, direction, facing, weight > 0) == 0
             else:
-                hit = scene.trace(point, direction, facing, weight > 0, scene.options.traced_bounces)
+                hit = scene.trace(point, direction, facing, weight > 0, options.traced_bounces)
                 stopped = hit.valid
         if scene is not None:
             found = dr.select(stopped, weight * scene.radiance(hit, direction), 0)

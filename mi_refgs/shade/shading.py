@@ -8,12 +8,21 @@ from typing import Any
 
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.timing import phase
+from mi_refgs.shade.ambient import ambient_of_pixels
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.lobe_matrices import Levels
 from mi_refgs.shade.options import DIFFUSE, TRACED, Diffuse, ShadedAt, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
-from mi_refgs.shade.reflectance import MODELS, Reflectance
+from mi_refgs.shade.reflectance import MODELS, Reflectance, TraceContext
+from mi_refgs.shade.reflection import reflection
+
+UNTRACED: dict[str, Any] = {name: getattr(ShadingOptions, name) for name in ("occlusion", *TRACED)}
+
+RELIT_RAYS = {"visibility_rays": 16, "traced_bounces": 2, "ambient_rays": 128}
+"""Rays under another light. PSNR of two balls of known materials, relit at 128² with 2 × 2 samples, against
+path tracing: 33.6 dB with one ray, 34.2 with 4, 34.4 with 16 and 34.5 with 64. In a self-reflecting bowl one
+bounce misses 27 % of the light, two 9 %, four 3 %."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +77,22 @@ class Shading(ShadingOptions):
     def resolve(options: ShadingOptions, mesh: bool) -> Shading:
         """The options of a stage: occluded if `traceable` and there is a `mesh`; else without TRACED ones."""
         given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
-        untraced = Shading(**given | {name: getattr(ShadingOptions, name) for name in ("occlusion", *TRACED)})
+        untraced = Shading(**given | UNTRACED)
         return Shading(**given | {"occlusion": True}) if mesh and untraced.traceable else untraced
+
+    def relit(self, mesh: bool) -> Shading | None:
+        """The shading under another light, occluded by a `mesh` if there is one; None: the model has none."""
+        at = "pixel" if "pixel" in self.model.shaded_at else self.at
+        options = self.model.relit(replace(self, at=at, **UNTRACED))
+        if options is None:
+            return None
+        given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
+        traced = {name: rays for name, rays in RELIT_RAYS.items() if name in self.model.honours}
+        return Shading.resolve(ShadingOptions(**given | traced), mesh)
+
+    def untraced(self) -> Shading:
+        """Without visibility, for renders of materials only."""
+        return replace(self, antialias=False, **UNTRACED)
 
     def antialiased(self) -> Shading:
         """With `antialias` where it has an effect: for displayed images; the steps of a fit go without."""
@@ -147,6 +170,14 @@ class Shading(ShadingOptions):
             raise InputError(f"shading: light: {needs}; add it, or set reflectance = {unlit}")
         if self.occlusion and not mesh:
             raise InputError("shading: occlusion: there is no mesh to trace; give one, or trace nothing")
+
+
+def trace(points: ShadingPoints, context: TraceContext, shading: Shading) -> ShadingPoints:
+    """The points with what rays find of the light and of other surfaces; needs `occlusion`."""
+    if shading.model.visibility == "own":
+        return shading.model.trace(points, context, shading)
+    points = reflection(points, context, shading)
+    return points.replaced(ambient=ambient_of_pixels(context)) if shading.ambient_rays else points
 
 
 @phase("shade forward")

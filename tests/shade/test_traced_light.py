@@ -23,6 +23,7 @@ from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
+from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.shade.split_sum import shade
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import unit, vector
@@ -75,10 +76,10 @@ def test_materials_of_the_surfels_reach_the_hits() -> None:
     hit = occluder.closest(origin, mi.Vector3f(-1, 0, 0), mi.Vector3f(1, 0, 0))
     assert dr.all(hit.valid)
     np.testing.assert_allclose(hit.point.numpy(), [0 * y, y, z], atol=1e-5)
-    found = occluder.surface(surfels).at(hit.triangle, hit.barycentric, hit.valid)
+    found = occluder.surface(surfels, MATERIALS).at(hit.triangle, hit.barycentric, hit.valid)
     expected = np.stack([0.2 + 0.4 * y, 0.5 + 0.2 * z, np.full(500, 0.3)])
-    np.testing.assert_allclose(found.albedo.numpy(), expected, atol=0.02)
-    np.testing.assert_allclose(found.metallic.numpy(), 1 / (1 + math.e), rtol=1e-5)
+    np.testing.assert_allclose(found.values["albedo"].numpy(), expected, atol=0.02)
+    np.testing.assert_allclose(found.values["metallic"].numpy(), 1 / (1 + math.e), rtol=1e-5)
     np.testing.assert_allclose(found.normal.numpy().T, np.tile([1, 0, 0], (500, 1)), atol=1e-4)
     distance = np.linalg.norm(position[np.array(found.surfel)][:, 1:] - np.stack([y, z], 1), axis=1)
     assert distance.max() < 0.35  # half a cell's diagonal
@@ -106,7 +107,7 @@ def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
     )
     vertices = np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0.1], [50, 0, 0]], np.float32)
     mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 3, 2]], np.uint32), 0.1)
-    rows = np.array(with_materials(mesh, surfels).surface(surfels).rows).reshape(4, 8)
+    rows = np.array(with_materials(mesh, surfels).surface(surfels, MATERIALS).rows).reshape(4, 8)
     for vertex, row in zip(vertices[:3], rows, strict=False):
         u, v, w = (vertex - position).T
         weight = opacity * np.exp(-0.5 * ((u / scale[:, 0]) ** 2 + (v / scale[:, 1]) ** 2 + (w / 0.1) ** 2))
@@ -126,8 +127,9 @@ def test_misuse_is_refused() -> None:
     with pytest.raises(InputError, match="none are set"):
         occluder.surface(surfels)
     bare = Surfels({name: x for name, x in surfels.raw.items() if name != "metallic"})
+    occluder.set_materials(bare)
     with pytest.raises(InputError, match="metallic"):
-        occluder.set_materials(bare)
+        occluder.surface(bare, MATERIALS)
     with pytest.raises(InputError, match="none to take"):
         occluder.set_materials(surfels.gather(mi.UInt32()))
 

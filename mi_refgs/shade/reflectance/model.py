@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
+import mitsuba as mi
+
 from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.registry import Registry
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import QUALITY, ShadedAt, ShadingOptions
-from mi_refgs.shade.points import RadianceTerms, ShadingPoints
-from mi_refgs.shade.reflection import TraceContext, mirror_visibility
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Color3f, Vector3f
+from mi_refgs.types import Bool, Color3f, Float, Point3f, UInt32, Vector3f
 
 Lookup = Literal["none", "radiance", "filtered"]
 Rays = Literal["none", "mirror", "own"]
+
+LIT = ("radiance_sh", "indirect_sh")  # attributes that are fitted to one light
 
 
 @dataclass(frozen=True)
@@ -34,12 +39,35 @@ class SurfelView:
         return clamp_positive(eval_sh(coefficients, self.direction) + 0.5)
 
 
+@dataclass(frozen=True)
+class TraceContext:
+    """The scene that rays from N shading points are traced in, and the primary rays to the points."""
+
+    occluder: Occluder
+    surfels: Surfels
+    light: Light | None  # None if the model looks none up
+    origin: Point3f  # (1,) the camera
+    ray: Vector3f  # (N,) from the camera to the points, of any length
+    covered: Bool = True  # (N,) or a literal; nothing is traced for the other points
+    pixel: UInt32 = None  # (N,) image index that seeds the random numbers; None: 0 … N - 1
+
+    def start(self, normal: Vector3f) -> tuple[Point3f, Vector3f, Bool]:
+        """Where the primary rays meet the mesh, the unit normals there, and whether they do; detached.
+
+        Not the blended depth: at a silhouette, and between two layers, that lies inside the object and every
+        ray from there is blocked, which draws a dark outline.
+        """
+        distance, hit = self.occluder.first_hit(self.origin, self.ray, self.covered)
+        return mi.Point3f(mi.Vector3f(self.origin) + distance * self.ray), safe_normalize(normal), hit
+
+
 class Reflectance:
     """A reflectance model: declares its inputs and shades points, as separate radiance terms.
 
     Register one object per subclass. Attributes are the named values that a model computes per surfel: in
     forward shading ("surfel") they are shaded and radiance is blended; in deferred shading ("pixel") they are
-    blended as slots of the G-buffer, divided by alpha, and shaded.
+    blended as slots of the G-buffer, divided by alpha, and shaded. Where traced rays hit the mesh, the model
+    shades the attributes of the surfels around the hit.
     """
 
     name: str = ""
@@ -62,7 +90,8 @@ class Reflectance:
     def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         """Values (N,) by name (mi.Float, mi.Color3f or mi.Vector3f), under AD.
 
-        A "normal" among them replaces the surfel's own, `seen.normal`.
+        A "normal" among them replaces the surfel's own, `seen.normal`. For hits of traced rays, `surfels`
+        has only `has` and `value` of the `required_attributes`.
         """
         raise NotImplementedError
 
@@ -71,9 +100,29 @@ class Reflectance:
         raise NotImplementedError
 
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-        """The points with what rays find, called if `options.occlusion`: here the visibility of the mirror
-        direction."""
-        return points.replaced(visibility=mirror_visibility(context, points.normal, points.view))
+        """The points with what rays find, called if `options.occlusion` and visibility is "own"."""
+        raise NotImplementedError
+
+    def lobe(self, points: ShadingPoints) -> tuple[Float, Color3f]:
+        """Roughness and reflectance at normal incidence of the GGX lobe that `visibility_rays` sample."""
+        raise NotImplementedError
+
+    def relit(self, options: ShadingOptions) -> ShadingOptions | None:
+        """The options with which the model shows a fit under another light; None: it cannot.
+
+        Here without the diffuse colours that were fitted, unless the model requires them.
+        """
+        options = replace(options, diffuse="irradiance")
+        lit = {*LIT}.intersection(self.required_attributes(options))
+        return None if lit or self.light == "none" else options
+
+    def textures(self, values: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Albedo, metallic and roughness of `split_sum` that reflect as attributes `values`, both by name.
+
+        They are what meshes are baked to and decompositions compared by. Plain arithmetic: values are Dr.Jit
+        arrays, or images in NumPy. None: there are none, and such exports are refused.
+        """
+        return None
 
 
 def require_complete(model: Reflectance) -> None:
@@ -83,7 +132,8 @@ def require_complete(model: Reflectance) -> None:
             f"reflectance model: {abbreviated(model)}: give an object of a subclass of Reflectance"
         )
     traced = ("trace",) if model.visibility == "own" else ()
-    for name in ("required_attributes", "values", "shade", *traced):
+    sampled = ("lobe",) if "visibility_rays" in model.honoured else ()
+    for name in ("required_attributes", "values", "shade", *traced, *sampled):
         if getattr(type(model), name) is getattr(Reflectance, name):
             raise InputError(f"reflectance model: {model.name}: {name} is missing; write that method")
     for name, values, allowed in (

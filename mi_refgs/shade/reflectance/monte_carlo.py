@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
@@ -13,8 +14,7 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.near_field import LocalLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
-from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
-from mi_refgs.shade.reflection import TraceContext
+from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 
@@ -48,6 +48,11 @@ class MonteCarlo(Reflectance):
         if surfels.has("indirect_sh"):
             values["incident"] = surfels.value("indirect_sh")
         return values
+
+    def textures(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        base = BASE_RANGE[1] * values["albedo"] + BASE_RANGE[0]
+        roughness = ROUGHNESS_RANGE[1] * values["roughness"] + ROUGHNESS_RANGE[0]
+        return {"albedo": base, "metallic": 0 * roughness, "roughness": roughness}
 
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
         """The points with `free` (mi.UInt64, detached): bit j says that light arrives from direction j."""

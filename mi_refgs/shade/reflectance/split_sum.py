@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from mi_refgs.shade import split_sum
-from mi_refgs.shade.ambient import ambient_of_pixels
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
-from mi_refgs.shade.reflection import TraceContext, reflection
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Color3f, Float
 
 MATERIALS = ("albedo", "metallic", "roughness")  # attributes of the surface under the light
 
@@ -41,6 +41,8 @@ class SplitSum(Reflectance):
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         return split_sum.shade(points, light, options)
 
-    def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-        points = reflection(points, context, options)
-        return points.replaced(ambient=ambient_of_pixels(context)) if options.ambient_rays else points
+    def lobe(self, points: ShadingPoints) -> tuple[Float, Color3f]:
+        return points.roughness, split_sum.base_reflectance(points)
+
+    def textures(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: values[name] for name in MATERIALS}
