@@ -144,6 +144,5 @@ def material_maps(
 
 def _comparable(model: Reflectance, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return maps with NAMES as `Reflectance.textures` converts them; without them if it does not."""
-    made = model.textures(maps) or {}
     others = {name: shown for name, shown in maps.items() if name not in NAMES}
-    return others | {name: made[name] for name in NAMES if name in maps and name in made}
+    return others | (model.textures(maps) or {})

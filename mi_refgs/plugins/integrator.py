@@ -28,14 +28,12 @@ from mi_refgs.plugins.properties import (
     read_near_field,
     read_shading,
     read_surfels,
-    read_terms,
 )
 from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
-from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.primitives import primitive_of
@@ -100,11 +98,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times the light that the specular term
          leaves). (Default: ``sh`` if there is one)
 
-     * - dominant, multiscatter, antialias
+     * - dominant, antialias
        - |bool|
-       - More accuracy for more time: look the light up along the GGX lobe's dominant direction; add
-         interreflection between microfacets; average reflections over each pixel, at interpolated normals.
-         (Default: false)
+       - More accuracy for more time: look the light up along the GGX lobe's dominant direction; average
+         reflections over each pixel, at interpolated normals. (Default: false)
 
      * - visibility_rays, traced_bounces, ambient_rays
        - |int|
@@ -112,14 +109,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
          surfels' indirect light; and rays per vertex of the mesh for the ambient visibility of diffuse light,
          with ``irradiance``. (Default: 1, 0, 0: fully visible)
 
-     * - directions, light_levels
+     * - directions
        - |int|
-       - Directions that ``monte_carlo`` samples; roughness levels of the light that ``split_sum`` prefilters.
-         Fewer are faster. (Default: 24, 7)
-
-     * - terms
-       - |string|
-       - Terms of the radiance in the image, out of ``diffuse,specular,indirect``. (Default: all)
+       - Directions that ``monte_carlo`` samples; fewer are faster. (Default: 24)
 
      * - surroundings
        - |string|
@@ -203,7 +195,6 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
         self.shading, self.occluder = read_shading(props, self.surfels)
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
-        self.terms = read_terms(props)
         self.background = BackgroundProperties.read(props, self.surfels)
         self.aovs = read_aovs(props)
         self.check()
@@ -324,11 +315,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self.caches_valid = self.light is not None or not self.shading.ambient_rays
         surfels, surroundings = Surfels(self.surfels.raw, screened=True), background.splatted(self.surfels)
         rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings, self.near)
-        chosen = () if len(self.terms) == len(TERMS) else self.terms
-        frame = render(rendered, camera, replace(request, aovs={*request.aovs, *chosen}))
-        if chosen:  # of the object only
-            radiance = sum((getattr(frame.terms, name) for name in chosen), start=mi.Color3f(0))
-            frame = replace(frame, radiance=radiance)
+        frame = render(rendered, camera, request)
         return replace(frame.only(request.aovs), background=background.behind(frame))
 
     def _light(self, scene: Any, forward_only: bool) -> Light | None:

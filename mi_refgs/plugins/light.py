@@ -23,7 +23,7 @@ from mi_refgs.shade.light.envmap import (
     is_height,
 )
 from mi_refgs.shade.light.light import ConstantLight, Light, RotatedLight
-from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels, resample
+from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.light.prefilter import prefilter
 from mi_refgs.shade.shading import Shading
 
@@ -45,8 +45,8 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
     return EnvironmentLight.from_radiance(np.tile(colour, (DEFAULT_HEIGHT, 2 * DEFAULT_HEIGHT, 1))), None
 
 
-def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) -> Light:
-    """The light of an emitter of the scene, under AD: `filtered` to `levels`, or with `radiance` only.
+def emitter_light(emitter: Any, filtered: bool = True) -> Light:
+    """The light of an emitter of the scene, under AD: `filtered`, or with `radiance` only.
 
     Gradients flow to its `scale` and `data`, or `radiance.value`; to `data` only where its size is one that
     lights have. Raises InputError if the texels of another size (see `_map_radiance`) should receive some,
@@ -63,7 +63,7 @@ def emitter_light(emitter: Any, filtered: bool = True, levels: Levels = LEVELS) 
         )
     light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
     if filtered:
-        light = PrefilteredLight(*prefilter(radiance, levels))
+        light = PrefilteredLight(*prefilter(radiance))
     return rotated(light, _light_from_world(params))
 
 
@@ -81,7 +81,7 @@ def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scen
     emitter = scene.environment()
     if emitter is None:
         raise InputError("refgs: light: there is none; nest an `envmap` in the integrator, or in the scene")
-    return emitter_light(emitter, wanted == "filtered", shading.levels)
+    return emitter_light(emitter, wanted == "filtered")
 
 
 def rotated(light: Light, light_from_world: Any) -> Light:

@@ -21,7 +21,6 @@ from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.options import DIFFUSE, QUALITY, ShadingOptions
-from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
@@ -190,15 +189,3 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
     shading = replace(shading, occlusion=occlusion, **quality)
     return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None
-
-
-def read_terms(props: Any) -> list[str]:
-    """Read the names of the terms that the image sums."""
-    text = str(_get(props, "terms", ",".join(TERMS)))
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    for name in names:
-        if name not in TERMS or names.count(name) > 1:
-            raise InputError(f"refgs: terms: '{name}' is unknown or repeated; use some of {', '.join(TERMS)}")
-    if not names:
-        raise InputError(f"refgs: terms: {abbreviated(text)} names none; use some of {', '.join(TERMS)}")
-    return names

@@ -30,7 +30,6 @@ class Options:
 
     diffuse: str = "sh"
     dominant: bool = False
-    multiscatter: bool = False
     directions: int = 24  # of `monte_carlo`
     free: Array | None = None  # (n, directions): whether light arrives along them
     detached_normal: Array | None = None  # (n, 3): about which these are taken, where it is not the point's
@@ -72,11 +71,6 @@ def split_sum(points: Points, light: Light | None, options: Options, taps: Taps)
         direction = unit(n + smooth * (np.sqrt(smooth) + 1 - smooth) * (direction - n))
     direction = seen_from(light, points.position, direction)
     reflected = _looked_up(light, specular(light, direction, roughness), free * reflectance, taps)
-    if options.multiscatter:  # [Fdez-Agüera 2019]
-        lost = (f0 + (1 - f0) / 21) * (1 - a - b)[:, None]
-        further = reflectance * lost / (1 - lost)
-        reflected = reflected + _looked_up(light, irradiance(light, n), free * further, taps)
-        reflectance = reflectance + further
     if options.diffuse == "sh":
         scattered = (1 - metallic) * values["radiance"]
     else:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args, get_type_hints
 
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 
 ShadedAt = Literal["pixel", "surfel"]
 """Deferred shading of blended attributes per pixel, or forward shading per surfel before blending."""
@@ -25,9 +24,6 @@ MAX_RAYS = 4096
 
 MAX_DIRECTIONS = 64
 """Most directions per hemisphere: their visibility is one bit each of a 64-bit word."""
-
-MAX_LEVELS = len(LEVEL_ROUGHNESS)
-"""Most prefiltered levels of a light: as many as there are matrices."""
 
 NOT_A_SETTING = {"setting": False}
 """Metadata of a field that method files do not contain, because it follows from others."""
@@ -50,12 +46,10 @@ class ShadingOptions:
     diffuse: Diffuse = "sh"  # fitted SH radiance, or albedo times the irradiance of the light
     occlusion: bool = field(default=False, metadata=NOT_A_SETTING)  # trace visibility; follows from a mesh
     dominant: bool = False  # look the light up along the lobe's dominant direction, not the mirror direction
-    multiscatter: bool = False  # add light that leaves after several bounces between microfacets
     visibility_rays: int = number(1, 1, MAX_RAYS)  # specular-lobe samples per pixel; 1: the mirror ray
     traced_bounces: int = number(0, 0, MAX_RAYS)  # of blocked rays, in place of the indirect SH attribute
     ambient_rays: int = number(0, 0, MAX_RAYS)  # per mesh vertex, for the ambient visibility; 0: unoccluded
     directions: int = number(24, 1, MAX_DIRECTIONS)  # per hemisphere; R3DG uses 64, which takes twice as long
-    light_levels: int = number(MAX_LEVELS, 2, MAX_LEVELS)  # prefiltered roughness levels of the light
     antialias: bool = False  # average the reflection over each pixel, at interpolated normals
 
     def __post_init__(self) -> None:

@@ -11,7 +11,6 @@ from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.ambient import ambient_of_pixels
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
-from mi_refgs.shade.light.lobe_matrices import Levels
 from mi_refgs.shade.options import DIFFUSE, TRACED, Diffuse, ShadedAt, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import MODELS, Reflectance, TraceContext
@@ -67,8 +66,8 @@ class Shading(ShadingOptions):
             ),
         ]
         for name in chosen:
-            able = " or ".join(other for other in MODELS if name in MODELS[other].honours)
-            rules.append((name not in model.honours, name, f"needs reflectance = {able}", "set it"))
+            able = " or ".join(other for other in MODELS if name in MODELS[other].honoured)
+            rules.append((name not in model.honoured, name, f"needs reflectance = {able}", "set it"))
         for refused, option, wrong, remedy in rules:
             if refused:
                 raise InputError(wrong, "shading", option, remedy)
@@ -87,7 +86,7 @@ class Shading(ShadingOptions):
         if options is None:
             return None
         given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
-        traced = {name: rays for name, rays in RELIT_RAYS.items() if name in self.model.honours}
+        traced = {name: rays for name, rays in RELIT_RAYS.items() if name in self.model.honoured}
         return Shading.resolve(ShadingOptions(**given | traced), mesh)
 
     def untraced(self) -> Shading:
@@ -96,7 +95,7 @@ class Shading(ShadingOptions):
 
     def antialiased(self) -> Shading:
         """With `antialias` where it has an effect: for displayed images; the steps of a fit go without."""
-        able = self.shaded_at == "pixel" and "antialias" in self.model.honours
+        able = self.shaded_at == "pixel" and "antialias" in self.model.honoured
         return replace(self, antialias=True) if able else self
 
     @staticmethod
@@ -150,14 +149,7 @@ class Shading(ShadingOptions):
         """The light as the model looks it up, under AD; None without one, or if the model uses none."""
         if environment is None or self.model.light == "none":
             return None
-        if self.model.light == "filtered":
-            return environment.prefilter(self.levels)
-        return environment.unfiltered()
-
-    @property
-    def levels(self) -> Levels:
-        """The levels of roughness that a light is prefiltered to."""
-        return Levels.some(self.light_levels)
+        return environment.prefilter() if self.model.light == "filtered" else environment.unfiltered()
 
     def require_inputs(self, attributes: Collection[str], light: bool = True, mesh: bool = True) -> None:
         """Raise InputError if an attribute, the light or the mesh that the model needs is missing."""

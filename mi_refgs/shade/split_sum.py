@@ -23,10 +23,6 @@ DIELECTRIC_F0 = 0.04
 SMOOTHNESS_FLOOR = 1e-12
 """Least 1 - α in √(1 - α), whose slope is infinite at α = 1; its factor is below 1e-12 there."""
 
-MEAN_FRESNEL_MAX = 1.25
-"""The mean of Schlick's term is at most 1 for a colour in 0 … 1; this cap, out of its reach, keeps the series
-of bounces finite for any other colour: A + B ≥ 0.31 everywhere."""
-
 
 def base_reflectance(points: ShadingPoints) -> mi.Color3f:
     """F0: reflectance at normal incidence, between a dielectric's and the metal's albedo."""
@@ -52,19 +48,6 @@ def lookup_direction(
     return safe_normalize(dr.lerp(normal, mirror, mirrored))
 
 
-def multiple_scattering(f0: mi.Color3f, single: mi.Color3f, energy: mi.Float) -> mi.Color3f:
-    """What light that bounced more than once between facets adds to the reflectance under diffuse light.
-
-    `single` = F0 A + B leaves after one bounce and `energy` = A + B would if nothing were absorbed; the rest
-    bounces on, each time by the mean of Schlick's term, F0 + (1 - F0) / 21: single F E / (1 - F E) with
-    E = 1 - energy. A white metal then returns all light. [Fdez-Agüera 2019, "A Multiple-Scattering Microfacet
-    Model for Real-Time Image Based Lighting"] Its diffuse term is that of `shade` here.
-    """
-    fresnel = dr.clip(dr.fma(f0, 20 / 21, 1 / 21), 0, MEAN_FRESNEL_MAX)
-    again = (1 - energy) * fresnel
-    return single * again * dr.rcp(1 - again)
-
-
 def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
     """Outgoing radiance towards the camera, as separate terms.
 
@@ -74,9 +57,7 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
     the points have none). n·v is clamped to [0, 1]: a point seen from behind keeps its mirror direction, with
     the reflectance at grazing incidence.
 
-    `options.dominant` turns r (`lookup_direction`); with `options.multiscatter` and M of
-    `multiple_scattering`, specular = V (L(r, roughness) S + irradiance(n) M),
-    indirect = (1 - V) L_indirect (S + M), and diffuse has the factor 1 - S - M.
+    `options.dominant` turns r (`lookup_direction`).
 
     Under a constant light of 1 no more than 1 leaves with "irradiance": S + (1 - S) (1 - metallic) albedo.
     This is the albedo scaling of layered models, a specular layer over a diffuse base; it is not reciprocal,
@@ -92,10 +73,6 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
     reflectance = dr.fma(f0, scale, bias)
     direction = lookup_direction(normal, view, points.roughness, options)
     specular = light.specular(direction, points.roughness) * reflectance
-    if options.multiscatter:
-        further = multiple_scattering(f0, reflectance, scale + bias)
-        specular += light.irradiance(normal) * further
-        reflectance += further
 
     # Visibility of that light, and what blocks it.
     indirect = None

@@ -20,9 +20,7 @@ CROPS = {"none": (0, 0, WIDTH, HEIGHT), "inner": (3, 2, 8, 6), "corner": (8, 6, 
 ACCURACY: dict[str, Any] = {
     "none": None,
     "dominant": True,
-    "multiscatter": True,
     "antialias": True,
-    "light_levels": 3,
     "directions": 7,
 }
 """Options of accuracy, one at a time. Those of rays beyond the mirror ray (`TRACED`) are compared by
@@ -65,7 +63,6 @@ DIMENSIONS: dict[str, list[Any]] = {
     "crop": [*CROPS],
     "samples": [1, 4, 5, 9],
     "aovs": ["none", "some", "all"],
-    "terms": ["all", "specular"],
     "threads": [1, 2],
     "derivative": ["none", "forward", "reverse", "reverse with a prior"],
 }
@@ -96,7 +93,7 @@ RULES = [
     Rule(
         ("shading", "accuracy"),
         lambda shading, accuracy: (
-            accuracy not in ("none", *_model(shading).honours)
+            accuracy not in ("none", *_model(shading).honoured)
             and not (accuracy == "antialias" and "/pixel" not in shading)
         ),
         "shading: [a-z_]+: needs reflectance = ",
@@ -112,7 +109,6 @@ RULES = [
     Rule(("input", "emitter"), lambda input_, emitter: input_ == "xml" and emitter == "tensor"),
     Rule(("input", "emitter"), lambda input_, emitter: input_ == "run" and emitter != "tensor"),
     Rule(("input", "map"), lambda input_, map_: input_ == "run" and map_ == "9 x 14"),
-    Rule(("input", "terms"), lambda input_, terms: input_ == "run" and terms != "all"),
     Rule(("input", "background"), lambda input_, background: input_ == "run" and background == "constant"),
     Rule(
         ("input", "background", "surroundings"),

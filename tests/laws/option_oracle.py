@@ -72,9 +72,7 @@ class Oracle:
         own, around = self._tables(first)
         self.order = sorted_rows([own, around], self.camera, self.pixels, self.corner)
         chosen = shading(case)
-        self.options = Options(
-            dominant=chosen.dominant, multiscatter=chosen.multiscatter, directions=chosen.directions
-        )
+        self.options = Options(dominant=chosen.dominant, directions=chosen.directions)
         if chosen.reflectance == "monte_carlo":
             normal = _facing(own, self.camera)
             free = _free(own["position"], normal, chosen.directions) if chosen.occlusion else None
@@ -138,8 +136,6 @@ class Oracle:
     def _developed(self, maps: dict[str, Array]) -> Array:
         case = self.case
         rgb, alpha = maps["radiance"], maps["alpha"]
-        if case["terms"] != "all":
-            rgb = maps[case["terms"]]
         coverage = self._blocks(alpha)
         if case["background"] != "none":
             behind = maps["background"] if case["background"] == "map" else np.array(BACKDROP)

@@ -165,8 +165,6 @@ def build(case: Case, found: Values, folder: Path) -> Built:
     if case["occlusion"]:
         write_mesh(folder / "mesh.ply", mesh())
         integrator |= {"mesh": str(folder / "mesh.ply"), "occlusion": True}
-    if case["terms"] != "all":
-        integrator["terms"] = case["terms"]
     if case["aovs"] != "none":
         integrator["aovs"] = ",".join(f"{kind}_:{kind}" for kind in aov_types(case))
     files = case["input"] != "tensors"

@@ -129,7 +129,6 @@ def test_the_world_has_no_preferred_direction(scene: Scene, seed: int) -> None:
     metallic=st.sampled_from([0.0, 0.5, 1.0]),
     roughness=st.floats(0, 1),
     dominant=st.booleans(),
-    multiscatter=st.booleans(),
     shade_at=st.sampled_from(["pixel", "surfel"]),
 )
 def test_no_more_light_leaves_than_arrives(

@@ -82,7 +82,7 @@ def shadings() -> list[tuple[Shading, str]]:
             found[Shading(Shading(order, name).shaded_at, name), "surfel"] = None
         plain = Shading(Shading(model.shaded_at[0], name).shaded_at, name, diffuse="irradiance")
         traced = replace(plain, occlusion=plain.traceable)
-        options = {key: OTHER_OPTIONS[key] for key in model.honours if traced.occlusion or key not in TRACED}
+        options = {key: OTHER_OPTIONS[key] for key in model.honoured if traced.occlusion or key not in TRACED}
         if options:
             found[replace(traced, **options), "surfel"] = None
     return [*found]

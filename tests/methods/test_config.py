@@ -422,10 +422,10 @@ def test_components_keep_what_python_changed() -> None:
 
 
 def test_a_stage_sets_every_shading_option() -> None:
-    options = ["dominant=true", "multiscatter=true", "light_levels=3", "visibility_rays=4", "antialias=true"]
+    options = ["dominant=true", "visibility_rays=4", "antialias=true"]
     method = methods.load("ref_gaussian", "quick", [f"stage.deferred.{option}" for option in options])
     shading = method.stage["deferred"].shading
-    assert shading.chosen() == ["dominant", "multiscatter", "visibility_rays", "light_levels", "antialias"]
+    assert shading.chosen() == ["dominant", "visibility_rays", "antialias"]
     for wrong in ("visibility_rays=0", "occlusion=true", "dominant=1"):
         with pytest.raises(InputError, match=wrong.partition("=")[0]):
             methods.load("ref_gaussian", "quick", [f"stage.deferred.{wrong}"])

@@ -11,11 +11,13 @@ import pytest
 
 from tests.helpers import refused
 from tests.scenes.integrator import (
+    COUNT,
     HEIGHT,
     WIDTH,
     check_derivatives,
     image,
     lit_scene,
+    raw_channels,
     scene,
     sky,
 )
@@ -29,9 +31,10 @@ def test_derivatives_with_irradiance_and_supersampling(key: str) -> None:
 
 @pytest.mark.parametrize("columns", [64, 48], ids=["as it is", "resampled"])
 def test_the_scale_of_an_environment_has_a_derivative(columns: int, tmp_path: Path) -> None:
-    """Reflections are linear in the scale, in both modes."""
+    """Images of metals are linear in the scale, in both modes."""
     mi.Bitmap(sky()[:, :columns]).write(str(tmp_path / "sky.exr"))
-    of = lit_scene({"type": "envmap", "filename": str(tmp_path / "sky.exr")}, terms="specular")
+    metal = raw_channels() | {"metallic": np.full((COUNT, 1), 30.0)}
+    of = lit_scene({"type": "envmap", "filename": str(tmp_path / "sky.exr")}, raw=metal)
     params = mi.traverse(of)
     expected = image(of)
     scale = mi.Float(1)

@@ -38,7 +38,7 @@ from tests.scenes.integrator import (
 
 def shading_with(option: str) -> Shading:
     """A shading whose model honours the option, with OTHER_OPTIONS's value."""
-    model = next(model for model in MODELS.values() if option in model.honours)
+    model = next(model for model in MODELS.values() if option in model.honoured)
     return Shading(model.shaded_at[0], model.name, "irradiance", True, **{option: OTHER_OPTIONS[option]})
 
 

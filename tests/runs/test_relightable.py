@@ -52,8 +52,10 @@ def test_relightable_requires_materials_and_light() -> None:
     raw = {name: x for name, x in surfels.raw.items() if name != "metallic"}
     light = EnvironmentLight.constant(0.5, 8)
     for scene, words in (
-        (TrainedScene(surfels, None, None, Shading("surfel", "radiance"), 1, 0.0), "light: the run has none"),
-        (TrainedScene(Surfels(raw), light, None, Shading("surfel", "radiance"), 1, 0.0), "metallic: the run"),
+        (TrainedScene(surfels, None, None, Shading(), 1, 0.0), "light: the run has none"),
+        (TrainedScene(Surfels(raw), light, None, Shading(), 1, 0.0), "metallic: the run"),
+        (TrainedScene(surfels, light, None, Shading("surfel", "radiance"), 1, 0.0), "reflectance: radiance"),
+        (TrainedScene(surfels, light, None, Shading("pixel", "mirror"), 1, 0.0), "reflectance: mirror"),
     ):
         refused(partial(relightable, scene), words)
 

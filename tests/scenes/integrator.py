@@ -193,11 +193,9 @@ def two_balls() -> Mesh:
 
 OTHER_OPTIONS: dict[str, Any] = {
     "dominant": True,
-    "multiscatter": True,
     "visibility_rays": 3,
     "traced_bounces": 1,
     "ambient_rays": 16,
-    "light_levels": 2,
     "directions": 5,
     "antialias": True,
 }

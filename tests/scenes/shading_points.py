@@ -68,7 +68,7 @@ def exact_light(light: PrefilteredLight) -> Light:
 def exact_terms(values: dict[str, Any], light: Light, options: ShadingOptions) -> np.ndarray:
     """Diffuse, specular and indirect radiance (n, 3, 3) of points: arrays (n, …) by name, or None."""
     free = values["free"][:, None] >> np.arange(options.directions) & 1 if "free" in values else None
-    chosen = models.Options(options.diffuse, options.dominant, options.multiscatter, options.directions, free)
+    chosen = models.Options(options.diffuse, options.dominant, options.directions, free)
     points = models.Points.of({name: x for name, x in values.items() if name != "free"})
     terms = models.MODELS[options.reflectance](points, light, chosen, [])
     return np.stack(terms, axis=1)

@@ -15,13 +15,12 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.reference import lobe as exact
 from mi_refgs.reference.light import radiance_of
-from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import reflect
 from mi_refgs.shade.shading import Shading
-from mi_refgs.shade.split_sum import multiple_scattering, shade
+from mi_refgs.shade.split_sum import shade
 from tests.helpers import unit
 from tests.scenes.integrator import check_derivatives, image, plane_mesh, raw_channels, scene
 from tests.scenes.shading_points import N, points_of, shading_values
@@ -43,7 +42,6 @@ def test_shading_survives_json() -> None:
     [
         ("diffuse", ("lambert",)),
         ("dominant", (1,)),
-        ("multiscatter", ("true",)),
         ("directions", (0, 65)),
         ("traced_bounces", (None, -1, True)),
         ("visibility_rays", (0, 2.0, True)),
@@ -94,42 +92,6 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
     assert dominant < (0.8 if roughness < 0.6 else 0.5) * mirror
 
 
-@pytest.mark.parametrize("roughness", [0.4, 0.7, 1.0])
-def test_multiple_scattering_comes_closer_to_a_walk_in_the_microsurface(
-    roughness: float, rng: np.random.Generator
-) -> None:
-    """Coloured metals in the furnace, against Heitz's random walk, whose first bounce is the table.
-
-    The formula gives too little, never too much: the bounces absorb by the mean of Schlick's term.
-    """
-    f0 = np.array([0.95, 0.7, 0.3, 0.04])
-    left = np.array([0.07, 0.25, 0.56, 0.9])  # largest part of the energy that is still missing, by f0
-    for cosine in (0.2, 0.6, 0.95):
-        walk, noise = exact.microsurface_walk(cosine, roughness, f0, rng, 40000)
-        white, _ = exact.microsurface_walk(cosine, roughness, np.ones(1), rng, 2000)
-        np.testing.assert_allclose(white, 1, atol=2e-3)
-        a, b = brdf.split_sum(mi.Float(cosine), mi.Float(roughness))
-        for channel, value in enumerate(f0):
-            single = value * float(a[0]) + float(b[0])
-            further = multiple_scattering(mi.Color3f(value), mi.Color3f(single), a + b).numpy()[0, 0]
-            missing = walk[channel] - single
-            error = missing - further
-            assert -3 * noise[channel] < error < left[channel] * missing + 3 * noise[channel], (cosine, value)
-            assert error < (0.07 if value > 0.5 else 0.025), (cosine, value)  # of the light that falls in
-
-
-def test_the_walks_first_bounce_is_the_brute_force_integral(rng: np.random.Generator) -> None:
-    """Two independent references: a black second bounce leaves F0 A + B."""
-    n, f0 = np.array([0, 0, 1.0]), np.array([0.3])
-    for cosine, roughness in ((0.3, 0.4), (0.8, 0.9)):
-        v = np.array([np.sqrt(1 - cosine**2), 0, cosine])
-        once = exact.reflected(lambda d: np.ones((len(d), 1)), n, v, roughness, f0)
-        a, b = exact.split_sum_entry(cosine, roughness)
-        np.testing.assert_allclose(once, f0 * a + b, rtol=2e-3)
-        single, noise = exact.microsurface_walk(cosine, roughness, f0, rng, 40000, bounces=1)
-        assert abs(single - once) < 4 * noise + 1e-3
-
-
 def test_a_point_seen_from_behind_keeps_its_mirror_direction() -> None:
     """With roughness 0 the dominant direction is the mirror direction, wherever the camera is."""
     rng = np.random.default_rng(5)
@@ -146,21 +108,19 @@ def test_a_point_seen_from_behind_keeps_its_mirror_direction() -> None:
 
 def test_properties_of_the_plugin(tmp_path: Path) -> None:
     mesh = plane_mesh(tmp_path)
-    options: dict[str, Any] = {"dominant": True, "multiscatter": True}
-    options |= {"visibility_rays": 4, "traced_bounces": 2}
+    options: dict[str, Any] = {"dominant": True, "visibility_rays": 4, "traced_bounces": 2}
     of = scene(mesh=mesh, **options)
     assert {name: getattr(of.integrator().shading, name) for name in options} == options
     assert not scene(mesh=mesh).integrator().shading.chosen()
-    plain = image(scene(mesh=mesh, terms="specular,indirect"))
+    plain = image(scene(mesh=mesh))
     for name, value in options.items():
-        changed = image(scene(mesh=mesh, terms="specular,indirect", **{name: value}))
+        changed = image(scene(mesh=mesh, **{name: value}))
         assert np.abs(changed - plain).max() > 0.01, name
 
 
 @pytest.mark.parametrize("rays", [1, 3])
 def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"dominant": True, "multiscatter": True, "diffuse": "irradiance"}
-    options |= {"visibility_rays": rays, "traced_bounces": 2}
+    options = {"dominant": True, "diffuse": "irradiance", "visibility_rays": rays, "traced_bounces": 2}
     check_derivatives(scene(mesh=plane_mesh(tmp_path), **options), "integrator.light")
 
 

@@ -5,7 +5,8 @@ One channel, one class and two `register`s are all that is added.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,27 @@ import pytest
 
 import mi_refgs
 from mi_refgs.cli import main
-from mi_refgs.io.exr import write_exr
+from mi_refgs.evaluation.decomposition import material_maps
+from mi_refgs.evaluation.images import RenderedView
+from mi_refgs.formats.baking import bake
+from mi_refgs.formats.format import Shot
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade import reflectance
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light import ConstantLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import Reflectance, SurfelView
+from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
 from mi_refgs.surfels import attributes
 from mi_refgs.surfels.attributes import Attribute
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
+from tests.scenes.corner import floor_points, seen, wall_surfels
 from tests.scenes.integrator import check_derivatives, image, raw_channels, scene
+from tests.scenes.known import known_mesh, known_surfels
 from tests.scenes.tiny import train_command, write_data
 
 SHININESS = Attribute("shininess", (1,), "sigmoid", 0.02, ("shininess",), initial=0.5, aov="Y")
@@ -33,9 +44,14 @@ SHARE = 0.3  # of the light that the lobe reflects
 
 
 class Phong(Reflectance):
-    """albedo irradiance(n), and a lobe about the mirror direction that narrows with the shininess."""
+    """albedo irradiance(n), and a lobe about the mirror direction that narrows with the shininess.
+
+    The mesh blocks the lobe, and is shaded where it does.
+    """
 
     name = "phong"
+    visibility = "mirror"
+    honoured = ("traced_bounces",)
 
     def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return ("albedo", "shininess")
@@ -45,8 +61,11 @@ class Phong(Reflectance):
 
     def shade(self, points: ShadingPoints, light: Any, options: ShadingOptions) -> RadianceTerms:
         normal, view = safe_normalize(points.normal), safe_normalize(points.view)
-        lobe = light.specular(reflect(view, normal), 1 - points.shininess)
-        return RadianceTerms(points.albedo * light.irradiance(normal), SHARE * lobe)
+        lobe, indirect = SHARE * light.specular(reflect(view, normal), 1 - points.shininess), None
+        if points.get("indirect") is not None:
+            indirect = SHARE * (1 - points.visibility) * points.indirect
+            lobe *= points.visibility
+        return RadianceTerms(points.albedo * light.irradiance(normal), lobe, indirect)
 
 
 METHOD = """
@@ -75,12 +94,13 @@ def phong() -> Iterator[None]:
 
 
 class Velvet(Phong):
-    """Phong's model, of all materials."""
+    """Phong's model, which other programs show as a rough dielectric."""
 
     name = "velvet"
 
-    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
-        return ("albedo", "metallic", "roughness", "shininess")
+    def textures(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        dull = 1 - values["shininess"]
+        return {"albedo": values["albedo"], "metallic": 0 * dull, "roughness": dull}
 
 
 def raw() -> dict[str, np.ndarray]:
@@ -132,20 +152,57 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     assert "damaged" not in refused(command, "0000006.npz: surfels: shininess", "register it")
 
 
-def test_runs_of_a_model_of_all_materials_are_scored_and_relit(tmp_path: Path) -> None:
-    """No SH colour is converted to an albedo where the model does not use it."""
-    needed = '"albedo", "metallic", "roughness", "shininess"'
-    text = METHOD.replace('"albedo", "shininess"', needed).replace("phong", "velvet")
-    (tmp_path / "own.toml").write_text(text)
+def test_it_shades_what_traced_rays_hit() -> None:
+    """Under a light of 1 the floor of a corner sees albedo + SHARE, or albedo where the lobe is blocked."""
+    place, points = floor_points(0.3, count=40)
+    materials = wall_surfels()
+    kept = {name: x for name, x in materials.raw.items() if name not in ("metallic", "roughness")}
+    surfels = Surfels(kept | {"shininess": mi.TensorXf(materials.raw["roughness"])})
+    options = ShadingOptions(reflectance="phong", traced_bounces=1)
+    found = seen(points, place, options, surfels, ConstantLight(mi.Color3f(1)))  # type: ignore[arg-type]
+    blocked = np.array(found.visibility) == 0
+    albedo = 1 / (1 + np.exp(-materials.raw["albedo"].numpy()[0]))
+    assert 0 < blocked.sum() < 40
+    lit = found.indirect.numpy().T[blocked]
+    assert all(np.allclose(x, albedo + SHARE, rtol=1e-4) or np.allclose(x, albedo, rtol=1e-4) for x in lit)
+
+
+def test_relit_it_stays_itself(tmp_path: Path) -> None:
+    """A run is scored and relit by its model, with all that the model requires; twice the light is twice the
+    image. What it is not asked to know, its materials for other programs, is refused."""
+    (tmp_path / "own.toml").write_text(METHOD)
     data = write_data(tmp_path / "data")
     assert main(train_command(data, tmp_path / "run", tmp_path / "own.toml")) == 0
     run = mi_refgs.load(tmp_path / "run")
     assert run.evaluate()["psnr"] > 0
-    write_exr(tmp_path / "sky.exr", np.full((4, 8, 3), 0.5, np.float32))
-    relit = run.relight(tmp_path / "sky.exr")
-    assert np.isfinite(relit.render(0)).all()
-    fitted = run.trained.surfels.to_numpy()["albedo"]
-    assert np.array_equal(relit.trained.surfels.to_numpy()["albedo"], fitted)
+    sky = np.full((8, 16, 3), 0.5, np.float32)
+    dim, bright = (run.relight(EnvironmentLight.from_radiance(factor * sky)) for factor in (1, 2))
+    assert dim.trained.shading.reflectance == "phong" and dim.trained.surfels.has("shininess")
+    once, twice = (np.asarray(relit.render(0))[..., :3] for relit in (dim, bright))
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-3, atol=1e-5)
+    assert once.max() > 0.05
+    scene = replace(run.trained, mesh=known_mesh())
+    refused(lambda: bake(scene, [], 200, 16), "reflectance: phong has no textures")
+
+
+def test_textures_are_baked_and_compared() -> None:
+    """What a model says of itself reaches textures, and the maps that evaluations compare."""
+    raw = {name: x for name, x in known_surfels().raw.items() if name != "metallic"}
+    raw["shininess"] = raw.pop("roughness")
+    light, shading = EnvironmentLight.constant(0.5, 8), Shading(reflectance="velvet", diffuse="irradiance")
+    scene = TrainedScene(Surfels(raw), light, known_mesh(), shading, 1, 0.0)
+    camera = Camera.look_at([0.3, -3, 1], size=32)
+    baked = bake(scene, [Shot("a", "train", camera)], 200, 16)
+    shown = 1 / (1 + np.exp(-raw["shininess"].numpy()))
+    assert np.all(baked.metallic == 0)
+    assert abs(baked.roughness.mean() - (1 - shown.mean())) < 0.1
+    rendered = RenderedView.maps_of(scene.renderer()(camera), 32, 32)
+    view = RenderedView(np.zeros((32, 32, 3)), np.zeros((32, 32)), np.zeros((32, 32, 3)), rendered)
+    maps = material_maps(scene)(camera, view)
+    np.testing.assert_array_equal(maps["roughness"], 1 - rendered["shininess"])
+    assert material_maps(replace(scene, shading=replace(shading, reflectance="phong")))(
+        camera, view
+    ).keys() == {"shininess"}
 
 
 @pytest.mark.parametrize("aov, widths", [("S", (1,)), ("RGB", (1,)), ("Y", (3,))])

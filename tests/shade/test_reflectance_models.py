@@ -19,7 +19,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import ConstantLight, RotatedLight
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import TraceContext
-from mi_refgs.shade.shading import Shading, shade
+from mi_refgs.shade.shading import Shading, shade, trace
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import check_slopes, unit, vector
 from tests.scenes.shading_points import N, exact_light, exact_terms, points_of, shading_values
@@ -37,15 +37,10 @@ def irradiance(**options: Any) -> Shading:
 CASES: dict[str, tuple[Shading, tuple[str, ...]]] = {
     "SH": (Shading(), ("radiance", *MATERIALS)),
     "SH, visibility": (Shading(), ("radiance", *MATERIALS, "visibility")),
-    "SH, indirect": (Shading(), ("radiance", *MATERIALS, *BLOCKED)),
-    "SH, both, indirect": (Shading(dominant=True, multiscatter=True), ("radiance", *MATERIALS, *BLOCKED)),
+    "SH, dominant, indirect": (Shading(dominant=True), ("radiance", *MATERIALS, *BLOCKED)),
     "irradiance": (irradiance(), MATERIALS),
-    "irradiance, indirect": (irradiance(), (*MATERIALS, *BLOCKED)),
     "irradiance, ambient": (irradiance(), (*MATERIALS, "ambient")),
     "dominant": (irradiance(dominant=True), (*MATERIALS, *BLOCKED)),
-    "multiscatter": (irradiance(multiscatter=True), (*MATERIALS, *BLOCKED)),
-    "both": (irradiance(dominant=True, multiscatter=True), (*MATERIALS, *BLOCKED)),
-    "both, open": (irradiance(dominant=True, multiscatter=True), MATERIALS),
     "mirror": (Shading("pixel", "mirror"), ("radiance", "metallic")),
     "gaussian_shader": (Shading("surfel", "gaussian_shader"), ("radiance", "tint", "roughness")),
     "monte_carlo": (
@@ -262,7 +257,7 @@ def test_hemisphere_is_blocked_where_mesh_stands() -> None:
     points = ShadingPoints(normal, normal, position=place)
     context = TraceContext(occluder, Surfels({}), None, mi.Point3f(0, 9, 0), -normal)
     shading = CASES["monte_carlo, occluded"][0]
-    free = np.array(shading.model.trace(points, context, shading).free)
+    free = np.array(trace(points, context, shading).free)
     directions = models.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))
     blocked = directions[:, 0] * 50 > 1  # the wall is as good as infinite
     assert 0 < blocked.sum() < DIRECTIONS

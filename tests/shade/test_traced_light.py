@@ -390,8 +390,8 @@ def test_degenerate_pixels_stay_finite() -> None:
     for occluder in (with_materials(corner(), surfels), empty):
         for options in (
             ShadingOptions(visibility_rays=7),
-            ShadingOptions(dominant=True, multiscatter=True, visibility_rays=7, traced_bounces=3),
-            ShadingOptions(dominant=True, multiscatter=True, traced_bounces=3),
+            ShadingOptions(dominant=True, visibility_rays=7, traced_bounces=3),
+            ShadingOptions(dominant=True, traced_bounces=3),
         ):
             raw = mi.TensorXf(light.raw)
             dr.enable_grad(raw)

@@ -35,13 +35,6 @@ class Levels:
     roughness: tuple[float, ...] = LEVEL_ROUGHNESS
     max_height: tuple[int, ...] = LEVEL_MAX_HEIGHT
 
-    @staticmethod
-    def some(count: int) -> Levels:
-        """`count` of all levels, evenly chosen: the sharpest, the roughest, and those between."""
-        chosen = np.unique(np.linspace(0, len(LEVEL_ROUGHNESS) - 1, count).round().astype(int))
-        roughness = tuple(LEVEL_ROUGHNESS[i] for i in chosen)
-        return Levels(roughness, tuple(LEVEL_MAX_HEIGHT[i] for i in chosen))
-
 
 LEVELS = Levels()  # the levels of a light by default
 

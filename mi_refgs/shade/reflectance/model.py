@@ -78,11 +78,6 @@ class Reflectance:
     visibility: Rays = "none"  # traced rays: none, mirror rays of pixels, those of its own `trace`
     honoured: tuple[str, ...] = ()  # names of the QUALITY options that it honours
 
-    @property
-    def honours(self) -> tuple[str, ...]:
-        """QUALITY options that have an effect: `honoured`, and the levels of a light that is prefiltered."""
-        return (*self.honoured, "light_levels") if self.light == "filtered" else self.honoured
-
     def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         """Names of the attributes beside the geometry that the surfels must have."""
         raise NotImplementedError

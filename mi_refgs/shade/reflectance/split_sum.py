@@ -22,7 +22,7 @@ class SplitSum(Reflectance):
 
     name = "split_sum"
     visibility = "mirror"
-    honoured = ("dominant", "multiscatter", "antialias", "visibility_rays", "traced_bounces", "ambient_rays")
+    honoured = ("dominant", "antialias", "visibility_rays", "traced_bounces", "ambient_rays")
 
     def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
         return (*MATERIALS, "radiance_sh") if options.diffuse == "sh" else MATERIALS
