@@ -62,7 +62,7 @@ drop = ["stage"]
 [select.component.specular.change]
 surfels = { attributes = ["radiance_sh", "albedo", "metallic", "roughness"] }
 light = { height = 8 }
-stage = { deferred = { until = 2_000, light_levels = 3 } }
+stage = { deferred = { until = 2_000, dominant = true } }
 
 [select.component.interreflection]
 after = 8
