@@ -215,7 +215,7 @@ class SharedPrefilter:
 
     def light(self, environment: EnvironmentLight | None, shading: Shading) -> Light | None:
         """The light of a step, under AD; a light that is not filtered stays attached to its environment."""
-        if self._light is not None and self._light.operator.roughness == shading.levels.roughness:
+        if self._light is not None and shading.model.light == "filtered":
             return replace(self._light, levels=self._leaf)
         light = shading.light_of(environment)
         if not isinstance(light, PrefilteredLight):

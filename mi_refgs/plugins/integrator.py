@@ -54,21 +54,18 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - filename
        - |string|
-       - PLY file with the surfels, or with 3D Gaussians: the properties of 2DGS or 3DGS, and those of the
-         other attributes below, all raw (before the activation). In Python, attributes may also be given, or
-         replaced, as tensors under their names.
+       - PLY file with surfels or 3D Gaussians: raw properties (before the activation) of 2DGS or 3DGS and of
+         the attributes below. In Python, attributes may also be given, or replaced, as tensors.
 
      * - light *or any name*
        - |emitter|
-       - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light. Without one, the
-         scene's own environment emitter of these types lights the surfels. In Python also the raw tensor of
-         a ``mi_refgs.shade.light.envmap.EnvironmentLight``.
+       - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light; in Python also the raw
+         tensor of an ``EnvironmentLight``. (Default: the scene's environment emitter of these types)
 
      * - near_field
        - |string|
        - File (.npz) with ``nearness`` (h, 2h), 1 / distance of what the light shows in the orientation of an
-         ``envmap`` without rotation, seen from the point ``centre`` (3,): reflections are looked up where
-         they meet it. (Default: infinitely far)
+         ``envmap`` without rotation, seen from the point ``centre`` (3,). (Default: infinitely far)
 
      * - mesh
        - |string|
@@ -76,22 +73,19 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
      * - occlusion
        - |bool|
-       - Trace visibility along the mirror direction, and use the surfels' indirect light where it is
-         blocked; ``monte_carlo`` traces each of its directions. (Default: whether there is a ``mesh``)
+       - Trace the visibility of the light, and use the surfels' indirect light where it is blocked.
+         (Default: whether there is a ``mesh``)
 
      * - shade_at
        - |string|
        - ``pixel`` (deferred: blend attributes, then shade) or ``surfel`` (forward: shade, then blend
-         radiance). (Default: ``pixel``; ``surfel`` with ``gaussian_shader`` and ``monte_carlo``, which have
-         no other)
+         radiance). (Default: the first that the reflectance model has)
 
      * - reflectance
        - |string|
-       - ``split_sum`` (diffuse and GGX specular), ``radiance`` (the SH colour alone, needs no light; the two
-         orders of shading are then the same), ``mirror`` (the SH colour mixed with a perfect mirror by
-         ``metallic``, 3DGS-DR), ``gaussian_shader`` (SH colour, diffuse and tinted specular layer) or
-         ``monte_carlo`` (light summed over the hemisphere, R3DG), ``displayed`` (encoded SH colours of
-         a splat), or a registered model. (Default: the first of these whose attributes the surfels have)
+       - ``split_sum`` (diffuse and GGX specular), ``radiance`` (the SH colour alone, needs no light),
+         ``mirror`` (3DGS-DR), ``gaussian_shader``, ``monte_carlo`` (R3DG), ``displayed`` (encoded SH colours
+         of a splat), or a registered model. (Default: the first of these whose attributes the surfels have)
 
      * - diffuse
        - |string|
@@ -106,8 +100,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * - visibility_rays, traced_bounces, ambient_rays
        - |int|
        - Specular-lobe samples of the visibility, 1 is the mirror ray; traced bounces, in place of the
-         surfels' indirect light; and rays per vertex of the mesh for the ambient visibility of diffuse light,
-         with ``irradiance``. (Default: 1, 0, 0: fully visible)
+         surfels' indirect light; rays per vertex of the mesh for the visibility of diffuse light, with
+         ``irradiance``. (Default: 1, 0, 0)
 
      * - directions
        - |int|
@@ -140,8 +134,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * - light
        - |tensor|
        - Raw map (h, w, 3) of the integrator's own light, if it has one: radiance =
-         ``EnvironmentLight(raw).radiance()``, positive for any raw value. Light of the scene is exposed by
-         its emitter instead.
+         ``EnvironmentLight(raw).radiance()``.
        - |exposed|, |differentiable|
 
      * - surroundings_position, …, surroundings_radiance_sh, background
@@ -160,9 +153,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     sensors, but not to a background colour or the mesh; `mi_refgs.splat.composite` lists the derivatives
     that are absent.
 
-    A surfel with a value that is NaN or infinite in any attribute, or beyond 1e18 in position or SH
-    coefficients, covers no pixel and gets zero gradient; such a value of the light is black. One warning
-    names the attribute.
+    A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 covers no
+    pixel and gets zero gradient; such a value of the light is black. One warning names the attribute.
 
     .. tabs::
         .. code-tab:: xml
@@ -195,11 +187,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
         self.shading, self.occluder = read_shading(props, self.surfels)
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
-        self.background = BackgroundProperties.read(props, self.surfels)
+        self.background = BackgroundProperties.read(props)
         self.aovs = read_aovs(props)
         self.check()
-        self.unusable = UnusableValues()
-        self.unusable.warn(self._models, self._maps)
+        self.changed, self.next_check = False, 0.0  # since the last check; seconds of the monotonic clock
+        self._warn_of_unusable()
 
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for attributes that are required but absent."""
@@ -240,7 +232,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.check()
-        self.unusable.changed = True
+        self.changed = True
         self.filtered_light = None
         # The materials that the occluder caches are gathered from surfels near its vertices: they depend on
         # geometry. Ambient ratios depend on everything. Without keys, anything may have changed.
@@ -263,7 +255,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor; see the class for its channels."""
-        self.unusable.check(self._models, self._maps)
+        if self.changed and (now := time.monotonic()) >= self.next_check:
+            self.changed, self.next_check = False, now + CHECK_SECONDS
+            self._warn_of_unusable()
         with dr.suspend_grad():
             image = self._image(scene, sensor, spp, forward_only=True).image()
         if evaluate:
@@ -333,30 +327,17 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         return f"RefGSIntegrator[\n  {what},\n  light = {size},\n  shading = {self.shading}\n]"
 
 
-class UnusableValues:
-    """Warn once of values that are NaN, infinite or too large: after construction, or after a change."""
-
-    def __init__(self) -> None:
-        self.changed = False  # since the last check
-        self._next = -math.inf  # seconds of the monotonic clock: earliest time of the next check
-
-    def check(self, models: dict[str, Surfels], maps: dict[str, EnvironmentLight]) -> None:
-        """Check again if something changed and the last such check is CHECK_SECONDS ago."""
-        now = time.monotonic()
-        if self.changed and now >= self._next:
-            self.changed, self._next = False, now + CHECK_SECONDS
-            self.warn(models, maps)
-
-    def warn(self, models: dict[str, Surfels], maps: dict[str, EnvironmentLight]) -> None:
-        """Warn if there are such values, and never check again."""
+    def _warn_of_unusable(self) -> None:
+        """Warn of values that are NaN, infinite or too large, and never check again if there are any."""
         found = [
             f"{len(rows)} {kind} in {name} (first: {rows[0]})"
-            for kind, model in models.items()
+            for kind, model in self._models.items()
             for name, rows in model.unusable().items()
         ]
-        found += [f"{black} values of {name}" for name, light in maps.items() if (black := light.unusable())]
+        maps = self._maps.items()
+        found += [f"{black} values of {name}" for name, light in maps if (black := light.unusable())]
         if found:
-            self._next = math.inf
+            self.next_check = math.inf
             warnings.warn(
                 f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(found)}; these surfels "
                 "are left out, and such light is black",

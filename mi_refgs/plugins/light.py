@@ -13,6 +13,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
+from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import (
     DEFAULT_HEIGHT,
     MIN_HEIGHT,
@@ -22,7 +23,7 @@ from mi_refgs.shade.light.envmap import (
     bounded,
     is_height,
 )
-from mi_refgs.shade.light.light import ConstantLight, Light, RotatedLight
+from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.light.prefilter import prefilter
 from mi_refgs.shade.shading import Shading

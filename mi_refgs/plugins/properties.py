@@ -106,7 +106,7 @@ class BackgroundProperties:
     map: EnvironmentLight | None = None
 
     @staticmethod
-    def read(props: Any, surfels: Surfels) -> BackgroundProperties:
+    def read(props: Any) -> BackgroundProperties:
         """Read the properties; see `require_fit` for surfels that do not fit the object's."""
         behind = read_background(props)
         colour, light = (None, behind) if isinstance(behind, EnvironmentLight) else (behind, None)

@@ -190,7 +190,7 @@ def map_of(case: Case, values: Values) -> Array:
 
 
 def light_of(case: Case, values: Values) -> Light:
-    radiance, wanted = map_of(case, values), shading(case).levels
+    radiance, wanted = map_of(case, values), lobe_matrices.LEVELS
     levels = filtered(radiance, filters(len(radiance), wanted))
     if case["map"] == "constant" and case["emitter"] != "tensor":
         levels = [np.broadcast_to(radiance[0, 0], level.shape) for level in levels]

@@ -13,6 +13,7 @@ import trimesh
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import unit, vector
 
@@ -85,7 +86,7 @@ def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, 
         }
     )
     made.set_materials(surfels)
-    rows = np.array(made.surface(surfels).rows).reshape(count, 8)
+    rows = np.array(made.surface(surfels, MATERIALS).rows).reshape(count, 8)
     # No vertex has the materials of a surfel that is not usable.
     broken = surfels.to_numpy()
     broken["position"][7] = np.nan

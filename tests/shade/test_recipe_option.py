@@ -22,7 +22,7 @@ shading = Shading.resolve(stage.shading, mesh=False)
 points = mi_refgs.shade.points.ShadingPoints(
     mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), radiance=mi.Color3f(1), metallic=mi.Float(1)
 )
-light = mi_refgs.shade.light.light.ConstantLight(mi.Color3f(0.5))
+light = mi_refgs.shade.light.constant.ConstantLight(mi.Color3f(0.5))
 print(mi_refgs.shade.shading.shade(points, light, shading).total().x[0], shading.chosen())
 for wrong in ({"gloss": 9}, {"gloss": 3, "reflectance": "radiance"}):
     try:

@@ -22,8 +22,8 @@ from mi_refgs.formats.baking import bake
 from mi_refgs.formats.format import Shot
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade import reflectance
+from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.light.light import ConstantLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import Reflectance, SurfelView

@@ -15,8 +15,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import models
+from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.light.light import ConstantLight, RotatedLight
+from mi_refgs.shade.light.light import RotatedLight
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace

@@ -15,7 +15,7 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.methods.read import load
 from mi_refgs.render.pipeline import SurfelScene, render
-from mi_refgs.shade.light.light import ConstantLight
+from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.options import Diffuse, ShadedAt, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister

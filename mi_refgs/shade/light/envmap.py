@@ -258,3 +258,7 @@ class EnvironmentLight:
         with suppress(OSError):  # a folder that cannot be made cannot be written to either
             path.parent.mkdir(parents=True, exist_ok=True)
         write_exr(path, self.radiance().numpy())
+
+    def environment(self) -> EnvironmentLight:
+        """The light itself, which a run saves."""
+        return self

@@ -1,8 +1,4 @@
-"""Lights: one protocol of three lookups, which reflectance models ask and nothing else.
-
-`envmap` has the learnable environment; here are the protocol, a light that is the same from everywhere, and
-one seen through a rotation.
-"""
+"""Lights: one protocol of three lookups, which reflectance models ask and nothing else."""
 
 from __future__ import annotations
 
@@ -23,22 +19,6 @@ class Light(Protocol):
 
     def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
         """Radiance that arrives from the directions, unfiltered."""
-
-
-@dataclass(frozen=True)
-class ConstantLight:
-    """The same radiance (mi.Color3f, under AD) from everywhere, which no filter changes."""
-
-    colour: Any
-
-    def specular(self, direction: Any, roughness: Any) -> Any:
-        return mi.Color3f(self.colour)
-
-    def irradiance(self, normal: Any) -> Any:
-        return mi.Color3f(self.colour)
-
-    def radiance(self, direction: Any) -> Any:
-        return mi.Color3f(self.colour)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,29 @@
+"""A light whose every direction is learnt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentLight, is_height
+from mi_refgs.shade.light.kind import LightKind
+from mi_refgs.types import TensorXf
+
+
+@dataclass(frozen=True)
+class Learnt(LightKind):
+    """An environment map, each of whose texels is learnt."""
+
+    # Texels; width is twice that.
+    height: int = field(
+        default=DEFAULT_HEIGHT, metadata={"allowed": (is_height, f"a multiple of 4 from {MIN_HEIGHT}")}
+    )
+    radiance: float = 0.5  # initial, everywhere
+
+    name: ClassVar[str] = "learnt"
+
+    def start(self) -> TensorXf:
+        return EnvironmentLight.constant(self.radiance, self.height).raw
+
+    def of(self, raw: TensorXf) -> EnvironmentLight:
+        return EnvironmentLight(raw)
