@@ -159,8 +159,8 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
         if array.ndim != 3 or array.shape[2] != 3 or array.shape[0] < 2 or not np.all(np.isfinite(array)):
             need = "need finite (h, w, 3) values, h ≥ 2; write the map again"
             raise InputError(f"metrics: {name} environment: {need}")
-    rows = lobe_matrices.row_resampling(len(truth), len(light))
-    columns = lobe_matrices.column_resampling(truth.shape[1], light.shape[1])
+    rows = lobe_matrices.resampling(len(truth), len(light)).toarray()
+    columns = lobe_matrices.resampling(truth.shape[1], light.shape[1], periodic=True).toarray()
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)
     weight = np.broadcast_to(lobe_matrices.row_areas(len(light))[:, None, None], light.shape)
     power = np.sum(weight * light**2, axis=(0, 1))

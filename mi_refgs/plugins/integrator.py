@@ -326,7 +326,6 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         what = f"surfels = {self.surfels.count},\n  attributes = {', '.join(self.surfels.raw)}"
         return f"RefGSIntegrator[\n  {what},\n  light = {size},\n  shading = {self.shading}\n]"
 
-
     def _warn_of_unusable(self) -> None:
         """Warn of values that are NaN, infinite or too large, and never check again if there are any."""
         found = [

@@ -66,14 +66,19 @@ def test_a_map_read_in_strips_is_the_map(
     np.testing.assert_allclose(read_radiance(path, rows), expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("fine", "coarse"), [(9, 8), (37, 12), (1000, 7), (16, 8), (5, 2)])
-def test_sparse_matrices_are_the_dense_ones(fine: int, coarse: int) -> None:
-    for periodic, dense in (
-        (False, lobe_matrices.row_resampling(fine, coarse)),
-        (True, lobe_matrices.column_resampling(fine, coarse)),
-    ):
-        sparse = lobe_matrices.hat_rows(fine, coarse, periodic).toarray()
-        np.testing.assert_allclose(sparse, dense, atol=1e-6)
+@pytest.mark.parametrize(("count", "wanted"), [(9, 8), (37, 12), (1000, 7), (5, 2), (8, 24)])
+def test_matrices_of_grids_are_hats(count: int, wanted: int) -> None:
+    """Area-weighted to coarsen, linear to refine; columns have their centres between those of the rows."""
+    angles = lobe_matrices.row_angles
+    hat = np.maximum(0, 1 - np.abs(angles(wanted)[:, None] - angles(count)) / angles(min(count, wanted))[1])
+    hat *= lobe_matrices.row_areas(count) if wanted < count else 1
+    rows = lobe_matrices.resampling(count, wanted).toarray()
+    np.testing.assert_allclose(rows, hat / hat.sum(1, keepdims=True), atol=1e-12)
+    between = lobe_matrices.column_angles(wanted)[:, None] - lobe_matrices.column_angles(count)
+    apart = np.abs((between + np.pi) % (2 * np.pi) - np.pi)
+    hat = np.maximum(0, 1 - apart * min(count, wanted) / (2 * np.pi))
+    columns = lobe_matrices.resampling(count, wanted, periodic=True).toarray()
+    np.testing.assert_allclose(columns, hat / hat.sum(1, keepdims=True), atol=1e-12)
 
 
 READ = """

@@ -16,7 +16,7 @@ from mi_refgs.io.exr import EXR_MAGIC, exr_strips
 from mi_refgs.io.files import strip_rows
 from mi_refgs.io.hdr import hdr_strips
 from mi_refgs.io.images import linear_from_srgb, read_bytes
-from mi_refgs.shade.light.lobe_matrices import hat_rows
+from mi_refgs.shade.light.lobe_matrices import resampling
 
 MAX_ROWS = 4096
 """Most rows that are kept of a map, unless the caller wants fewer: 400 MB of float32 with their columns."""
@@ -36,8 +36,8 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
         raise InputError(f"{size} are no lat-long image", path, "environment", "give 2 × 2 at least")
     h, w = min(height, rows), min(width, 2 * rows)
     image = np.zeros((h, w, 3), np.float32)
-    down = None if h == height else hat_rows(height, h)
-    across = None if w == width else hat_rows(width, w, periodic=True)
+    down = None if h == height else resampling(height, h).astype(np.float32)
+    across = None if w == width else resampling(width, w, periodic=True).astype(np.float32)
     top = 0
     for strip in strips:
         if not np.isfinite(strip).all():

@@ -15,9 +15,9 @@ function.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 LEVEL_ROUGHNESS = (0.1, 0.15, 0.22, 0.32, 0.45, 0.65, 1.0)
 """Roughness of the filtered levels (level 0 is the map itself): α about doubles from one to the next, so that
@@ -88,42 +88,26 @@ def row_areas(h: int) -> np.ndarray:
     return np.concatenate([left, [0.0]]) + np.concatenate([[0.0], right])
 
 
-def row_resampling(h_in: int, h_out: int) -> np.ndarray:
-    """(h_out, h_in) matrix between row grids: area-weighted hats to coarsen, linear to refine."""
-    step = np.pi / (min(h_in, h_out) - 1)
-    hat = np.maximum(0, 1 - np.abs(row_angles(h_out)[:, None] - row_angles(h_in)[None]) / step)
-    if h_out < h_in:
-        hat *= row_areas(h_in)
-    return hat / hat.sum(1, keepdims=True)
+def resampling(count: int, wanted: int, periodic: bool = False) -> csr_matrix:
+    """Sparse matrix (wanted, count) between grids of rows, or of columns if `periodic`.
 
-
-def column_resampling(w_in: int, w_out: int) -> np.ndarray:
-    """(w_out, w_in) matrix between column grids, periodic; hats as in `row_resampling`."""
-    step = 2 * np.pi / min(w_in, w_out)
-    Δ = np.abs(column_angles(w_out)[:, None] - column_angles(w_in)[None])
-    hat = np.maximum(0, 1 - np.minimum(Δ, 2 * np.pi - Δ) / step)
-    return hat / hat.sum(1, keepdims=True)
-
-
-def hat_rows(count: int, fewer: int, periodic: bool = False) -> Any:
-    """`row_resampling(count, fewer)`, or of columns if `periodic`, sparse (fewer, count) float32."""
-    from scipy.sparse import csr_matrix
-
+    Area-weighted hats to coarsen, linear to refine; rows of the matrix sum to 1.
+    """
     last = 0 if periodic else 1  # rows are on both ends of their interval, columns are not
-    ratio = (count - last) / (fewer - last)
+    ratio = (count - last) / (wanted - last)
     offset = 0.5 * (ratio - 1) if periodic else 0.0
-    centre = ratio * np.arange(fewer) + offset  # in steps of the finer grid
-    index = np.round(centre).astype(int)[:, None] + np.arange(-int(ratio) - 1, int(ratio) + 2)
-    weight = np.maximum(0, 1 - np.abs(centre[:, None] - index) / ratio)
+    centre, reach = ratio * np.arange(wanted) + offset, max(ratio, 1.0)  # in steps of the given grid
+    index = np.round(centre).astype(int)[:, None] + np.arange(-int(reach) - 1, int(reach) + 2)
+    weight = np.maximum(0, 1 - np.abs(centre[:, None] - index) / reach)
     if periodic:
         index %= count
     else:
         weight[(index < 0) | (index >= count)] = 0
         index = np.clip(index, 0, count - 1)
-        weight *= row_areas(count)[index]
+        weight *= row_areas(count)[index] if wanted < count else 1
     weight /= weight.sum(axis=1, keepdims=True)
-    row = np.repeat(np.arange(fewer), index.shape[1])
-    matrix = csr_matrix((weight.ravel().astype(np.float32), (row, index.ravel())), shape=(fewer, count))
+    row = np.repeat(np.arange(wanted), index.shape[1])
+    matrix = csr_matrix((weight.ravel(), (row, index.ravel())), shape=(wanted, count))
     matrix.eliminate_zeros()
     return matrix
 
@@ -131,8 +115,9 @@ def hat_rows(count: int, fewer: int, periodic: bool = False) -> Any:
 def resample(radiance: np.ndarray, height: int) -> np.ndarray:
     """Radiance (h, w, 3) at (height, 2·height, 3), keeping its integral when it coarsens."""
     h, w = radiance.shape[:2]
-    rows = np.tensordot(row_resampling(h, height), radiance.astype(np.float64), 1)
-    return np.einsum("ab,ibc->iac", column_resampling(w, 2 * height), rows)
+    rows, columns = resampling(h, height), resampling(w, 2 * height, periodic=True)
+    coarse = np.tensordot(rows.toarray(), radiance.astype(np.float64), 1)
+    return np.einsum("ab,ibc->iac", columns.toarray(), coarse)
 
 
 def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
@@ -185,10 +170,12 @@ def build_levels(h: int, levels: Levels = LEVELS) -> list[Level]:
         weights = fourier_rows(roughness, h_in, min(h_in, cap))
         if h_in < h:
             m = np.arange(h_in + 1)
-            first = column_resampling(2 * h, 2 * h_in)[0]
+            first = resampling(2 * h, 2 * h_in, periodic=True).toarray()[0]
             offset = column_angles(2 * h) - column_angles(2 * h_in)[0]
             transfer = (first[:, None] * np.cos(m * offset[:, None])).sum(0) * (h_in / h)
-            weights = np.einsum("ikm,kn,m->inm", weights, row_resampling(h, h_in), transfer, optimize=True)
+            weights = np.einsum(
+                "ikm,kn,m->inm", weights, resampling(h, h_in).toarray(), transfer, optimize=True
+            )
         rows = weights.shape[0]
         weights = weights[:, :, : rows + 1]  # a level of w columns has frequencies up to w/2
         if rows < h_in and roughness > HORIZON_CUTS:
