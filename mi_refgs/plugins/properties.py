@@ -179,9 +179,8 @@ def read_near_field(props: Any) -> NearField | None:
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
     """Read the shading, whose defaults fit the attributes, and the occluder if it traces visibility."""
-    default = Shading.default_reflectance(surfels.raw)
-    reflectance = _choice(props, "reflectance", default, tuple(MODELS))
-    diffuse = _choice(props, "diffuse", Shading.default_diffuse(reflectance, surfels.raw), DIFFUSE)
+    reflectance = _choice(props, "reflectance", Shading.default(surfels.raw)[0], tuple(MODELS))
+    diffuse = _choice(props, "diffuse", Shading.default(surfels.raw, [reflectance])[1], DIFFUSE)
     at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
     shading = Shading(at, reflectance, diffuse)

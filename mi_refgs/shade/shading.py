@@ -104,19 +104,15 @@ class Shading(ShadingOptions):
         return Shading(**note)
 
     @staticmethod
-    def default_reflectance(attributes: Collection[str]) -> str:
-        """The first model whose attributes are available, with either diffuse; else the one of fewest."""
-        each = [ShadingOptions(diffuse=diffuse) for diffuse in DIFFUSE]
-        needs = {name: min(map(model.required_attributes, each), key=len) for name, model in MODELS.items()}
-        able = (name for name, needed in needs.items() if {*needed} <= {*attributes})
-        return next(able, min(needs, key=lambda name: len(needs[name])))
-
-    @staticmethod
-    def default_diffuse(reflectance: str, attributes: Collection[str]) -> Diffuse:
-        """The first diffuse whose attributes are available; else the one of fewest."""
-        needs = {d: {*MODELS[reflectance].required_attributes(ShadingOptions(diffuse=d))} for d in DIFFUSE}
-        able = (diffuse for diffuse in DIFFUSE if needs[diffuse] <= {*attributes})
-        return next(able, min(DIFFUSE, key=lambda diffuse: len(needs[diffuse])))
+    def default(attributes: Collection[str], models: Collection[str] = MODELS) -> tuple[str, Diffuse]:
+        """The first of some models, with its first diffuse, whose attributes exist; else that of fewest."""
+        needs: dict[tuple[str, Diffuse], set[str]] = {
+            (name, diffuse): {*MODELS[name].required_attributes(ShadingOptions(diffuse=diffuse))}
+            for name in models
+            for diffuse in DIFFUSE
+        }
+        able = (chosen for chosen, needed in needs.items() if needed <= {*attributes})
+        return next(able, min(needs, key=lambda chosen: len(needs[chosen])))
 
     @property
     def model(self) -> Reflectance:

@@ -59,9 +59,8 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
 
     `options.dominant` turns r (`lookup_direction`).
 
-    Under a constant light of 1 no more than 1 leaves with "irradiance": S + (1 - S) (1 - metallic) albedo.
-    This is the albedo scaling of layered models, a specular layer over a diffuse base; it is not reciprocal,
-    as 1 - S depends on the view and not on the light. A fitted radiance ("sh") is outgoing and is not scaled.
+    Under a constant light of 1 no more than 1 leaves with "irradiance": the albedo scaling of layered models,
+    which is not reciprocal, as 1 - S depends on the view alone. A fitted radiance ("sh") is not scaled.
 
     Differentiable in everything but the branches of the clamps. Finite for every finite input.
     Raises InputError for "sh" without a radiance.

@@ -101,7 +101,7 @@ def test_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"near_field\.npz: near field: cannot be read"):
         NearField.read(path)
     np.savez(path, centre=CENTRE, nearness=-np.ones((8, 16)))
-    with pytest.raises(InputError, match=r"near_field\.npz: near field: nearness: .*negative"):
+    with pytest.raises(InputError, match=r"near_field\.npz: near field: .*negative"):
         NearField.read(path)
     np.savez(path, centre=CENTRE)
     with pytest.raises(InputError, match="cannot be read"):

@@ -52,11 +52,8 @@ def bounded(value: Any, raw: Any) -> Any:
 
 
 def nearest_raw(radiance: np.ndarray) -> np.ndarray:
-    """Raw float32 values whose softplus, as the device rounds it, is nearest to the radiance (float64).
-
-    A light that was read, written and read again is the same, bit for bit; by the exact inverse alone 2 % of
-    the texels are not, and images differ by 1e-6.
-    """
+    """Raw float32 values whose softplus, as the device rounds it, is nearest to the radiance (float64): a
+    light that was read, written and read again is the same, bit for bit."""
     wanted, exact = radiance.astype(np.float32), radiance + np.log(-np.expm1(-radiance))
     step = np.maximum(np.spacing(np.abs(exact).astype(np.float32)), np.spacing(wanted) / -np.expm1(-radiance))
     tried = np.stack([exact + k * step for k in (0, -1, 1, -2, 2)]).astype(np.float32)
@@ -65,11 +62,8 @@ def nearest_raw(radiance: np.ndarray) -> np.ndarray:
     return np.take_along_axis(tried, nearest[None], axis=0)[0]
 
 
-DEFAULT_HEIGHT = 64
-"""Rows of a light that is fitted: 2.8° a texel, about what an image of a few hundred pixels resolves in a
-mirror."""
-
-MIN_HEIGHT = 8  # fewest rows for which the prefilter's symmetries hold
+DEFAULT_HEIGHT = 64  # rows: 2.8° a texel, about what an image of a few hundred pixels resolves in a mirror
+MIN_HEIGHT = 8  # fewest rows of a light
 FINEST = 1024  # default for most rows of a light that is read from a file: 0.2° per texel
 RADIANCE_FLOOR = 1e-4  # least radiance after an import: softplus has no finite raw value for 0
 POLE_SINE = 1e-4  # within 0.006° of a pole the azimuth is fixed, so that its derivative stays below 1e4
@@ -92,18 +86,14 @@ class PrefilteredLight:
         return self._bilinear(*azimuth_polar(direction), mi.UInt32(0))
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
-        """∫ L cosθ dω / π over the hemisphere of unit world normals: constant light 1 gives 1.
-
-        At roughness 1 the lobe D is constant and only the cosine is left, so this is the last level.
-        """
+        """∫ L cosθ dω / π over the hemisphere of unit world normals: the last level, whose D is constant."""
         return self._bilinear(*azimuth_polar(normal), mi.UInt32(len(self.operator.roughness)))
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        """Radiance averaged over the GGX lobe around unit world directions.
+        """Radiance averaged over the GGX lobe around unit world directions. [split sum, Karis 2013]
 
-        Linear between levels in 1/roughness, where the mixture keeps both the lobe's energy (6 %) and its
-        peak, and in roughness⁴ below the first level, where a lobe narrower than a texel only begins to
-        spread. Derivative in light, direction and roughness. [split sum, Karis 2013]
+        Linear between levels in 1/roughness, which keeps the lobe's energy (6 %) and its peak, and in
+        roughness⁴ below the first. Derivative in light, direction and roughness.
         """
         place = _level(roughness, self.operator.roughness)
         lower = dr.minimum(mi.UInt32(dr.detach(place)), len(self.operator.roughness) - 1)

@@ -46,10 +46,8 @@ class NearField:
             raise InputError(
                 f"shapes {centre} and {nearness}", "near field", remedy="need (3,) and (h, 2h), h ≥ 2"
             )
-        if not (np.isfinite(self.centre).all() and np.isfinite(self.nearness).all()):
-            raise InputError("a value is not finite", "near field", remedy="replace it")
-        if np.min(self.nearness) < 0:
-            raise InputError("a value is negative", "near field", "nearness", "replace it")
+        if not (np.isfinite(self.centre).all() and np.all((0 <= self.nearness) & (self.nearness < np.inf))):
+            raise InputError("a value is negative or not finite", "near field", remedy="replace it")
 
     @staticmethod
     def read(path: str | os.PathLike[str]) -> NearField:
