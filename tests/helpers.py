@@ -78,6 +78,11 @@ def command_options(command: str | type) -> list[str]:
     return found
 
 
+def slow(*values: Any) -> Any:
+    """A case that is left out unless tests are asked for with `-m slow`."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def unit(d: np.ndarray) -> np.ndarray:
     """Rows of length 1."""
     return d / np.linalg.norm(d, axis=-1, keepdims=True)

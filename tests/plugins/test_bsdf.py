@@ -13,7 +13,7 @@ import pytest
 from mi_refgs.reference import lobe as reference
 from mi_refgs.reference.light import radiance_of
 from mi_refgs.shade.brdf import split_sum
-from tests.helpers import unit, vector
+from tests.helpers import slow, unit, vector
 from tests.scenes.integrator import sky
 
 ALBEDO = np.array([0.9, 0.5, 0.2])
@@ -67,8 +67,10 @@ def mean_weight(of: Any, wi: Any, ctx: Any = None, side: int = 512) -> Any:
 # ---------- The formula ----------
 
 
-@pytest.mark.parametrize("roughness", [0.03, 0.2, 0.6, 1.0])
-@pytest.mark.parametrize("metallic", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize(
+    ("roughness", "metallic"),
+    [(0.03, 0.4), (0.2, 0.0), (0.6, 1.0), (1.0, 0.4), slow(0.03, 1.0), slow(1.0, 0.0)],
+)
 def test_eval_is_the_formula(rng: np.random.Generator, roughness: float, metallic: float) -> None:
     count = 80
     wi = above(rng, count)
@@ -113,7 +115,7 @@ def test_reciprocity(rng: np.random.Generator) -> None:
 # ---------- Energy ----------
 
 
-@pytest.mark.parametrize("roughness", [0.01, 0.05, 0.2, 0.6, 1.0])
+@pytest.mark.parametrize("roughness", [0.01, 0.2, 1.0, slow(0.05), slow(0.6)])
 def test_white_furnace_is_the_split_sum(roughness: float) -> None:
     """Under constant light each component reflects what `shade` says, in the mean over its own samples."""
     for n_dot_v in (0.02, 0.1, 0.4, 1.0):
@@ -136,8 +138,9 @@ def test_white_furnace_is_the_split_sum(roughness: float) -> None:
 # ---------- Samples ----------
 
 
-@pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
-@pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(
+    ("roughness", "metallic"), [(0.3, 0.5), (1.0, 0.0), slow(0.3, 1.0), slow(0.6, 0.5), slow(1.0, 1.0)]
+)
 def test_chi_squared(roughness: float, metallic: float) -> None:
     from mitsuba.python.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
 
@@ -250,7 +253,7 @@ def patch(angle: float, spp: int) -> tuple[Any, np.ndarray, np.ndarray]:
     return mi.load_dict(scene), normal, view
 
 
-@pytest.mark.parametrize("degrees", [0, 50, 80])
+@pytest.mark.parametrize("degrees", [50, slow(0), slow(80)])
 def test_path_tracer_equals_quadrature(degrees: int) -> None:
     scene, normal, view = patch(np.radians(degrees), spp=1024)
     image = mi.render(scene, seed=2).numpy()
@@ -291,7 +294,7 @@ def sphere(integrator: str = "prb") -> Any:
     )
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.7, 1.0])
+@pytest.mark.parametrize("roughness", [0.2, 1.0, slow(0.7)])
 def test_derivatives_of_sampled_weights(roughness: float) -> None:
     """Those of the weights give those of the reflectance, as samples, densities and the choice have none."""
     n_dot_v, metallic, ε = 0.5, 0.3, 1e-3
@@ -354,7 +357,7 @@ def test_derivatives_of_images(rng: np.random.Generator) -> None:
     starts = {key: type(params[key])(params[key]) for key in keys}
     weight = rng.uniform(0, 1, (24, 24, 3)).astype(np.float32)
     gradients, differences = [], []
-    for seed in range(16):
+    for seed in range(8):
         for key, start in starts.items():
             params[key] = type(start)(start)
             dr.enable_grad(params[key])
@@ -375,7 +378,7 @@ def test_derivatives_of_images(rng: np.random.Generator) -> None:
         differences.append(np.concatenate(difference))
     off = np.array(gradients) - differences
     error = off.std(0, ddof=1) / np.sqrt(len(off))
-    assert (error < 0.015 * np.abs(np.mean(differences, 0))).all(), "too noisy to tell"
+    assert (error < 0.03 * np.abs(np.mean(differences, 0))).all(), "too noisy to tell"
     assert (np.abs(off.mean(0)) < 3 * error).all()
 
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.helpers import refused
+from tests.helpers import refused, slow
 from tests.scenes.integrator import (
     COUNT,
     HEIGHT,
@@ -23,7 +23,7 @@ from tests.scenes.integrator import (
 )
 
 
-@pytest.mark.parametrize("key", ["position", "opacity", "albedo", "light"])
+@pytest.mark.parametrize("key", ["position", "light", slow("opacity"), slow("albedo")])
 def test_derivatives_with_irradiance_and_supersampling(key: str) -> None:
     of = scene(diffuse="irradiance", aovs="nn:normal,d:depth,a:albedo")
     check_derivatives(of, f"integrator.{key}", spp=4)
@@ -96,9 +96,14 @@ def test_a_parameter_that_changes_nothing_has_tangent_zero() -> None:
     assert not np.any(dr.forward_to(image).numpy())
 
 
-@pytest.mark.parametrize("most", [None, WIDTH * HEIGHT // 3], ids=["whole", "bands"])
-@pytest.mark.parametrize("key", ["position", "albedo", "light"])
-@pytest.mark.parametrize("derived", [False, True], ids=["leaf", "derived"])
+@pytest.mark.parametrize(
+    ("key", "derived", "most"),
+    [
+        ("position", False, WIDTH * HEIGHT // 3),
+        ("light", True, None),
+        *(slow("albedo", derived, most) for derived in (False, True) for most in (None, WIDTH * HEIGHT // 3)),
+    ],
+)
 def test_tangents_add_up_over_losses(
     key: str, derived: bool, most: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,7 @@ from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import PinholeCamera, ray_slopes
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.init import from_points
-from tests.helpers import unit
+from tests.helpers import slow, unit
 from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotation_of
 from tests.scenes.integrator import (
     check_image_derivatives,
@@ -137,7 +137,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", ["deferred", "3D Gaussians", slow("forward"), slow("SH colour"), slow("occlusion")]
+)
 def test_derivatives_are_those_of_float64(name: str, tmp_path: Path) -> None:
     """Both modes, of radiance, alpha and AOVs, with respect to motions and the field of view."""
     pair = Pair(CASES[name].rounded(), tmp_path)
@@ -163,7 +165,7 @@ CROP = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 
 AOVS = "nn:normal,d:depth,a:albedo"
 
 
-@pytest.mark.parametrize("kind", ["occlusion", "antialias", "open", "crop"])
+@pytest.mark.parametrize("kind", ["occlusion", "crop", slow("antialias"), slow("open")])
 def test_derivatives_are_those_of_differences(kind: str, tmp_path: Path) -> None:
     """Supersampled images and their AOVs."""
     options: dict[str, Any] = {

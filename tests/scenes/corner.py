@@ -91,7 +91,7 @@ def floor_points(
         view=vector(unit(eye - place)),
         albedo=mi.Color3f(0.8, 0.7, 0.6) + dr.zeros(mi.Color3f, n),
         metallic=dr.full(mi.Float, 1, n),
-        roughness=dr.full(mi.Float, roughness, n),
+        roughness=dr.opaque(mi.Float, roughness, n),
     )
     return place, points
 

@@ -21,11 +21,8 @@ def T(matrix: object = None) -> mi.ScalarTransform4f:
 
 TURNS = {
     "as it is": lambda: T(),
-    "turned": lambda: T().rotate([0.6, 0.8, 0], 70),
     "mirrored in x": lambda: T().scale([-1, 1, 1]),
-    "mirrored in y": lambda: T().scale([1, -1, 1]),
     "mirrored in z and turned": lambda: T().rotate([0.6, 0, 0.8], 40).scale([1, 1, -1]),
-    "inverted": lambda: T().scale(-1),
     "moved": lambda: T().translate([3, 1, 2]),
 }
 

@@ -20,7 +20,7 @@ from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflection import reflection
-from tests.helpers import unit, vector
+from tests.helpers import slow, unit, vector
 from tests.scenes.corner import corner, floor_points, mirrored, seen, wall_blocks
 
 # ---------------- the points ----------------
@@ -43,14 +43,14 @@ def test_points_repeat_differ_between_pixels_and_are_even() -> None:
         assert np.abs(error).max() < bound, count
 
 
-@pytest.mark.parametrize("roughness", [0.05, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("roughness", [0.05, 0.6, slow(0.3), slow(1.0)])
 def test_weights_add_up_to_the_table(roughness: float) -> None:
     """Σ weight / k is F0 A + B, and Σ weight direction / k the quadrature's: density, shadowing, Fresnel."""
     cosine, f0, count = np.array([0.05, 0.2, 0.5, 0.8, 1.0]), 0.3, 4096
     normal = unit(np.array([[0.3, -0.5, 0.7]]))[0]
     view = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], 1) @ exact.frame(normal)
     normals, views = (vector(np.repeat(x, count, 0)) for x in (np.tile(normal, (5, 1)), view))
-    lobe = Lobe.of(normals, views, dr.full(mi.Float, roughness, 5 * count), mi.Color3f(f0))
+    lobe = Lobe.of(normals, views, dr.opaque(mi.Float, roughness, 5 * count), mi.Color3f(f0))
     unturned = replace(lobe, turn=mi.UInt32(0))
     ray = dr.arange(mi.UInt32, 5 * count) % count
     direction, weight = unturned.sample(ray, mi.UInt32(count))
@@ -75,7 +75,7 @@ def test_limits_of_the_lobe() -> None:
     view = height * normal + np.sqrt(1 - height**2) * across
 
     def sample(roughness: float) -> tuple[np.ndarray, np.ndarray]:
-        r = dr.full(mi.Float, roughness, 60)
+        r = dr.opaque(mi.Float, roughness, 60)
         lobe = Lobe.of(vector(normal), vector(view), r, mi.Color3f(0.3))
         direction, weight = lobe.sample(mi.UInt32(5), mi.UInt32(8))
         return direction.numpy().T, np.array(weight)
@@ -112,7 +112,7 @@ def true_fraction(place: np.ndarray, points: ShadingPoints, roughness: float, f0
     return np.array([*map(fraction, place, points.view.numpy().T.astype(np.float64))])
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("roughness", [0.2, 0.8, slow(0.5)])
 def test_many_rays_converge_to_the_traced_fraction(roughness: float) -> None:
     """Analytic floor and wall: the error falls as rays are added, and the mirror ray is far off."""
     place, points = floor_points(roughness)

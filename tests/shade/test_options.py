@@ -21,7 +21,7 @@ from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import reflect
 from mi_refgs.shade.shading import Shading
 from mi_refgs.shade.split_sum import shade
-from tests.helpers import unit
+from tests.helpers import slow, unit
 from tests.scenes.integrator import check_derivatives, image, plane_mesh, raw_channels, scene
 from tests.scenes.shading_points import N, points_of, shading_values
 
@@ -71,7 +71,7 @@ def lit_by(
     )
 
 
-@pytest.mark.parametrize("roughness", [0.3, 0.5, 0.7, 0.9])
+@pytest.mark.parametrize("roughness", [0.3, 0.9, slow(0.5), slow(0.7)])
 def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -> None:
     """Under a gradient, split sum against brute force: nearer in sum, and over twice as near where lobes are
     wide."""
@@ -118,7 +118,7 @@ def test_properties_of_the_plugin(tmp_path: Path) -> None:
         assert np.abs(changed - plain).max() > 0.01, name
 
 
-@pytest.mark.parametrize("rays", [1, 3])
+@pytest.mark.parametrize("rays", [3, slow(1)])
 def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
     options = {"dominant": True, "diffuse": "irradiance", "visibility_rays": rays, "traced_bounces": 2}
     check_derivatives(scene(mesh=plane_mesh(tmp_path), **options), "integrator.light")

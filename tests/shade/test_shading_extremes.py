@@ -11,7 +11,7 @@ import pytest
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.split_sum import shade
-from tests.helpers import unit
+from tests.helpers import slow, unit
 from tests.scenes.shading_points import exact_light, exact_terms, points_of, shading_values
 
 N = 24
@@ -70,7 +70,8 @@ LIGHTS = {
 
 
 @pytest.mark.parametrize(
-    ("light", "diffuse"), [("smooth", "sh"), *((light, "irradiance") for light in LIGHTS)]
+    ("light", "diffuse"),
+    [("smooth", "sh"), ("a peak of 1e6", "irradiance"), *(slow(light, "irradiance") for light in LIGHTS)],
 )
 def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.random.Generator) -> None:
     """Error ≤ 1e-4 of the brightest term, and gradients of albedo, metallic and radiance to 1 %.

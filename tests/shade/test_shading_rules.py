@@ -30,10 +30,6 @@ STAGE = "[stage.only]\nuntil = 100\n"
 
 IMPOSSIBLE = {
     "no light": (STAGE, ["stage.only", "light", "add it"]),
-    "no light in a later stage": (
-        f"[stage.first]\nuntil = 50\nreflectance = 'radiance'\n{STAGE}",
-        ["stage.only", "light"],
-    ),
     "no roughness": (
         f"[surfels]\nattributes = ['radiance_sh', 'albedo', 'metallic']\n{LIGHT}{STAGE}",
         ["stage.only", "roughness", "no such attribute"],
@@ -41,10 +37,6 @@ IMPOSSIBLE = {
     "no harmonics": (
         f"[surfels]\nattributes = ['albedo', 'metallic', 'roughness']\n{LIGHT}{STAGE}",
         ["stage.only", "radiance_sh", "no such attribute"],
-    ),
-    "no SH attribute for radiance": (
-        f"[surfels]\nattributes = ['albedo']\n{STAGE}reflectance = 'radiance'",
-        ["stage.only", "radiance_sh"],
     ),
     "a misspelt attribute": (
         f"[surfels]\nattributes = ['albdeo']\n{STAGE}",

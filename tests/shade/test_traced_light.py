@@ -26,7 +26,7 @@ from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.shade.split_sum import shade
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import unit, vector
+from tests.helpers import slow, unit, vector
 from tests.scenes.corner import (
     EYE,
     FLOOR,
@@ -156,7 +156,7 @@ def true_reflection(
     return exact.reflected(incoming, y, view, roughness, np.array([0.8, 0.7, 0.6]), 24)
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.45])
+@pytest.mark.parametrize("roughness", [0.2, slow(0.45)])
 def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
     """Two plates, brute force with one bounce: mirror ray alone, traced mirror ray, traced lobe."""
     place, points = floor_points(roughness, count=10)
@@ -226,8 +226,14 @@ def lengths(place: np.ndarray, directions: np.ndarray) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("diffuse", ["irradiance", "sh"])
-@pytest.mark.parametrize("bounces", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("bounces", "diffuse"),
+    [
+        (2, "sh"),
+        (3, "irradiance"),
+        *(slow(*c) for c in ((1, "sh"), (1, "irradiance"), (2, "irradiance"), (3, "sh"))),
+    ],
+)
 def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) -> None:
     """Between two walls, recursion in float64: rays that end before the last bounce, and after."""
     place, points = floor_points(0.3, eye=LOW_EYE)
@@ -245,7 +251,7 @@ def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) 
     assert {1, 2, 3, 4} <= set(lengths(place, mirrors))
 
 
-@pytest.mark.parametrize("rays", [2, 6])
+@pytest.mark.parametrize("rays", [slow(2), 6])
 def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
     """The mean over the blocked rays, one by one, and a single bright ray among them held back."""
     place, points = floor_points(0.4, count=25, eye=LOW_EYE)
@@ -276,7 +282,7 @@ def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
     assert held > 2
 
 
-@pytest.mark.parametrize("rays", [1, 4])
+@pytest.mark.parametrize("rays", [1, slow(4)])
 def test_bounces_add_light_and_converge(rays: int) -> None:
     """Every bounce adds light somewhere and takes none anywhere; the last ones add next to nothing."""
     place, points = floor_points(0.3, count=300, eye=LOW_EYE)
@@ -296,8 +302,17 @@ def test_bounces_add_light_and_converge(rays: int) -> None:
 # ---------------- derivatives ----------------
 
 
-@pytest.mark.parametrize("rays", [1, 5])
-@pytest.mark.parametrize("name", ["light", "albedo", "metallic", "roughness", "radiance_sh"])
+@pytest.mark.parametrize(
+    ("name", "rays"),
+    [
+        ("light", 5),
+        ("roughness", 5),
+        ("albedo", 1),
+        ("radiance_sh", 1),
+        slow("metallic", 5),
+        slow("light", 1),
+    ],
+)
 def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two bounces, both modes against central differences of the indirect radiance, with random weights and
     steps; what is held back of bright rays stays as it was, as the derivative has it."""
