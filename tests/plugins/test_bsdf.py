@@ -346,6 +346,7 @@ def test_everything_is_finite() -> None:
             assert np.isfinite(np.array(x)).all()
 
 
+@pytest.mark.slow
 def test_derivatives_of_images(rng: np.random.Generator) -> None:
     """prb against differences of images with the same random numbers, in the mean over seeds."""
     scene = sphere()

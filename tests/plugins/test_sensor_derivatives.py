@@ -1,4 +1,4 @@
-"""Derivatives of mi.render with respect to a sensor's `to_world` and `x_fov`; poses found by descent."""
+"""Derivatives of mi.render with respect to a sensor's `to_world` and `x_fov`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from benchmarks.stability import exact
 from benchmarks.stability.cases import HEIGHT, WIDTH, Case, camera, catalogue, plain
@@ -20,8 +19,7 @@ from mi_refgs.occlusion.mesh import write_mesh
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import PinholeCamera, ray_slopes
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.init import from_points
-from tests.helpers import slow, unit
+from tests.helpers import slow
 from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotation_of
 from tests.scenes.integrator import (
     check_image_derivatives,
@@ -237,28 +235,3 @@ def test_sensor_without_gradients_changes_nothing() -> None:
     dr.enable_grad(leaf)
     assert dr.grad_enabled(moved.image(leaf, spp=1)) and camera.attached(eye).motion is not None
     assert not dr.grad_enabled(moved.of.integrator().render(moved.of, 0, spp=1))
-
-
-# ---------------- poses that are found ----------------
-
-
-def test_wrong_pose_is_recovered() -> None:
-    """By descent through mi.render, from 3° and 4.6 % of the distance away."""
-    rng = np.random.default_rng(0)
-    points = unit(rng.normal(size=(400, 3)))
-    spots = 0.5 + 0.5 * np.sin(6 * points)
-    ball = from_points(points, points, spots, rng=rng, opacity=0.99, metallic=0.1, roughness=0.3)
-    eye = sensor(film={"width": 24, "height": 24})
-    moved = Moved(scene(eye, ball.to_numpy()))
-    target = mi.render(moved.of, spp=1)
-    opt = mi.ad.Adam(lr=1e-2)
-    opt["motion"] = mi.Float([0.03, -0.03, 0.03, 0.1, -0.1, 0.1])
-    for step in range(120):
-        opt.set_learning_rate(1e-2 * 0.97**step)
-        image = moved.image(dr.concat([opt["motion"], mi.Float(0)]), spp=1)
-        dr.backward(dr.mean(dr.square(image - target), axis=None))
-        opt.step()
-    found, true = (np.array(x.matrix, np.float64).reshape(4, 4) for x in (moved.params[POSE], moved.start))
-    turn = Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).magnitude()
-    assert np.degrees(turn) < 0.1
-    assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 2e-3 * np.linalg.norm(true[:3, 3])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import drjit as dr
@@ -280,23 +279,6 @@ def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
             plain = weight[k][blocked] @ radiance[blocked] / weight[k][blocked].sum()
             held += bool((expected < 0.9 * plain).any())
     assert held > 2
-
-
-@pytest.mark.parametrize("rays", [1, slow(4)])
-def test_bounces_add_light_and_converge(rays: int) -> None:
-    """Every bounce adds light somewhere and takes none anywhere; the last ones add next to nothing."""
-    place, points = floor_points(0.3, count=300, eye=LOW_EYE)
-    surfels = channel_surfels()
-    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    occluder = with_materials(channel(), surfels)
-    each = [ShadingOptions(visibility_rays=rays, traced_bounces=bounces) for bounces in (1, 2, 3, 6, 7)]
-    found = [seen(points, place, one, surfels, light, occluder=occluder, eye=LOW_EYE) for one in each]
-    images = [points.indirect.numpy() for points in found]
-    steps = [after - before for before, after in pairwise(images)]
-    for step in steps:
-        assert step.min() > (-1e-5 if rays == 1 else -0.02)  # a brighter ray may hold another back less
-    size = [float(step.mean()) for step in steps]
-    assert size[0] > size[1] > size[2] > size[3] and size[0] > 0.01 and size[3] < 0.01 * size[0]
 
 
 # ---------------- derivatives ----------------
