@@ -107,7 +107,7 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     """Learnt, saved as a map that scene.xml and the relit run read, and continued from its checkpoint."""
     data, own = write_data(tmp_path / "data"), method(tmp_path, METHOD)
     assert main(train_command(data, tmp_path / "run", own)) == 0
-    run = mi_refgs.load(tmp_path / "run")
+    run: Any = mi_refgs.load(tmp_path / "run")
     saved = run.trained.light.radiance().numpy()
     before = Sun(elevation=60).of(Sun(elevation=60).start()).environment().radiance().numpy()
     assert saved.shape == before.shape and 1e-4 < np.abs(saved - before).max()
@@ -121,7 +121,8 @@ def lit(folder: Path, light: str) -> Any:
     """Radiance of the light of a short fit with this table."""
     text = METHOD.replace('kind = "sun"\nelevation = 60', light)
     assert main(train_command(write_data(folder / "data"), folder / "run", method(folder, text))) == 0
-    return mi_refgs.load(folder / "run").trained.light.radiance().numpy()
+    run: Any = mi_refgs.load(folder / "run")
+    return run.trained.light.radiance().numpy()
 
 
 def test_a_constant_light_learns_one_colour(tmp_path: Path) -> None:
