@@ -135,5 +135,5 @@ def test_a_known_light_stays_what_it_is(tmp_path: Path, rng: np.random.Generator
     sky = rng.uniform(0.2, 1, (8, 16, 3)).astype(np.float32)
     write_exr(tmp_path / "sky.exr", sky)
     np.testing.assert_allclose(lit(tmp_path, f'kind = "file"\nfile = "{tmp_path}/sky.exr"'), sky, rtol=1e-5)
-    with pytest.raises(InputError, match="light.file"):
+    with pytest.raises(InputError, match=r"light\.file"):
         LIGHTS["file"]().start()
