@@ -143,6 +143,6 @@ def material_maps(
 
 
 def _comparable(model: Reflectance, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return maps with NAMES as `Reflectance.textures` converts them; without them if it does not."""
-    others = {name: shown for name, shown in maps.items() if name not in NAMES}
+    """Return maps with MATERIALS as `Reflectance.textures` converts them; without them if it does not."""
+    others = {name: shown for name, shown in maps.items() if name not in MATERIALS}
     return others | (model.textures(maps) or {})
