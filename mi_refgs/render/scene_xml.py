@@ -21,6 +21,7 @@ from mi_refgs.splat.camera import Camera
 # cameras of a file have no near plane to derive it from, and other integrators show nothing behind it.
 NEAR_CLIP_MIN = 1e-12
 FAR_CLIP = RAW_LIMIT
+SQUARE = 1e-5  # relative difference of focal lengths, by rounding, up to which pixels are square
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
 
     # The field of view and the principal point are those of the whole film, of which a crop is rendered.
     (left, top), whole = (0, 0), (width, height)
-    if camera.film is not None and per_pixel == (1.0, 1.0):
+    if camera.film is not None and max(per_pixel) < 1 + SQUARE:
         (left, top), whole = camera.offset, camera.film
     x, y = cx * per_pixel[0] + left, cy * per_pixel[1] + top
     sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id=name)

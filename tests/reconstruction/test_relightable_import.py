@@ -107,7 +107,7 @@ def test_strays_do_not_decide_where_cameras_are(stray: dict[str, float], ball: P
         np.testing.assert_allclose(second.camera.pose(), first.camera.pose(), atol=0.05)
 
 
-@pytest.mark.parametrize(("preset", "side"), [("quick", 256), ("paper", 800), ("6:9", 256)])
+@pytest.mark.parametrize(("preset", "side"), [("quick", 256), ("paper", 800), ("6:9", 400)])
 def test_preset_chooses_the_size_of_the_views(
     preset: str, side: int, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
