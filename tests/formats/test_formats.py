@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
-from mi_refgs.formats import FORMATS, Format, Option, write
+from mi_refgs.formats import FORMATS, Format, Option
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.ownership import RECORD
 from mi_refgs.occlusion.mesh import Mesh
@@ -145,16 +145,3 @@ def test_turntable_ignores_outliers(finished: Path, mesh: bool) -> None:
             moved = replace(trained, mesh=Mesh(position.copy(), np.zeros((0, 3), np.uint32), 0.1))
         places.append([camera.pose()[:3, 3] for camera in turntable_cameras(moved, cameras, 3)])
     np.testing.assert_allclose(places[1], places[0], atol=0.1)
-
-
-def test_cameras_around_no_surfels_are_refused(finished: Path) -> None:
-    surfels = TrainedScene.read(finished).surfels
-    refused(lambda: shots_around(surfels.gather(mi.UInt32())), "there are none")
-
-
-def test_write_function_writes_formats(plain: list[Any], finished: Path, tmp_path: Path) -> None:
-    trained = TrainedScene.read(finished)
-    shots = shots_around(trained.surfels)
-    found = write(trained, ["plain"], tmp_path / "n.txt", shots, {"level": 5})
-    assert found == {"plain": [tmp_path / "n.txt"]} and plain[0][3] == 5
-    refused(lambda: write(trained, [], tmp_path, shots), "no format")

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import mi_refgs
-from mi_refgs import Camera, InputError, NewLight, Reconstruction, methods
+from mi_refgs import Camera, InputError, NewLight, Reconstruction
 from mi_refgs.cli import main
 from mi_refgs.data.region import Region
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
-from mi_refgs.methods.read import assignments, load_resolved
+from mi_refgs.methods.read import load_resolved
 from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.runs.run import CAMERAS, Run
 from tests.helpers import refused
@@ -260,15 +260,6 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
     del kept
     gc.collect()
     assert not folder.exists()
-
-
-def test_settings_become_toml_assignments() -> None:
-    found = assignments({"a": 1, "b.c": 0.5, "d": True, "e": "x", "f": [1, 2], "g": {"h": [{"i": 1}]}})
-    assert found == ["a=1", "b.c=0.5", "d=true", 'e="x"', "f=[1, 2]", 'g={"h" = [{"i" = 1}]}']
-    assert assignments(["a=1"]) == ["a=1"]
-    changes = assignments({"loss.normal": {"weight": 0.1, "rise": 3}, "data.coarse": ({"until": 9},)})
-    made = methods.load("ref_gaussian", "quick", changes)
-    assert made.loss["normal"] == methods.LossWeight(0.1, rise=3) and made.data.coarse[0].until == 9
 
 
 # ---------------- refusals ----------------

@@ -279,15 +279,3 @@ def test_bad_preset_is_refused_before_views_are_rendered(ball: Path, tmp_path: P
     refused([*argv, "--for", "fun"], "--for: fun: no method is for that")
     refused([*argv[:-1], "--resume"], "--resume: ", "add --relightable")
     assert not (tmp_path / "run").exists()
-
-
-def test_foreign_files_stay(ball: Path, method: Path, tmp_path: Path) -> None:
-    """In the folder of the views, as in the run folder."""
-    run = tmp_path / "run"
-    for name in ("data/transforms.json", "surfels.ply"):
-        file = run / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text("mine")
-        refused(lambda: mi_refgs.import_relightable(ball, run, method=method, preset=PRESET), file)
-        assert tree(run) == {file: b"mine"}
-        file.unlink()
