@@ -36,7 +36,7 @@ class Edit:
     def run(self) -> Result:
         """Edit the run."""
         from mi_refgs.editing.change import assignments
-        from mi_refgs.editing.values import parse_condition
+        from mi_refgs.editing.selection import parse_condition
         from mi_refgs.io.images import write_png
         from mi_refgs.reconstruction.reconstruction import load
         from mi_refgs.runs.run import Run

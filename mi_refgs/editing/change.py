@@ -10,7 +10,7 @@ import numpy as np
 
 from mi_refgs.editing.options import Assignments, Change
 from mi_refgs.editing.placement import MAJORITY, Owners
-from mi_refgs.editing.values import COLOUR, SurfelValues, activated
+from mi_refgs.editing.selection import COLOUR, SurfelValues, activated
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import TrainedScene

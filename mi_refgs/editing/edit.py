@@ -12,8 +12,7 @@ import numpy as np
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.editing.change import apply, assignments
 from mi_refgs.editing.options import Change, EditOptions, Selection
-from mi_refgs.editing.selection import select
-from mi_refgs.editing.values import COLOUR
+from mi_refgs.editing.selection import COLOUR, select
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import contact_sheet, image_array
 from mi_refgs.render.display import displayed

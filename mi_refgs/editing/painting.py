@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
-from mi_refgs.editing.values import SurfelValues
+from mi_refgs.editing.selection import SurfelValues
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import render_depth

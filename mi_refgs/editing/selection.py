@@ -1,16 +1,108 @@
-"""Selection of surfels by their values and their positions."""
+"""Selection of surfels by their values, such as `metallic > 0.5 and z < 0`, and their positions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.editing.options import Selection
-from mi_refgs.editing.values import SurfelValues, parse_condition
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.runs.relightable import outward
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.surfels.attributes import ATTRIBUTES, SH_DC, sigmoid
+
+COLOUR = "colour"
+"""The SH term of degree 0 of radiance_sh, ½ + c Y₀: linear radiance."""
+AXES = "xyz"
+NORMALS = [f"normal.{axis}" for axis in AXES]
+COMPARISON = re.compile(r"\s*([A-Za-z_][\w.]*)\s*([<>]=?)\s*(\S+)\s*", re.ASCII)
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "<": np.less,
+    "<=": np.less_equal,
+    ">": np.greater,
+    ">=": np.greater_equal,
+}
+Condition = list[list[tuple[str, str, float]]]
+"""Groups of comparisons: those of at least one group are all true."""
+
+
+def parse_condition(text: str) -> Condition:
+    """Parse comparisons of names with numbers between `and` and `or`; raises InputError for anything else."""
+    groups = re.split(r"\bor\b", text)
+    return [[_comparison(part) for part in re.split(r"\band\b", group)] for group in groups]
+
+
+def _comparison(text: str) -> tuple[str, str, float]:
+    if match := COMPARISON.fullmatch(text):
+        try:
+            return match[1], match[2], float(match[3])
+        except ValueError:
+            pass
+    raise InputError("no comparison", "--where", abbreviated(text.strip()), "write it like metallic > 0.5")
+
+
+def activated(name: str, raw: dict[str, np.ndarray]) -> np.ndarray:
+    """Return an attribute with a linear or sigmoid activation, or the COLOUR, (N, D) float64."""
+    if name == COLOUR:
+        return 0.5 + SH_DC * raw["radiance_sh"][:, :3].astype(np.float64)
+    values = raw[name].astype(np.float64)
+    return sigmoid(values) if ATTRIBUTES[name].activation == "sigmoid" else values
+
+
+class SurfelValues:
+    """The activated attributes of a scene's surfels, (N,) float64 by name, computed when they are read.
+
+    Names: single columns, such as `roughness`, `albedo.r`, `position.x` or `x`; `colour.r` … `.b` (COLOUR);
+    `size`, the largest standard deviation (scene units); and `normal.x` … `.z`, outwards as in
+    `runs.relightable.outward`.
+    """
+
+    def __init__(self, scene: TrainedScene) -> None:
+        self.scene, self.raw = scene, scene.surfels.to_numpy()
+        self.columns: dict[str, tuple[str, list[int]]] = {}  # attribute, or COLOUR, and its columns by name
+        for name, table in self.raw.items():
+            declared, width = ATTRIBUTES[name], table.shape[1]
+            if not declared.harmonics and declared.activation not in ("quaternion", "exp"):
+                self._add(name, width, declared.aov.lower() if len(declared.aov) == width else AXES)
+        self.columns |= {axis: ("position", [i]) for i, axis in enumerate(AXES)}
+        if "radiance_sh" in self.raw:
+            self._add(COLOUR, 3, "rgb")
+        singles = [name for name, (_, columns) in self.columns.items() if len(columns) == 1]
+        self.names = [*singles, "size", *NORMALS]
+
+    def _add(self, of: str, width: int, letters: str) -> None:
+        self.columns[of] = of, list(range(width))
+        if width > 1:
+            self.columns |= {f"{of}.{letter}": (of, [i]) for i, letter in enumerate(letters)}
+
+    @property
+    def settable(self) -> list[str]:
+        """The names that can be given other values, of all columns of an attribute or of one."""
+        return [
+            n for n, (of, _) in self.columns.items() if of == COLOUR or ATTRIBUTES[of].activation == "sigmoid"
+        ]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return the values (N,) of a name; raises InputError for an unknown one."""
+        if name == "size":
+            return self.scene.surfels.primitive.extent(self.raw)[1].max(axis=1).astype(float)
+        if name in NORMALS:
+            normal = outward(self.scene.surfels, self.scene.mesh)[0]
+            return normal[:, NORMALS.index(name)].astype(np.float64)
+        if name not in self.names:
+            what = f"{abbreviated(name)} is no value of these surfels"
+            raise InputError(what, "--where", remedy=f"use one of {', '.join(self.names)}")
+        of, columns = self.columns[name]
+        return activated(of, self.raw)[:, columns[0]]
+
+    def where(self, condition: Condition) -> np.ndarray:
+        """Return the surfels (N,) bool that meet a condition; raises InputError for an unknown name."""
+        groups = [[OPERATORS[sign](self[name], x) for name, sign, x in group] for group in condition]
+        return np.any([np.all(group, axis=0) for group in groups], axis=0)
 
 
 def select(scene: TrainedScene, selection: Selection) -> np.ndarray:

@@ -15,8 +15,7 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.editing.edit import edit
 from mi_refgs.editing.options import Selection
-from mi_refgs.editing.selection import select
-from mi_refgs.editing.values import SurfelValues
+from mi_refgs.editing.selection import SurfelValues, select
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.run import Run
