@@ -35,34 +35,27 @@ class _Sums:
     """Sums over pixels from which every error follows, whatever the scale."""
 
     count: int = 0
-    own: Any = 0.0  # (C,) Σ ours²
-    cross: Any = 0.0  # (C,) Σ ours · true
-    true: Any = 0.0  # (C,) Σ true²
-    absolute: Any = 0.0  # (C,) Σ |ours - true|
+    sums: np.ndarray = field(default_factory=lambda: np.zeros((4, 1)))
+    """(4, C): Σ ours², Σ ours · true, Σ true², Σ |ours - true|."""
 
     def add(self, ours: np.ndarray, true: np.ndarray) -> None:
         """Add pixels (P, C)."""
-        ours, true = ours.astype(np.float64), true.astype(np.float64)
-        self.count += len(ours)
-        self.own += np.sum(ours**2, axis=0)
-        self.cross += np.sum(ours * true, axis=0)
-        self.true += np.sum(true**2, axis=0)
-        self.absolute += np.sum(np.abs(ours - true), axis=0)
+        a, b = ours.astype(np.float64), true.astype(np.float64)
+        self.count += len(a)
+        self.sums = self.sums + np.stack([a**2, a * b, b**2, np.abs(a - b)]).sum(axis=1)
 
     def scale(self) -> np.ndarray:
         """Return the least-squares scale of ours (C,); 1 without a pixel."""
-        return np.asarray(self.cross / np.maximum(self.own, 1e-30)) if self.count else np.ones(3)
+        return np.asarray(self.sums[1] / np.maximum(self.sums[0], 1e-30)) if self.count else np.ones(3)
 
     def psnr(self, scale: np.ndarray) -> float | None:
         """Return the PSNR in dB after a scale, of linear values with a peak of 1; None without a pixel."""
-        if not self.count:
-            return None
-        squared = scale**2 * self.own - 2 * scale * self.cross + self.true
-        return psnr_of(float(np.mean(squared)) / self.count)
+        squared = scale**2 * self.sums[0] - 2 * scale * self.sums[1] + self.sums[2]
+        return psnr_of(float(np.mean(squared)) / self.count) if self.count else None
 
     def mae(self) -> float | None:
         """Return the mean absolute error; None without a pixel."""
-        return float(np.mean(self.absolute)) / self.count if self.count else None
+        return float(np.mean(self.sums[3])) / self.count if self.count else None
 
 
 @dataclass

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Sequence
+from types import EllipsisType
 from typing import Any
 
 import drjit as dr
@@ -36,7 +37,7 @@ TIMED_FRAMES = 20  # frames whose median is reported; the views repeat if there 
 # ---------------- images ----------------
 
 
-def psnr(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
+def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | EllipsisType = ...) -> float:
     """Compute the peak signal-to-noise ratio in dB over all pixels and channels, at most 100.
 
     `where` (H, W) selects pixels, at least one; by default the background counts too.
@@ -48,7 +49,7 @@ def psnr(image: np.ndarray, truth: np.ndarray, where: Any = ...) -> float:
 def ssim(
     image: np.ndarray,  # (H, W, 3)
     truth: np.ndarray,  # (H, W, 3)
-    where: Any = ...,
+    where: np.ndarray | EllipsisType = ...,
 ) -> float:
     """Compute the structural similarity that the loss uses (`fitting.ssim`); `where` as in `psnr`.
 
