@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import combinations
+from itertools import count as counter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,33 +24,22 @@ from mi_refgs.errors import InputError
 from mi_refgs.progress import progress_bar
 
 SEED = 0  # seed of all random numbers; a second run gives the same result
-WORKING_SIZE = 1600
-"""Longest side, pixels, of the images in which features are detected. Images of twice that size take four
-times as long and give hardly more features that match."""
-MOST_FEATURES = 3000
-"""Largest number of features per image; matching time grows with its square. With 3,000, two cores match
-about 30 pairs per second."""
-POLL = 0.25  # seconds between two updates of the progress bar
-IMAGES_AT_ONCE, PAIRS_AT_ONCE = 8, 200
-"""Images or pairs per call of COLMAP; the progress bar moves after each call."""
+WORKING_SIZE = 1600  # longest side of the images, pixels; twice takes four times as long for few matches more
+MOST_FEATURES = 3000  # per image; matching time grows with its square: two cores match 30 pairs a second
+POLL = 0.25  # seconds between two looks for Ctrl-C
+IMAGES_AT_ONCE, PAIRS_AT_ONCE = 8, 200  # per call of COLMAP; the progress bar moves after each
 SMALLEST_MODEL = 3  # smallest number of images in a model; COLMAP's default of 10 would refuse small sets
 MOST_MODELS = 5  # largest number of separate groups of images that are reconstructed; a message counts them
+EXHAUSTIVE = 150  # largest number of images for which every pair is matched: 11,175 pairs take some minutes
+IN_ORDER = 8  # images before and after each, by name, with which it is matched in larger sets: a walk
+ALIKE = 20  # most similar images with which each is also matched in larger sets: they close loops
+WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12
+"""Size of the vocabulary, features per image from which it is made, and iterations of k-means."""
+LENS_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV")  # that are tried, from few to many parameters
+LENS_GAIN = 0.01  # by which more parameters must reduce the mean reprojection error; noise gives 1e-4
 
 Result = TypeVar("Result")
 Item = TypeVar("Item")
-EXHAUSTIVE = 150  # largest number of images for which every pair is matched: 11,175 pairs take some minutes
-IN_ORDER = 8
-"""Number of images before and after each one, in the order of names, with which it is matched in larger sets:
-they overlap on a walk around an object."""
-ALIKE = 20
-"""Number of most similar images with which each one is also matched in larger sets, which closes loops."""
-WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12
-"""Size of the vocabulary, features per image from which it is made, and iterations of k-means."""
-LENS_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV")
-"""Lens models that are tried, from few to many parameters."""
-LENS_GAIN = 0.01
-"""Fraction by which a lens model with more parameters must reduce the mean reprojection error: for 50,000
-observations, fitting noise reduces it by 1e-4."""
 
 
 def load() -> Any:
@@ -57,17 +47,9 @@ def load() -> Any:
     try:
         import pycolmap
     except ImportError:
-        raise InputError('capture: pycolmap is not installed; pip install "mi_refgs[capture]"') from None
+        remedy = 'pip install "mi_refgs[capture]"'
+        raise InputError("pycolmap is not installed", "capture", remedy=remedy) from None
     return pycolmap
-
-
-def installed() -> bool:
-    """Whether pycolmap can be imported."""
-    try:
-        load()
-    except InputError:
-        return False
-    return True
 
 
 @contextmanager
@@ -82,8 +64,8 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def _run(call: Callable[[Any], Result], poll: Callable[[], None] = lambda: None) -> Result:
-    """Run `call(cancellation token)` in a thread, so that Ctrl-C stops it; `poll` is called repeatedly."""
+def _run(call: Callable[[Any], Result]) -> Result:
+    """Run `call(cancellation token)` in a thread, so that Ctrl-C stops it."""
     pycolmap = load()
     token = pycolmap.CancellationToken()
     with quiet(), ThreadPoolExecutor(1) as pool:
@@ -91,7 +73,7 @@ def _run(call: Callable[[Any], Result], poll: Callable[[], None] = lambda: None)
         future = pool.submit(call, token)
         try:
             while not wait([future], timeout=POLL).done:
-                poll()
+                pass
         except BaseException:
             token.cancel()
             raise
@@ -115,9 +97,9 @@ def _in_parts(
 def begin(database: Path, folder: Path, groups: Sequence[tuple[Sequence[str], str, Sequence[float]]]) -> None:
     """Create a database with the images of cameras: (names in `folder`, model, parameters or none) each."""
     pycolmap = load()
-    temporary = database.with_name(f".{database.name}.tmp")
-    for stale in (temporary, *(temporary.with_name(temporary.name + ending) for ending in ("-wal", "-shm"))):
-        stale.unlink(missing_ok=True)
+    temporary = database.parent / "begun.db"
+    for stale in database.parent.glob("begun.db*"):
+        stale.unlink()
     with quiet():
         pycolmap.Database.open(temporary).close()
         for names, model, parameters in groups:
@@ -172,32 +154,6 @@ def features(database: Path) -> dict[str, np.ndarray]:
         }
 
 
-def verified(database: Path) -> list[tuple[str, str, int, bool]]:
-    """Pairs with a two-view geometry: names, number of matches, whether a rotation or a plane suffices."""
-    pycolmap = load()
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    flat = {kinds.PANORAMIC, kinds.PLANAR, kinds.PLANAR_OR_PANORAMIC}
-    with quiet(), closing(pycolmap.Database.open(database)) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        ids, geometries = opened.read_two_view_geometries()
-        found = []
-        for pair, geometry in zip(ids, geometries, strict=True):
-            first, second = (names[image] for image in pycolmap.pair_id_to_image_pair(pair))
-            if count := len(geometry.inlier_matches):
-                found.append((first, second, count, geometry.config in flat))
-        return found
-
-
-def options_of_mapping() -> Any:
-    """Options of mapping and triangulation."""
-    pycolmap = load()
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = SEED
-    options.min_model_size = SMALLEST_MODEL
-    options.max_num_models = MOST_MODELS
-    return options
-
-
 def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[Any]:
     """Reconstruct each connected group of images: pycolmap.Reconstructions, the largest first.
 
@@ -205,24 +161,22 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
     """
     pycolmap = load()
     output.mkdir(parents=True, exist_ok=True)
-    placed: list[None] = []
-
-    def one_more() -> None:
-        placed.append(None)
-
-    arguments = (database, folder, output, options_of_mapping())
-    callbacks = {"initial_image_pair_callback": one_more, "next_image_callback": one_more}
-
-    def call(token: Any) -> Any:
-        return pycolmap.incremental_mapping(*arguments, **callbacks, cancellation_token=token)
-
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = SEED
+    options.min_model_size = SMALLEST_MODEL
+    options.max_num_models = MOST_MODELS
+    placed = counter(1)
     with progress_bar(count, "cameras") as shown:
 
-        def show() -> None:
-            shown.update(max(0, min(len(placed), count) - shown.n))
+        def one_more() -> None:
+            shown.update(next(placed) <= count)
 
-        models = _run(call, show)
-        show()
+        def call(token: Any) -> Any:
+            calls = {"initial_image_pair_callback": one_more, "next_image_callback": one_more}
+            arguments = (database, folder, output, options)
+            return pycolmap.incremental_mapping(*arguments, **calls, cancellation_token=token)
+
+        models = _run(call)
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 

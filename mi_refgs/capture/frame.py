@@ -18,15 +18,11 @@ from mi_refgs.data.region import Region, region_radius, weighted_quantile
 from mi_refgs.errors import InputError
 
 ROUNDS = 50  # iterations of reweighted least squares, which converge to the least sum of absolute values
-LEVEL_SPREAD = 0.02
-"""Variance of the cameras' right-hand directions off their main line, relative, below which they determine no
-plane: ± 8°."""
+LEVEL_SPREAD = 0.02  # relative variance of right-hand directions off their main line without a plane: ± 8°
 SEEN_SHARE = 0.5  # fraction of the cameras whose images must show a point; other points are background
 REGION_POINTS = 50  # number of points that determine the region's radius; with fewer, the cameras alone do
 REGION_QUANTILE = 0.9  # fraction of the points around the focus that the region contains
-LEAST_SHARE = 0.5
-"""Smallest radius of the region over the radius estimated from the cameras: points are only where the object
-has texture."""
+LEAST_SHARE = 0.5  # least radius over that from the cameras: points are only where the object has texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +94,8 @@ def region_of_interest(solved: Solved) -> Region:
     distance = np.linalg.norm(solved.origin - focus, axis=1)
     radius = region_radius(distance, solved.half_angle)
     if not radius > 0:
-        raise InputError("photographs: a camera is at the point at which all look; walk around an object")
+        what = "a camera is at the point at which all look"
+        raise InputError(what, "photographs", remedy="walk around an object")
     offset = np.linalg.norm(solved.points - focus, axis=1)
     near = offset < radius
     near[near] = seen_share(solved, solved.points[near]) >= SEEN_SHARE

@@ -1,8 +1,4 @@
-"""The data set of a capture: undistorted images and masks, COLMAP's files of pinhole cameras, and its folder.
-
-The file RECORD lists the files that the last capture wrote, so that the next one removes no others, and marks
-the folder as one to which a capture may write.
-"""
+"""The data set of a capture: undistorted images and masks, and COLMAP's files of pinhole cameras."""
 
 from __future__ import annotations
 
@@ -24,29 +20,15 @@ from mi_refgs.capture.photographs import Photograph, mask_pixels
 from mi_refgs.data.colmap_model import MODELS, Camera
 from mi_refgs.data.lens import Undistortion, undistortion
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import (
-    TEMPORARY,
-    cannot_write,
-    inside,
-    is_file,
-    read_json,
-    remove_temporaries,
-    replace_file,
-    write_json,
-)
+from mi_refgs.io.files import cannot_write, read_json, replace_file
 from mi_refgs.progress import with_bar
 
 QUALITY = 95  # quality of JPEG files; lower ones make a fit reproduce their block edges
-WRITERS = 4
-"""Largest number of images that are undistorted at once. Peak memory of the process, measured with images of
-12 Mpx of one lens: 0.5 GB with one, 1.3 GB with four."""
-SPLINE_PIXELS = 2_000_000
-"""Pixels up to which images are resampled with cubic splines; larger ones are reduced before a fit sees
-them."""
-WORK = ".work"  # folder of working copies, features, matches and models; it may be removed after the capture
-RECORD = ".capture.json"  # key and names of the files of the last output
-LAST = "sparse/0/images.bin"
-"""The file that is removed first and moved last: without it the folder is no data set."""
+WRITERS = 4  # images undistorted at once, at most: with images of 12 Mpx 1.3 GB, with one 0.5 GB
+SPLINE_PIXELS = 2_000_000  # up to which images are resampled with cubic splines; a fit reduces larger ones
+WORK = ".work"  # folder of working copies, features, matches and the model; it may be removed afterwards
+REPORT = "capture.json"  # written last: with a folder WORK or this file, the folder is a capture
+SPARSE, IMAGES, MASKS = "sparse/0", "images", "masks"
 
 
 @dataclass(frozen=True)
@@ -72,10 +54,9 @@ class Straight:
             lens = known.lens()
             undo = None if lens is None else undistortion(lens, *size, fx, fy, cx, cy)
         except InputError as error:
-            raise InputError(
-                f"photographs: the lens found cannot be undone ({error}); choose another lens model, such as "
-                "--camera-model RADIAL"
-            ) from None
+            what = f"the lens found cannot be undone ({error})"
+            remedy = "choose another lens model, such as --camera-model RADIAL"
+            raise InputError(what, "photographs", remedy=remedy) from None
         zoom = 1.0 if undo is None else undo.zoom
         return cls(size, (zoom * fx, zoom * fy), (cx, cy), undo)
 
@@ -99,40 +80,58 @@ def straighten(model: Any, photographs: dict[str, Photograph]) -> dict[str, Stra
     return {image.name: straight[image.camera_id] for image in images}
 
 
+def prepare(folder: Path, sources: Sequence[Path]) -> None:
+    """Make the folder of a data set; `sources` are the folders that are read.
+
+    Raises InputError for a folder that is or contains a source, that contains anything but a capture, and
+    that cannot be written.
+    """
+    real = folder.resolve()
+    for source in sources:
+        if real in (source.resolve(), *source.resolve().parents):
+            what = f"it contains {source}, which is read"
+            raise InputError(what, folder, "output", "choose another folder")
+    own = (folder / WORK / "key").is_file()
+    own = own or ((folder / REPORT).is_file() and "key" in read_json(folder / REPORT))
+    if not own and folder.is_dir() and any(folder.iterdir()):
+        raise InputError("not empty, and no capture", folder, "output", "choose another folder")
+    try:
+        (folder / WORK).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
 def write_images(
     placed: Sequence[Photograph],
     straight: Callable[[Photograph], Straight],
     masks: dict[str, Path],
     folder: Path,
 ) -> None:
-    """Write missing images/NAME, and masks/NAME.png if there are masks."""
-    for part in ("images", *(["masks"] if masks else [])):
-        (folder / part).mkdir(parents=True, exist_ok=True)
+    """Write images/NAME, and masks/NAME.png if there are masks, in place of those of the last capture."""
+    for part in (IMAGES, MASKS):
+        shutil.rmtree(folder / part, ignore_errors=True)
+        if part == IMAGES or masks:
+            (folder / part).mkdir()
 
     def write(photograph: Photograph) -> None:
         from PIL import Image
 
-        camera, image = straight(photograph), folder / "images" / photograph.name
-        if not image.is_file():
-            if camera.undo is None and photograph.as_displayed:
-                replace_file(image, partial(shutil.copyfile, photograph.path))
-            else:
-                pixels = Image.fromarray(camera.resample(np.asarray(photograph.load())))
-                replace_file(image, partial(_save, pixels, photograph))
+        camera, image = straight(photograph), folder / IMAGES / photograph.name
+        if camera.undo is None and photograph.as_displayed:
+            replace_file(image, partial(shutil.copyfile, photograph.path))
+        else:
+            jpeg = photograph.path.suffix.lower() in (".jpg", ".jpeg")
+            kind = {"format": "JPEG", "quality": QUALITY, "subsampling": 0} if jpeg else {"format": "PNG"}
+            pixels = Image.fromarray(camera.resample(np.asarray(photograph.load())))
+            replace_file(image, lambda path: pixels.save(path, exif=photograph.exif(), **kind))
         if masks:
-            mask = folder / "masks" / f"{photograph.name}.png"
-            pixels = Image.fromarray(camera.resample(mask_pixels(masks[photograph.name], photograph))[..., 0])
-            replace_file(mask, lambda path: pixels.save(path, format="PNG"))
+            mask = camera.resample(mask_pixels(masks[photograph.name], photograph))[..., 0]
+            target = folder / MASKS / f"{photograph.name}.png"
+            replace_file(target, lambda path: Image.fromarray(mask).save(path, format="PNG"))
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, WRITERS)) as pool:
-        for written, _ in zip(pool.map(write, placed), with_bar(placed, "undistorted"), strict=True):
-            assert written is None
-
-
-def _save(image: Any, photograph: Photograph, path: Path) -> None:
-    jpeg = photograph.path.suffix.lower() in (".jpg", ".jpeg")
-    options = {"format": "JPEG", "quality": QUALITY, "subsampling": 0} if jpeg else {"format": "PNG"}
-    image.save(path, exif=photograph.exif(), **options)
+        for _ in zip(pool.map(write, placed), with_bar(placed, "undistorted"), strict=True):
+            pass
 
 
 def write_model(
@@ -161,70 +160,3 @@ def write_model(
         image.name = photographs[image.name].name
     folder.mkdir(parents=True, exist_ok=True)
     moved.write_binary(folder)
-
-
-def prepare(folder: Path, sources: Sequence[Path]) -> None:
-    """Make or accept the folder of a data set; `sources` are the folders that are read.
-
-    Raises InputError for a folder that is or contains a source, that contains anything but a capture, and
-    that cannot be written.
-    """
-    real = folder.resolve()
-    for source in sources:
-        if real in (source.resolve(), *source.resolve().parents):
-            raise InputError(f"{folder}: output: it contains {source}, which is read; choose another folder")
-    try:
-        empty = not folder.is_dir() or not any(folder.iterdir())
-        if not (empty or (is_file(folder / RECORD) and "files" in read_json(folder / RECORD))):
-            raise InputError(f"{folder}: output: not empty, and no capture; choose another folder")
-        (folder / WORK).mkdir(parents=True, exist_ok=True)
-        remove_temporaries(folder)
-        if empty:
-            write_json(folder / RECORD, {"key": None, "files": []})
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-
-
-def is_complete(folder: Path, key: str) -> bool:
-    """Whether the folder has all files of the output with this key."""
-    recorded, files = _record(folder)
-    return recorded == key and all(is_file(folder / name) for name in files)
-
-
-def replace_output(folder: Path, made: Path, key: str) -> None:
-    """Move the files below `made` into the folder; those of the last output are removed.
-
-    Another call completes an interrupted one. Raises InputError, before anything is changed, if a file that
-    no capture wrote is in the way; and if the folder cannot be written.
-    """
-    _, before = _record(folder)
-    new = sorted(path.relative_to(made).as_posix() for path in made.rglob("*") if _whole(path))
-    for name in sorted({*new} - {*before}):
-        if os.path.lexists(folder / name):
-            raise InputError(f"{folder / name}: output: not written by a capture; move it to another folder")
-    try:
-        write_json(folder / RECORD, {"key": None, "files": sorted({*before, *new})})
-        for name in sorted(before, key=lambda name: name != LAST):
-            (folder / name).unlink(missing_ok=True)
-        for name in sorted(new, key=lambda name: name == LAST):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (made / name).rename(folder / name)
-        for parent in {(folder / name).parent for name in before}:
-            if parent.is_dir() and not any(parent.iterdir()):
-                parent.rmdir()
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    write_json(folder / RECORD, {"key": key, "files": new})
-
-
-def _whole(path: Path) -> bool:
-    """Whether this is a file, and no temporary one of a killed process."""
-    return path.is_file() and not TEMPORARY.fullmatch(path.name)
-
-
-def _record(folder: Path) -> tuple[str | None, list[str]]:
-    """Key and files of the last output; names that lead out of the folder are ignored."""
-    content = read_json(folder / RECORD)
-    files = content.get("files")
-    names = [name for name in files if inside(folder, name)] if isinstance(files, list) else []
-    return content.get("key"), names

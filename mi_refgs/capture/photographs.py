@@ -15,17 +15,14 @@ import numpy as np
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
-from mi_refgs.io.images import ENDINGS, exif_tags, open_image, read_mask, to_8_bits
+from mi_refgs.io.images import ENDINGS, exif_tags, image_size, open_image, read_mask, to_8_bits
 from mi_refgs.progress import with_bar
 
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()
 """Formats of cameras that are not read here, for a message that says what to do."""
 FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point
-DIAGONAL_35MM = 43.2666
-"""Diagonal of a frame of 36 mm × 24 mm, mm, to which EXIF's 35 mm equivalent of a focal length relates."""
+DIAGONAL_35MM = 43.2666  # mm, of a frame of 36 mm × 24 mm, to which EXIF's 35 mm equivalent relates
 ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405  # EXIF tags
-TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split()
-"""Pillow's names of what displays stored pixels upright, for EXIF's orientations from 2 on."""
 SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation that swap width and height
 
 
@@ -73,10 +70,6 @@ class Photograph:
         """The upward direction when it was taken, (right, down) in the data set's image."""
         return (-1.0, 0.0) if self.lying else (0.0, -1.0)
 
-    def focal_pixels(self, size: tuple[int, int]) -> float | None:
-        """The focal length in pixels of a copy of this size."""
-        return None if self.focal is None else self.focal * float(np.hypot(*size))
-
     def load(self, longest: int | None = None) -> Any:
         """The image as oriented in the data set: an RGB PIL image of at most `longest` pixels per side.
 
@@ -86,27 +79,25 @@ class Photograph:
 
         with open_image(self.path) as image:
             if image.mode.startswith(("I", "F")):
-                raise InputError(
-                    f"{self.path}: pixels: more than 8 bits per channel; save it as JPEG or 8-bit PNG"
-                )
+                remedy = "save it as JPEG or 8-bit PNG"
+                raise InputError("more than 8 bits per channel", self.path, "pixels", remedy)
             factor = 1.0 if longest is None else max(1.0, max(image.size) / longest)
             wanted = tuple(max(1, round(side / factor)) for side in image.size)
             if factor >= 2:
                 image.draft("RGB", wanted)  # JPEG decodes smaller for less
             copy = image.convert("RGB")
-            copy.info = {}
         if copy.size != wanted:
             copy = copy.resize(wanted, Image.Resampling.LANCZOS)
-        return self.turned(copy)
+        return self.turned(copy, self.orientation)
 
-    def turned(self, stored: Any) -> Any:
-        """Rotate a PIL image from the stored orientation to that of the data set."""
-        from PIL.Image import Transpose
+    def turned(self, stored: Any, orientation: int) -> Any:
+        """Rotate a PIL image from an orientation of EXIF to that of the data set."""
+        from PIL import Image, ImageOps
 
-        turns = [TURNS[self.orientation - 2]] if self.orientation > 1 else []
-        for turn in (*turns, *(["ROTATE_90"] if self.lying else [])):
-            stored = stored.transpose(Transpose[turn])
-        return stored
+        upright = Image.fromarray(np.asarray(stored))  # without EXIF data of its own
+        upright.getexif()[ORIENTATION] = orientation
+        upright = ImageOps.exif_transpose(upright)
+        return upright.transpose(Image.Transpose.ROTATE_90) if self.lying else upright
 
     def exif(self) -> bytes:
         """The EXIF data for an image in display orientation; empty if the file's are broken."""
@@ -128,7 +119,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
     Raises InputError for a missing folder, too few images, images of many sizes, and unreadable files.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: photographs: no such folder; give one with JPEG or PNG files")
+        raise InputError("no such folder", folder, "photographs", "give one with JPEG or PNG files")
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     paths = [path for path in files if path.suffix.lower() in ENDINGS]
     if len(paths) < FEWEST:
@@ -136,12 +127,12 @@ def find_photographs(folder: Path) -> list[Photograph]:
         remedy = "photograph the object from all sides, 30 to 100 times"
         remedy = f"convert its {other[0][0]} files to JPEG" if other else remedy
         found = {0: "no JPEG or PNG file", 1: "one image"}.get(len(paths), f"{len(paths)} images")
-        raise InputError(f"{folder}: photographs: {found}; {remedy}")
+        raise InputError(found, folder, "photographs", remedy)
     kept = [replace(_photograph(path), number=i) for i, path in enumerate(paths)]
     most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]
     kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in kept]
     remedy = f"a fit takes {MAX_SIZES} at most: leave out those that were cropped"
-    require_few_sizes(f"{folder}: photographs", {p.kept_size: p.name for p in kept}, remedy)
+    require_few_sizes(folder, "photographs", {p.kept_size: p.name for p in kept}, remedy)
     return kept
 
 
@@ -178,14 +169,6 @@ def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int) 
             replace_file(file, partial(image.save, format="PNG", compress_level=1))
 
 
-def cameras_of(photographs: Sequence[Photograph]) -> list[list[Photograph]]:
-    """Group photographs by camera and lens: by size, device and focal length."""
-    groups: dict[tuple[Any, ...], list[Photograph]] = {}
-    for photograph in photographs:
-        groups.setdefault((photograph.kept_size, photograph.device, photograph.focal), []).append(photograph)
-    return list(groups.values())
-
-
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
     """The mask of each photograph by the photograph's name; empty without a folder.
 
@@ -195,7 +178,7 @@ def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[s
     if folder is None:
         return {}
     if not folder.is_dir():
-        raise InputError(f"{folder}: --masks: no such folder; give one with a PNG file for each photograph")
+        raise InputError("no such folder", folder, "--masks", "give one with a PNG file per photograph")
     there = {path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()}
     masks: dict[str, Path] = {}
     for photograph in photographs:
@@ -203,17 +186,12 @@ def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[s
         candidates = [name + ".png", *(stem + ending for ending in ENDINGS)]
         path = next((there[candidate] for candidate in candidates if candidate in there), None)
         if path is None:
-            raise InputError(
-                f"{folder}: --masks: none for {photograph.name}; add {photograph.path.stem}.png, white where "
-                "the object is"
-            )
-        with open_image(path) as image:
-            size = image.size
-        if size not in (photograph.size, photograph.stored_size):
-            raise InputError(
-                f"{path}: --masks: {size[0]} × {size[1]} pixels, but {photograph.name} has "
-                f"{photograph.size[0]} × {photograph.size[1]}; make masks of the photographs' size"
-            )
+            remedy = f"add {photograph.path.stem}.png, white where the object is"
+            raise InputError(f"none for {photograph.name}", folder, "--masks", remedy)
+        (width, height), wanted = image_size(path), photograph.size
+        if (width, height) not in (wanted, photograph.stored_size):
+            what = f"{width} × {height} pixels, but {photograph.name} has {wanted[0]} × {wanted[1]}"
+            raise InputError(what, path, "--masks", "make masks of the photographs' size")
         masks[photograph.name] = path
     return masks
 
@@ -227,6 +205,5 @@ def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
     from PIL import Image
 
     mask = Image.fromarray(to_8_bits(read_mask(path)))
-    displayed = mask.size == photograph.size
-    turned = (replace(photograph, orientation=1) if displayed else photograph).turned(mask)
-    return np.asarray(turned)[..., None]
+    orientation = 1 if mask.size == photograph.size else photograph.orientation
+    return np.asarray(photograph.turned(mask, orientation))[..., None]

@@ -1,7 +1,7 @@
 """The capture pipeline: from photographs to a COLMAP data set with cameras, points and a region of interest.
 
-The result of a step is named by the hash of its inputs and written atomically: a run that was interrupted, or
-is repeated with other photographs or options, computes only what has changed.
+The folder `.work` contains what the steps leave, and the hash of their inputs: a run that was interrupted
+goes on, one with the same inputs computes nothing again, and other photographs or options begin anew.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,60 +20,24 @@ import numpy as np
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import Solved
 from mi_refgs.capture.frame import moved, upright_unit
-from mi_refgs.capture.photographs import Photograph, cameras_of, find_masks, find_photographs, write_copies
+from mi_refgs.capture.output import REPORT, SPARSE, WORK
+from mi_refgs.capture.photographs import Photograph, find_masks, find_photographs, write_copies
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.object_region import support_planes
 from mi_refgs.data.region import Region, write_region
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import read_json, replace_file, write_json
-from mi_refgs.io.images import image_size, read_png
+from mi_refgs.io.images import image_size
 
-REPORT, PLOT = "capture.json", "capture.png"
-VERSION = 2
-"""Version of the steps' algorithms. Results of other versions are computed again."""
-
-FIRST_MODEL = "SIMPLE_RADIAL"
-"""Lens model with which images are registered by default; few matches determine its one parameter."""
-
-SHOWN_RADII = 6.0
-"""Half the width of the plot in radii of the region, unless the cameras need more; far points are cut off."""
+PLOT = "capture.png"
+VERSION = 3  # of the steps' algorithms; results of other versions are computed again
+FIRST_MODEL = "SIMPLE_RADIAL"  # lens with which images are registered: few matches determine its parameter
+SHOWN_RADII = 6.0  # half the width of the plot in radii of the region, unless the cameras need more
 LEAST_TILT = 0.3  # sine of the angle to a plot from which a plane is drawn in it
-GOOD_ERROR = 1.0
-"""Mean reprojection error, pixels, above which something is wrong: lens, rolling shutter, moving objects."""
-FEW_FEATURES = 60
-"""Smallest number of features in the median image: a pair needs 15 consistent matches, and a quarter of the
-features is a good fraction."""
-FLAT_CONTRAST = 0.04  # standard deviation of brightness, 0 … 1, below which an image is uniform
+GOOD_ERROR = 1.0  # reprojection error, pixels, above which lens, rolling shutter or scene are wrong
+FEW_FEATURES = 60  # of the median image: a pair needs 15 consistent matches, a good quarter of the features
 LEAST_PLACED = 0.5  # fraction of the photographs that must be registered in one group
-TURN_SHARE = 0.8
-"""Fraction of the matched pairs explained by a rotation or a plane from which the camera probably only
-rotated."""
 NAMED = 5  # largest number of photographs that a message names
-
-
-@dataclass(frozen=True)
-class CaptureJob:
-    """Photographs and masks of a capture, its folders and options."""
-
-    photographs: list[Photograph]
-    masks: dict[str, Path]
-    source: Path
-    folder: Path
-    camera: str | None
-
-    @property
-    def work(self) -> Path:
-        return self.folder / output.WORK
-
-    @property
-    def copies(self) -> dict[str, Photograph]:
-        """The photographs by the names of their working copies."""
-        return {photograph.copy: photograph for photograph in self.photographs}
-
-    def key(self, *more: Any) -> str:
-        """A hash of the photographs, their orientation, and the other inputs of a step."""
-        parts = [VERSION, [(p.name, p.digest, p.lying) for p in self.photographs], *more]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
 def capture(
@@ -95,51 +58,54 @@ def capture(
     Raises InputError for unusable input, with the remedy, and without pycolmap.
     """
     # Photographs and options.
-    colmap.load()
+    pycolmap = colmap.load()
     if camera not in (None, *MODELS):
-        raise InputError(f"--camera-model: {camera}: unknown lens model; give one of {', '.join(MODELS)}")
+        remedy = f"give one of {', '.join(MODELS)}"
+        raise InputError(f"{camera}: unknown lens model", "--camera-model", remedy=remedy)
     photographs = find_photographs(source)
-    job = CaptureJob(photographs, find_masks(masks, photographs), source, folder, camera)
+    mask_files = find_masks(masks, photographs)
     output.prepare(folder, [source] if masks is None else [source, masks])
+    inputs = [VERSION, pycolmap.__version__, camera, [(p.name, p.digest, p.lying) for p in photographs]]
+    copies = {photograph.copy: photograph for photograph in photographs}
 
     # Cameras of the largest group, transformed to an upright world.
-    began = time.perf_counter()
-    result = _solve(job, tell)
-    model, groups = colmap.load().Reconstruction(result), read_json(result / "groups.json")["groups"]
-    require_placed(source, len(photographs), groups, _beside_gap(job, groups[0]))
-    straight = output.straighten(model, job.copies)
+    began, work = time.perf_counter(), folder / WORK
+    mark, given = work / "key", _hash(inputs)
+    if not mark.is_file() or mark.read_text() != given:
+        shutil.rmtree(work)
+        work.mkdir()
+        mark.write_text(given)
+    if not (work / "model").is_dir():
+        _solve(source, work, copies, camera, tell)
+    model = pycolmap.Reconstruction(work / "model")
+    straight = output.straighten(model, copies)
     solved = Solved.of(model)
-    similarity = upright_unit(solved, np.array([job.copies[name].up for name in solved.names]))
+    similarity = upright_unit(solved, np.array([copies[name].up for name in solved.names]))
     world = moved(solved, similarity)
     found = region or Region((0.0, 0.0, 0.0), 1.0, estimated=True)
     found = replace(found, planes=support_planes(world.points, world.origin, found))
 
     # Undistorted images and COLMAP's files, unless the last capture wrote the same.
-    lenses = [(name, repr(straight[name])) for name in solved.names]
-    key = job.key(lenses, _digests(sorted(result.glob("*.bin"))), _digests(job.masks.values()))
-    if not output.is_complete(folder, key):
-        made = job.work / f"output-{key}"
-        for stale in {*job.work.glob("output-*")} - {made}:
-            shutil.rmtree(stale)
-        placed = [job.copies[name] for name in solved.names]
-        output.write_images(placed, lambda p: straight[p.copy], job.masks, made)
-        output.write_model(model, job.copies, straight, similarity, made / "sparse" / "0")
-        output.replace_output(folder, made, key)
-        shutil.rmtree(made)
+    mask_digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in mask_files.values()]
+    key, last = _hash([inputs, repr(straight), mask_digests]), folder / REPORT
+    if not (last.is_file() and read_json(last).get("key") == key):
+        for stale in (*folder.glob(f"{SPARSE}/*.bin"), last):  # without them the folder is no data set
+            stale.unlink(missing_ok=True)
+        placed = [copies[name] for name in solved.names]
+        output.write_images(placed, lambda p: straight[p.copy], mask_files, folder)
+        output.write_model(model, copies, straight, similarity, folder / SPARSE)
     write_region(folder, found)
     draw(folder / PLOT, world, found)
 
     # The report.
-    registered = {job.copies[name].name for name in world.names}
+    registered = {copies[name].name for name in world.names}
     cameras, pinholes = model.cameras.values(), {(s.size, s.focal): s for s in straight.values()}
     report = {
         "key": key,
         "photographs": len(photographs),
         "placed": len(registered),
         "not_placed": [p.name for p in photographs if p.name not in registered],
-        "other_groups": [[job.copies[name].name for name in group] for group in groups[1:]],
         "points": len(world.points),
-        "observations": int(world.length.sum()),
         "mean_track_length": float(world.length.mean()) if len(world.length) else 0.0,
         "mean_reprojection_error": float(model.compute_mean_reprojection_error()),
         "lens": {
@@ -148,86 +114,68 @@ def capture(
         },
         "pinholes": [{"size": s.size, "focal": s.focal, "centre": s.centre} for s in pinholes.values()],
         "region": found.content,
-        "masks": bool(job.masks),
         "seconds": round(time.perf_counter() - began, 1),
     }
-    write_json(folder / REPORT, report)
+    write_json(last, report)
     return report
 
 
-def _digests(files: Iterable[Path]) -> list[str]:
-    """SHA-256 of files."""
-    return [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+def _hash(inputs: list[Any]) -> str:
+    return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:12]
 
 
-def _solve(job: CaptureJob, tell: Callable[[str], None]) -> Path:
-    """The folder with the largest group's reconstruction and groups.json, the names in each group."""
-    pycolmap = colmap.load()
-    size, names = colmap.WORKING_SIZE, sorted(job.copies)
-    images = job.work / f"pictures-{job.key(size)}"
-    features = job.key(size, colmap.MOST_FEATURES, pycolmap.__version__, job.camera or FIRST_MODEL)
-    database = job.work / f"features-{features}.db"
-    result = job.work / f"model-{job.key(features, job.camera)}"
-    if not result.is_dir():
-        for path in job.work.iterdir():  # of other images or options
-            if path != images and not path.name.startswith(database.stem):
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-        # Features.
-        write_copies(job.photographs, images, size)
-        if not database.is_file():
-            colmap.begin(database, images, _groups(job, images))
-        colmap.extract(database, images, names)
-        found = colmap.features(database)
-        require_features(job.source, [len(found[name]) for name in names], _contrast(images, names))
-        # Matches.
-        pairs = colmap.pairs_to_match(found)
-        features_found = sum(map(len, found.values()))
-        tell(f"{len(names)} photographs, {features_found} features, {len(pairs)} pairs to match")
-        colmap.match(database, pairs)
-        # Cameras and lens.
-        raw = job.work / "unfinished"
-        shutil.rmtree(raw, ignore_errors=True)
-        models = colmap.reconstruct(database, images, raw, len(names))
-        if not models:
-            raise no_model(job.source, len(names), colmap.verified(database))
-        best = models[0] if job.camera else colmap.best_lens(models[0])
-        if job.camera:
-            colmap.adjust(best)
-        shutil.rmtree(raw)
-        raw.mkdir()
-        best.write_binary(raw)
-        write_json(raw / "groups.json", {"groups": [Solved.of(model).names for model in models]})
-        raw.rename(result)
-    return result
+def _solve(
+    source: Path, work: Path, copies: dict[str, Photograph], camera: str | None, tell: Callable[[str], None]
+) -> None:
+    """Write work/model: the reconstruction of the largest group."""
+    images, database, names = work / "pictures", work / "features.db", sorted(copies)
+    # Features.
+    write_copies([*copies.values()], images, colmap.WORKING_SIZE)
+    if not database.is_file():
+        colmap.begin(database, images, _groups([*copies.values()], images, camera or FIRST_MODEL))
+    colmap.extract(database, images, names)
+    found = colmap.features(database)
+    require_features(source, [len(found[name]) for name in names])
+    # Matches.
+    pairs = colmap.pairs_to_match(found)
+    features_found = sum(map(len, found.values()))
+    tell(f"{len(names)} photographs, {features_found} features, {len(pairs)} pairs to match")
+    colmap.match(database, pairs)
+    # Cameras and lens.
+    raw = work / "unfinished"
+    shutil.rmtree(raw, ignore_errors=True)
+    models = colmap.reconstruct(database, images, raw, len(names))
+    groups = [Solved.of(model).names for model in models]
+    require_placed(source, len(names), groups)
+    best = models[0] if camera else colmap.best_lens(models[0])
+    if camera:
+        colmap.adjust(best)
+    shutil.rmtree(raw)
+    raw.mkdir()
+    best.write_binary(raw)
+    raw.rename(work / "model")
 
 
-def _groups(job: CaptureJob, images: Path) -> list[tuple[list[str], str, list[float]]]:
-    """Images, lens model and initial parameters of each camera; none without a focal length in EXIF."""
+def _groups(
+    photographs: Sequence[Photograph], images: Path, model: str
+) -> list[tuple[list[str], str, list[float]]]:
+    """Images, lens model and initial parameters of each camera: of equal size, device and focal length.
+
+    There are no parameters without a focal length in EXIF data.
+    """
+    cameras: dict[Any, list[Photograph]] = {}
+    for photograph in photographs:
+        cameras.setdefault((photograph.kept_size, photograph.device, photograph.focal), []).append(photograph)
     groups = []
-    for photographs in cameras_of(job.photographs):
-        copies = [photograph.copy for photograph in photographs]
-        size = image_size(images / copies[0])
-        focal, model = photographs[0].focal_pixels(size), job.camera or FIRST_MODEL
-        parameters: list[float] = []
+    for group in cameras.values():
+        size = image_size(images / group[0].copy)
+        focal, parameters = group[0].focal, list[float]()
         if focal is not None:
-            known = {"f": focal, "fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}
+            pixels = focal * float(np.hypot(*size))
+            known = {"f": pixels, "fx": pixels, "fy": pixels, "cx": size[0] / 2, "cy": size[1] / 2}
             parameters = [known.get(name, 0.0) for name in MODELS[model][1].split()]
-        groups.append((copies, model, parameters))
+        groups.append(([photograph.copy for photograph in group], model, parameters))
     return groups
-
-
-def _contrast(images: Path, names: Sequence[str]) -> float:
-    """Median over images of the standard deviation of brightness, 0 … 1."""
-    few = names[:: max(1, len(names) // 10)]
-    return float(np.median([read_png(images / name).mean(axis=2).std() for name in few]))
-
-
-def _beside_gap(job: CaptureJob, placed: Sequence[str]) -> str:
-    """The first name at a boundary between registered photographs and others."""
-    known = {job.copies[name].name for name in placed}
-    names = [photograph.name for photograph in job.photographs]
-    edges = [b for a, b in pairwise(names) if (a in known) != (b in known)]
-    return edges[0] if edges else names[-1]
 
 
 def report_text(c: dict[str, Any], folder: Path) -> str:
@@ -239,8 +187,7 @@ def report_text(c: dict[str, Any], folder: Path) -> str:
     ]
     if missing := c["not_placed"]:
         more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-        names = ", ".join(missing[:NAMED]) + more
-        lines.append(f"not placed: {names}; take more between them and the others")
+        lines.append(f"not placed: {', '.join(missing[:NAMED])}{more}; take more between them and the others")
     if c["mean_reprojection_error"] > GOOD_ERROR:
         lines.append("the error is high: something moved, or the lens needs another --camera-model")
     lines.append(f"look at {folder / PLOT}; next: refgs train {folder} -o runs/{folder.name}")
@@ -275,45 +222,24 @@ def draw(path: Path, world: Solved, region: Region) -> None:
     replace_file(path, lambda temporary: figure.savefig(temporary, dpi=100))
 
 
-def require_features(folder: Path, counts: Sequence[int], contrast: float) -> None:
-    """Raise InputError if the median image has hardly any features; `contrast`: its standard deviation."""
-    median = int(np.median(counts))
-    if median >= FEW_FEATURES:
-        return
-    if contrast < FLAT_CONTRAST:
-        reason = "they are uniform"
-        remedy = "put the object on a patterned ground, such as a newspaper,"
-    else:
-        reason = "they are blurred, or show hardly any texture"
-        remedy = "hold still, use more light, put a patterned ground below the object,"
-    raise InputError(
-        f"{folder}: photographs: half of them have no more than {median} features: {reason}; "
-        f"{remedy} and photograph it anew"
-    )
+def require_features(folder: Path, counts: Sequence[int]) -> None:
+    """Raise InputError if the median image has hardly any features."""
+    if (median := int(np.median(counts))) < FEW_FEATURES:
+        what = f"half of them have no more than {median} features: they are blurred, or without texture"
+        remedy = "hold still, use more light, put a patterned ground, such as a newspaper, below the object"
+        raise InputError(what, folder, "photographs", remedy)
 
 
-def no_model(folder: Path, count: int, pairs: Sequence[tuple[str, str, int, bool]]) -> InputError:
-    """The InputError if no pair of images can be the initial one; `pairs`: from `colmap.verified`."""
-    if not pairs:
-        reason = f"no two of the {count} show the same points"
-        remedy = "take more, so close that each shows two thirds of the one before"
-    elif np.mean([flat for *_, flat in pairs]) >= TURN_SHARE:
-        reason = "they seem to be taken from one place, so nothing shows depth"
-        remedy = "walk around the object instead of turning the camera"
-    else:
-        reason = f"of the {count}, no two with enough in common look from different enough sides"
-        remedy = "take more on a circle around the object, 5° to 10° apart"
-    return InputError(f"{folder}: photographs: {reason}; {remedy}")
-
-
-def require_placed(folder: Path, count: int, groups: Sequence[Sequence[str]], longest_gap: str) -> None:
-    """Raise InputError unless the largest group has half of the images; `longest_gap`: a boundary name."""
-    if len(groups[0]) >= LEAST_PLACED * count:
-        return
-    apart = ", ".join(str(len(group)) for group in groups) + " images"
-    if len(groups) > 1:
-        apart = f"{len(groups)} groups that share nothing ({apart})"
-    raise InputError(
-        f"{folder}: photographs: of {count}, only {apart} could be placed; take images that lead from one "
-        f"group to the next in small steps, as around {longest_gap}"
-    )
+def require_placed(folder: Path, count: int, groups: Sequence[Sequence[str]]) -> None:
+    """Raise InputError unless the largest group has half of the images."""
+    if not groups:
+        what = f"no two of the {count} show the same points from different sides"
+        remedy = (
+            "walk around the object, and take images so close that each shows two thirds of the one before"
+        )
+        raise InputError(what, folder, "photographs", remedy)
+    if len(groups[0]) < LEAST_PLACED * count:
+        sizes = ", ".join(str(len(group)) for group in groups)
+        what = f"of {count}, only {sizes} could be placed together, in {counted(len(groups), 'group')}"
+        remedy = "take images that lead from one group to the next in small steps"
+        raise InputError(what, folder, "photographs", remedy)

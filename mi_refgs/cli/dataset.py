@@ -29,8 +29,6 @@ class Dataset:
     """pixels per side, or width and height"""
     relight: Annotated[tuple[Path, ...], optional("ENV …")] = ()
     """trace the test views under these maps, too, into relight/NAME; may be added later"""
-    colmap: Annotated[Path | None, optional("DIR")] = None
-    """also write the data set as COLMAP text files with points"""
     overwrite: Flag = False
     """replace a data set that was made with other settings"""
     image: DatasetOptions = DatasetOptions()
@@ -49,7 +47,6 @@ class Dataset:
             self.scene,
             self.output,
             relight=self.relight,
-            colmap=self.colmap,
             overwrite=self.overwrite,
             **image,
         )

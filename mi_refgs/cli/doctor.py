@@ -140,9 +140,9 @@ class Doctor:
     def run(self) -> Result:
         """Examine the data set or the installation."""
         if self.data is not None:
-            from mi_refgs.data.survey import survey
+            from mi_refgs.data.survey import survey, survey_text
 
             found = survey(self.data)
-            return Result(found.to_dict(), found.to_text())
+            return Result(found, survey_text(found))
         report = examine()
         return Result(report, text(report), 0 if report["usable"] else 1)

@@ -1,7 +1,6 @@
 """Reader of COLMAP's layout: a reconstruction in `sparse/0`, as text or binary, and images in `images`.
 
-`images_2`, `images_4` and `images_8` may contain smaller copies, as in the scenes of Ref-Real and Mip-NeRF
-360; `masks` may contain masks of the object, as NAME.png with or without the image's ending before it. Every
+`masks` may contain masks of the object, as NAME.png with or without the image's ending before it. Every
 eighth image in the order of names is a test view, unless `test.txt` beside the reconstruction lists them.
 """
 
@@ -14,19 +13,17 @@ import numpy as np
 
 from mi_refgs.data.colmap_model import TEST_LIST, Camera, Image, read_cameras, read_images, read_points
 from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.images import ImageFile, ImageFolders
+from mi_refgs.data.images import ImageFile, ImageFolder
 from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file
-from mi_refgs.io.images import image_size, linear_from_srgb
+from mi_refgs.io.images import linear_from_srgb
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 """Folders of a reconstruction, in the order in which they are tried."""
 ENDINGS = ("bin", "txt")
-MIN_VIEWS, MAX_ERROR = 3, 2.0
-"""Track length and reprojection error, pixels, of points that are used: a single wrong match puts a point of
-two images anywhere on a line, and larger errors mean such a match."""
+MIN_VIEWS, MAX_ERROR = 3, 2.0  # track length and error, pixels, of used points: wrong matches have others
 MIN_POINTS = 100  # number of reliable points below which others are used, too
 
 
@@ -40,15 +37,10 @@ class ColmapReader:
         """Whether the folder contains a reconstruction."""
         return _model(folder) is not None
 
-    def size(self, folder: Path, images: str) -> tuple[int, int]:
-        """Width and height of the first training image in its file."""
-        model = Reconstruction(folder, ReadOptions(images=images))
-        return image_size(model.registered("train")[0][1])
-
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         """Read the views of one split, and the reliable points."""
         model = Reconstruction(folder, options)
-        views = tuple(model.view(*image) for image in model.registered(split))
+        views = tuple(model.view(image) for image in model.registered(split))
         return Recording(views, model.points(), source=model.source, notes=model.notes())
 
 
@@ -57,53 +49,48 @@ class Reconstruction:
 
     def __init__(self, folder: Path, options: ReadOptions) -> None:
         model, ending = _model(folder) or (folder, ENDINGS[0])
-        if options.images != "png":
-            raise InputError(f"{folder}: images: a reconstruction has no EXR images; read it as 'png'")
+        options.require_png(folder)
         self.options = options
         self.source = model / f"images.{ending}"
         self.cameras = read_cameras(model / f"cameras.{ending}")
         self.images = read_images(self.source)
         self.point_file = model / f"points3D.{ending}"
-        self.folders = ImageFolders.of(folder, flat=True)
-        found = {image.name: self.folders.find(image.name, options.downscale) for image in self.images}
+        self.folder = ImageFolder.of(folder, flat=True)
+        found = {image.name: self.folder.find(image.name) for image in self.images}
         self.files = {name: file for name, file in found.items() if file is not None}
 
-    def registered(self, split: str) -> list[tuple[Image, Path, int]]:
-        """The images of a split that have a file; each with that and the remaining downscale."""
+    def registered(self, split: str) -> list[Image]:
+        """The images of a split that have a file."""
         images = [image for image in self.images if image.name in self.files]
         if not images:
-            raise InputError(
-                f"{self.source}: none of its {len(self.images)} images is in {self.folders.folders[1]}; "
-                "put them there under the same names"
-            )
+            what = f"none of its {len(self.images)} images is in {self.folder.path}"
+            raise InputError(what, self.source, remedy="put them there under the same names")
         test_list = self.source.with_name(TEST_LIST)
-        if is_file(test_list):
-            lines = test_list.read_bytes().decode("utf-8", "replace").splitlines()
-            tests = {line.strip() for line in lines}
-            chosen = [image for image in images if (image.name in tests) == (split == "test")]
-            if not chosen:
-                raise InputError(f"{test_list}: zero {split} views; name some of the images, not all")
-        else:
-            chosen = held_out(images, split, self.source)
-        return [(image, *self.files[image.name]) for image in chosen]
+        if not is_file(test_list):
+            return held_out(images, split, self.source)
+        tests = {line.strip() for line in test_list.read_text("utf-8", "replace").splitlines()}
+        chosen = [image for image in images if (image.name in tests) == (split == "test")]
+        if not chosen:
+            raise InputError(f"zero {split} views", test_list, remedy="name some of the images, not all")
+        return chosen
 
-    def view(self, image: Image, file: Path, downscale: int) -> View:
+    def view(self, image: Image) -> View:
         """The view of an image; raises InputError for an unusable pose, lens, mask or size."""
-        field = f"{self.source}: {image.name}"
         camera = self.cameras.get(image.camera)
         if camera is None:
-            raise InputError(f"{field}: there is no camera {image.camera}; export the model again")
+            remedy = "export the model again"
+            raise InputError(f"there is no camera {image.camera}", self.source, image.name, remedy)
+        field = f"{self.source}: {image.name}"
         where = f"{field}: camera {image.camera}"
         try:
             lens = camera.lens()
         except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-        to_world = from_world_to_camera(image.rotation, image.translation, field)
-        source = ImageFile.of(file, downscale, self.folders.mask(image.name))
-        pinhole, name = _intrinsics(camera, source), image.name
-        return make_view(
-            source, self.options, where, name=name, intrinsics=pinhole, lens=lens, to_world=to_world
-        )[0]
+            raise error.at(file=where) from None
+        pose = from_world_to_camera(image.rotation, image.translation, field)
+        mask = self.folder.mask(image.name)
+        file = ImageFile.of(self.files[image.name], self.options.downscale, mask)
+        pinhole = _intrinsics(camera, file)
+        return make_view(file, self.options, where, image.name, pinhole, pose, lens)[0]
 
     def points(self) -> PointCloud | None:
         """The reliable points, or all where only a few are reliable; None without any."""
@@ -120,7 +107,7 @@ class Reconstruction:
 
     def notes(self) -> tuple[str, ...]:
         """What the user may want to correct."""
-        notes, names = [], self.folders.names()
+        notes, names = [], self.folder.names()
         if absent := len(self.images) - len(self.files):
             notes.append(f"{absent} of {len(self.images)} cameras have no image and are left out")
         if (spare := len(names) - len(self.files)) > 0:
@@ -146,9 +133,7 @@ def _intrinsics(camera: Camera, image: ImageFile) -> tuple[float, float, float, 
     across, down = image.width / camera.width, image.height / camera.height
     # Width and height of a copy are rounded by up to a pixel each.
     if abs(image.height - across * camera.height) > 1 + image.height / image.width:
-        raise InputError(
-            f"{image.path}: size: {image.width} × {image.height} pixels are no copy of "
-            f"{camera.width} × {camera.height}, which were reconstructed; restore the image"
-        )
+        what = f"{image.width} × {image.height} pixels are no copy of {camera.width} × {camera.height}"
+        raise InputError(f"{what}, which were reconstructed", image.path, "size", "restore the image")
     fx, fy, cx, cy = camera.intrinsics
     return fx * across, fy * down, cx * across, cy * down

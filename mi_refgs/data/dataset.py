@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -24,20 +24,15 @@ from mi_refgs.data.view import FileCamera, View, evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.registry import Registry
 
-HOLDOUT = 8
-"""Every eighth image is a test view where a data set names none (convention of LLFF, 3DGS and 2DGS)."""
+HOLDOUT = 8  # every eighth image is a test view where a data set names none (LLFF, 3DGS, 2DGS)
 EXTENT_MARGIN = 1.1  # scene extent over the largest distance of a training camera to their mean (3DGS)
-NEAR_EXTENTS = 2e-3
-"""Depth of the near plane in scene extents, about 0.01 in the units of Blender's data sets."""
+NEAR_EXTENTS = 2e-3  # depth of the near plane in scene extents, about 0.01 units of Blender's data sets
 FAR = 1e3
 """Distance of the training cameras' mean from the world's origin, in scene extents, from which positions are
 shifted: from there float32 resolves less than a ten-thousandth of the extent."""
-DISTINCT = 1e-11
-"""Scene extent over that distance below which all cameras are at one place, and nothing is shifted."""
-OPAQUE_CHECKED = 8
-"""Images whose alpha is examined: if none of them has a transparent pixel, alpha is ignored."""
-MAX_SIZES = 4
-"""Image sizes in a data set, such as portrait and landscape: a fit compiles every kernel for each."""
+DISTINCT = 1e-11  # extent over that distance below which all cameras are at one place; nothing is shifted
+OPAQUE_CHECKED = 8  # images whose alpha is examined: if none has a transparent pixel, alpha is ignored
+MAX_SIZES = 4  # image sizes in a data set, such as portrait and landscape: a fit compiles kernels for each
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 
 Item = TypeVar("Item")
@@ -51,8 +46,12 @@ class ReadOptions:
     background: float = 1.0  # 0 … 1, in the colour space of the images, where they have alpha
     images: str = "png"  # "png": sRGB-encoded, or "exr": linear radiance
     truth: bool = True  # read ground-truth normals, depth and materials
-    decode: bool = True  # decode images while the cache has room; else when views are loaded
     cache: ImageCache = field(default_factory=ImageCache, compare=False)
+
+    def require_png(self, folder: Path) -> None:
+        """Raise InputError if EXR images are asked for, which the layout of the folder has not."""
+        if self.images != "png":
+            raise InputError("has no EXR images", file=folder, field="images", remedy="read it as 'png'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +99,6 @@ class Reader(Protocol):
     def recognises(self, folder: Path) -> bool:
         """Whether the folder has this layout."""
 
-    def size(self, folder: Path, images: str) -> tuple[int, int]:
-        """Width and height of the first training image in its file."""
-
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         """Read the views of "train" or "test"; raises InputError that names file, field and remedy."""
 
@@ -119,12 +115,14 @@ def register_reader(reader: Reader) -> Reader:
 def reader_of(folder: Path) -> Reader:
     """The reader of a folder; raises InputError if there is no such folder, or none recognises it."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: data set: no such folder; give one that contains images and cameras")
+        remedy = "give one that contains images and cameras"
+        raise InputError("no such folder", file=folder, field="data set", remedy=remedy)
     for reader in READERS.values():
         if reader.recognises(folder):
             return reader
     known = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS.values())
-    raise InputError(f"{folder}: data set: no layout is recognised; complete it ({known})")
+    what, remedy = "no layout is recognised", f"complete it ({known})"
+    raise InputError(what, file=folder, field="data set", remedy=remedy)
 
 
 def held_out(ordered: Sequence[Item], split: str, source: Path | None = None) -> list[Item]:
@@ -134,22 +132,21 @@ def held_out(ordered: Sequence[Item], split: str, source: Path | None = None) ->
     """
     items = [item for i, item in enumerate(ordered) if (i % HOLDOUT == 0) == (split == "test")]
     if source is not None and not items:
-        raise InputError(f"{source}: zero {split} views; add images")
+        raise InputError(f"zero {split} views", file=source, remedy="add images")
     return items
 
 
-def require_few_sizes(where: str, sizes: dict[tuple[int, int], str], remedy: str) -> None:
+def require_few_sizes(file: Path, field: str, sizes: dict[tuple[int, int], str], remedy: str) -> None:
     """Raise InputError for more than MAX_SIZES image sizes; `sizes`: the name of an image of each."""
     if len(sizes) > MAX_SIZES:
         some = ", ".join(f"{width} × {height} ('{name}')" for (width, height), name in [*sizes.items()][:3])
-        raise InputError(f"{where}: {len(sizes)} different sizes, such as {some}; {remedy}")
+        raise InputError(f"{len(sizes)} different sizes, such as {some}", file, field, remedy)
 
 
 def make_view(
     image: ImageFile,
     options: ReadOptions,
     where: str,
-    *,
     name: str,
     intrinsics: tuple[float, float, float, float],
     to_world: np.ndarray,
@@ -162,26 +159,21 @@ def make_view(
     """
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
-            raise InputError(f"{where}: focal length: {focal:.3g} pixels is out of range; correct it")
+            raise InputError(f"{focal:.3g} pixels is out of range", where, "focal length", "correct it")
     file = FileCamera(image.path, image.width, image.height, intrinsics, lens, image.mask)
-    width, height = image.size
     fx, fy, cx, cy = (value / image.downscale for value in intrinsics)
     straight = None
     if lens is not None:
         try:
-            straight = undistortion(lens, width, height, fx, fy, cx, cy)
+            straight = undistortion(lens, *image.size, fx, fy, cx, cy)
         except InputError as error:
-            raise InputError(f"{where}: k1 … p2: {error}") from None
+            raise error.at(file=where, field="k1 … p2") from None
         fx, fy = fx * straight.zoom, fy * straight.zoom
         image = replace(image, undistortion=straight)
-    source = ImageSource.of(image, options.background, options.cache, options.decode)
-    view = View(
-        *(name, width, height, fx, fy, cx, cy, to_world, source),
-        is_linear_radiance=options.images == "exr",
-        exposure=log_exposure(image.path),
-        file=file,
-    )
-    return view, straight
+    source = ImageSource(image, options.background, options.cache, image.has_alpha())
+    exposure, linear = log_exposure(image.path), options.images == "exr"
+    view = View(name, *image.size, fx, fy, cx, cy, to_world, source, exposure=exposure, file=file)
+    return replace(view, is_linear_radiance=linear), straight
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +220,6 @@ def read_dataset(
     background: str = "white",
     images: str = "png",
     truth: bool = True,
-    decode: bool = True,
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
@@ -237,45 +228,44 @@ def read_dataset(
     `background`: "white" or "black", behind images with alpha.
     `images`: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
     `truth`: read ground-truth normals, depth and materials where there are any.
-    `decode`: decode images now while the cache has room, so that a broken file is refused now; else
-        `View.load` decodes them.
 
-    Without a list of test views, every eighth image in the order of paths is one. The region of interest is
-    that of region.json; without it and without alpha, the one that the training cameras look at. Positions
-    far from the world's origin, as in UTM coordinates, are relative to `Dataset.offset`, which is the same
-    for all splits.
+    Images are decoded by `View.load`, and kept as far as `images.CACHE_BYTES` allows. Without a list of test
+    views, every eighth image in the order of paths is one. The region of interest is that of region.json, or
+    without alpha the one that the training cameras look at. Positions far from the world's origin, as in UTM
+    coordinates, are relative to `Dataset.offset`, the same for all splits.
 
     Raises InputError for anything missing, unreadable or inconsistent; it names file, field and remedy.
     """
     path = Path(path)
     if background not in BACKGROUNDS:
-        raise InputError(f"{path}: background: unknown value '{background}'; give white or black")
+        raise InputError(f"unknown value '{background}'", path, "background", "give white or black")
     if images not in ("png", "exr"):
-        raise InputError(f"{path}: images: unknown value '{images}'; give png or exr")
+        raise InputError(f"unknown value '{images}'", path, "images", "give png or exr")
     downscale = 1 if downscale is None else downscale
     if downscale < 1:
-        raise InputError(f"{path}: downscale: {downscale} is out of range; give a whole number from 1")
-    options = ReadOptions(downscale, BACKGROUNDS[background], images, truth, decode)
-    found = reader_of(path).read(path, split, options)
+        raise InputError(f"{downscale} is out of range", path, "downscale", "give a whole number from 1")
+    options = ReadOptions(downscale, BACKGROUNDS[background], images, truth)
+    reader = reader_of(path)
+    found = reader.read(path, split, options)
     views, notes, points = found.views, found.notes, found.points
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
-    require_few_sizes(f"{found.source or path}: images", sizes, remedy)
+    require_few_sizes(found.source or path, "images", sizes, remedy)
 
     # What depends on cameras depends on the training cameras in every split, so that a fit and its
     # evaluation use the same region and the same offset.
-    @cache
-    def training() -> tuple[View, ...]:
-        cameras_only = replace(options, truth=False, decode=False)
-        return views if split == "train" else reader_of(path).read(path, "train", cameras_only).views
+    training = views
+    if split != "train":
+        with contextlib.suppress(InputError):  # a relit data set has none
+            training = reader.read(path, "train", replace(options, truth=False)).views
 
     # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored, but not that of masks.
-    if _opaque(views) and (split == "train" or _opaque(training())):
+    if _opaque(views) and (split == "train" or _opaque(training)):
         own = sum(map(_own_alpha, views))
-        note = "images have alpha, but no pixel is transparent: alpha is ignored"
-        if own < len(views):
-            note = f"alpha of {own} of {len(views)} images is ignored: no pixel is transparent"
-        notes = (*notes, note)
+        which = (
+            "images have alpha, but" if own == len(views) else f"{own} of {len(views)} images have alpha, but"
+        )
+        notes = (*notes, f"{which} no pixel is transparent: alpha is ignored")
         ignored = (replace(v, pixels=v.pixels.without_alpha()) if _own_alpha(v) else v for v in views)
         views = tuple(ignored)
     without = [view.name for view in views if not view.has_alpha]
@@ -284,13 +274,13 @@ def read_dataset(
         notes = (*notes, f"no alpha and no mask for {which}; give all images masks, or none")
 
     # Positions are shifted near the origin, and clip planes derived.
-    offset = _offset(training()) if split == "train" or _may_be_far(views) else np.zeros(3)
-    near = NEAR_EXTENTS * _extent(views, offset)
-    region = read_region(path)
-    region = None if region is None else region.moved(-offset)
-    if region is None and not all(view.has_alpha for view in views):
+    offset = _offset(training)
+    near, region = NEAR_EXTENTS * _extent(views, offset), read_region(path)
+    if region is not None:
+        region = region.moved(-offset)
+    elif without:
         with contextlib.suppress(InputError):  # views that share no point have none
-            region = region_of([_moved(view, offset) for view in training()])
+            region = region_of([_moved(view, offset) for view in training])
     views = tuple(replace(_moved(view, offset), near=near) for view in views)
     x, y, z = map(float, offset)
     if offset.any():
@@ -298,9 +288,8 @@ def read_dataset(
         position = f"({x:.12g}, {y:.12g}, {z:.12g})"
         notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
     colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
-    return Dataset(
-        path, split, views, colour, images == "exr", found.environment, points, region, notes, (x, y, z)
-    )
+    linear = images == "exr"
+    return Dataset(path, split, views, colour, linear, found.environment, points, region, notes, (x, y, z))
 
 
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
@@ -308,7 +297,10 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
 
     Also returns the width and height of that image's file. Raises InputError as `read_dataset` does.
     """
-    width, height = reader_of(Path(path)).size(Path(path), images)
+    options = ReadOptions(images=images, truth=False)
+    first = reader_of(Path(path)).read(Path(path), "train", options).views[0]
+    size = first.file or first
+    width, height = size.width, size.height
     factors = range(1, min(width, height))
     factor = next((k for k in factors if (width // k) * (height // k) <= pixels), min(width, height))
     return factor, width, height
@@ -332,12 +324,6 @@ def _extent(views: tuple[View, ...], offset: np.ndarray | float = 0.0) -> float:
     return EXTENT_MARGIN * float(np.linalg.norm(origins - middle, axis=1).max()) or 1.0
 
 
-def _may_be_far(views: tuple[View, ...]) -> bool:
-    """Whether the training cameras must be read to decide on an offset; no if views are clearly near."""
-    middle = np.mean([view.to_world[:3, 3] for view in views], axis=0)
-    return len(views) == 1 or float(np.linalg.norm(middle)) > 0.01 * FAR * _extent(views)
-
-
 def _offset(views: tuple[View, ...]) -> np.ndarray:
     """What to subtract from all positions, (3,): the rounded mean of cameras that are FAR away, else 0."""
     middle = np.mean([view.to_world[:3, 3] for view in views], axis=0)
@@ -350,8 +336,6 @@ def _offset(views: tuple[View, ...]) -> np.ndarray:
 
 def _moved(view: View, offset: np.ndarray) -> View:
     """The view with positions relative to an offset (3,)."""
-    if not offset.any():
-        return view
     to_world = view.to_world.copy()
     to_world[:3, 3] -= offset
     return replace(view, to_world=to_world)

@@ -10,8 +10,7 @@ import numpy as np
 from mi_refgs.data.view import View
 from mi_refgs.io.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_image
 
-EXPOSURE_TIME, F_NUMBER, ISO = 33434, 33437, 34855
-"""EXIF 2.3 tags of the camera settings: seconds, f-number, sensitivity."""
+EXPOSURE_TIME, F_NUMBER, ISO = 33434, 33437, 34855  # EXIF 2.3 tags: seconds, f-number, sensitivity
 CLIPPED = float(linear_from_srgb(np.array(254.5 / 255)))  # linear value from which an 8-bit image is clipped
 MAX_GAIN = 16.0  # gains are limited to this and its inverse, ± 4 stops: larger ones mean a failed render
 

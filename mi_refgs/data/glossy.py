@@ -8,6 +8,7 @@ by number is a test view, as in the splits made for 3DGS-DR and Ref-Gaussian. [N
 
 from __future__ import annotations
 
+import pickletools
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,16 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.data.array_pickle import read_arrays
 from mi_refgs.data.dataset import ReadOptions, Recording, held_out, make_view
 from mi_refgs.data.ground_truth import block_mean
 from mi_refgs.data.images import ImageFile, Mask
 from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.io.images import image_size, read_grey
+from mi_refgs.io.images import read_grey
 
 CAMERA = re.compile(r"(\d{1,6})-camera\.pkl")
+SHAPES = ((3, 4), (3, 3))  # of pose and K
+MAX_BYTES = 4096  # of a camera's file that are read; it has a few hundred
 MAX_DEPTH, MAX_CODE = 15.0, 65535  # scene units of the largest number in a depth file, and that number
 BACKGROUND = int(14.5 / MAX_DEPTH * MAX_CODE) + 1  # smallest number of the background: 14.5 units
 
@@ -39,14 +41,9 @@ class GlossyReader:
         """Whether the folder contains cameras."""
         return any(CAMERA.fullmatch(path.name) for path in folder.glob("*-camera.pkl"))
 
-    def size(self, folder: Path, images: str) -> tuple[int, int]:
-        """Width and height of the first training image in its file."""
-        return image_size(folder / f"{_numbers(folder, 'train')[0]}.png")
-
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         """Read the views of one split, with depths."""
-        if options.images != "png":
-            raise InputError(f"{folder}: images: the layout has no EXR images; read it as 'png'")
+        options.require_png(folder)
         views = tuple(_view(folder, number, options) for number in _numbers(folder, split))
         return Recording(views, source=folder)
 
@@ -57,12 +54,16 @@ def _numbers(folder: Path, split: str) -> list[int]:
 
 
 def _view(folder: Path, number: int, options: ReadOptions) -> View:
-    field, depths = folder / f"{number}-camera.pkl", folder / f"{number}-depth.png"
-    pose, matrix = _camera(field)
-    to_world = from_world_to_camera(pose[:, :3], pose[:, 3], f"{field}: pose")
+    file, depths = folder / f"{number}-camera.pkl", folder / f"{number}-depth.png"
+    pose, matrix = _arrays(file)
+    expected = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
+    if not (np.abs(matrix) <= MAX_NUMBER).all() or (matrix != expected).any() or min(np.diag(matrix)) <= 0:
+        what = "no matrix of focal lengths and a principal point"
+        raise InputError(what, file=file, field="K", remedy="copy the file again")
+    to_world = from_world_to_camera(pose[:, :3], pose[:, 3], f"{file}: pose")
     image = ImageFile.of(folder / f"{number}.png", options.downscale, Mask(depths, BACKGROUND))
     pinhole = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    view, _ = make_view(image, options, str(field), name=str(number), intrinsics=pinhole, to_world=to_world)
+    view, _ = make_view(image, options, str(file), str(number), pinhole, to_world)
     if not options.truth:
         return view
     grey = read_grey(depths)[0][..., None]
@@ -70,13 +71,32 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
     return replace(view, depth=block_mean(depth, grey < BACKGROUND, options.downscale)[0][..., 0])
 
 
-def _camera(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Pose (3, 4) and K (3, 3); raises InputError for anything else."""
-    arrays = read_arrays(path)
-    if [array.shape for array in arrays] != [(3, 4), (3, 3)]:
-        raise InputError(f"{path}: not a pose of 3 × 4 and a matrix of 3 × 3 numbers; copy the file again")
-    pose, matrix = arrays
-    expected = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
-    if not (np.abs(matrix) <= MAX_NUMBER).all() or (matrix != expected).any() or min(np.diag(matrix)) <= 0:
-        raise InputError(f"{path}: K: no matrix of focal lengths and a principal point; copy the file again")
-    return pose, matrix
+def _arrays(path: Path) -> list[np.ndarray]:
+    """The arrays of SHAPES in a pickle; raises InputError for a file with anything else.
+
+    A pickle is a program, which is not run: its text is searched for the types, shapes and bytes of arrays.
+    """
+    arrays, code, by_columns, sides = list[np.ndarray](), "", False, list[int]()
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES)
+        for instruction, value, _ in pickletools.genops(data):
+            if isinstance(value, bool) or instruction.name in ("NEWTRUE", "NEWFALSE"):
+                by_columns = value or instruction.name == "NEWTRUE"
+            elif "INT" in instruction.name:
+                sides.append(int(value or 0))
+            elif value in ("f4", "f8"):  # of this array, and of later ones that refer to it
+                code = f"<{value}"
+            elif value == ">":
+                raise ValueError("big-endian numbers")
+            elif isinstance(value, bytes | str) and len(value) > 1 and instruction.name != "GLOBAL":
+                numbers = value if isinstance(value, bytes) else value.encode("latin1")
+                if len(arrays) < 2 and len(numbers) == np.prod(SHAPES[len(arrays)]) * int(code[-1:] or 0):
+                    found = np.frombuffer(numbers, code).astype(np.float64)
+                    arrays.append(found.reshape(sides[2:4], order="F" if by_columns else "C"))
+                    sides = []
+        if [array.shape for array in arrays] != [*SHAPES]:
+            raise ValueError("no pose of 3 × 4 and matrix of 3 × 3 numbers")
+    except Exception as error:  # what a broken file raises has no common type
+        raise InputError(str(error)[:100], file=path, field="pickle", remedy="copy the file again") from error
+    return arrays

@@ -68,8 +68,6 @@ def shiny_blender_maps(
 
 def _of_shape(file: Path, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     if pixels.shape[:2] != shape:
-        raise InputError(
-            f"{file}: size: {pixels.shape[1]} × {pixels.shape[0]} pixels, but the image has {shape[1]} × "
-            f"{shape[0]}; restore the map, or remove it"
-        )
+        what = f"{pixels.shape[1]} × {pixels.shape[0]} pixels, but the image has {shape[1]} × {shape[0]}"
+        raise InputError(what, file, "size", "restore the map, or remove it")
     return pixels

@@ -14,18 +14,14 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
-HULL_RESOLUTION = 96  # voxels per edge of the visual hull's grid: at 200², a voxel is two pixels wide
-HULL_LEAST = 32  # the same for small images at least; in between, the number of pixels of their longer edge
+HULL_RESOLUTION, HULL_LEAST = 96, 32
+"""Voxels per edge of the visual hull's grid, most and fewest: as many as pixels along the longer edge."""
 HULL_LEVEL = 0.5  # mask level that bounds the hull
 HULL_CARVED = 0.05  # level of the blurred masks below which a voxel is carved and not looked at again
-HULL_SEEN = 0.25
-"""Fraction of the views that must see a point of the hull: what hardly any camera sees was never carved."""
-HULL_DRAWS = 64
-"""Rounds of rejection sampling inside the hull; one round keeps about a quarter for a voxel-thin sheet."""
-COLOUR_VIEWS = 32
-"""Views from which a point's median colour is computed; memory grows with points times views."""
-FOCUS_CONDITION = 1e-3
-"""Smallest singular value of the mean of (I - d dᵀ) over view axes that meet; 0 for parallel ones."""
+HULL_SEEN = 0.25  # of the views must see a point of the hull: what hardly any camera sees was never carved
+HULL_DRAWS = 64  # rounds of rejection sampling; one keeps about a quarter for a voxel-thin sheet
+COLOUR_VIEWS = 32  # from which a point's median colour is computed; memory grows with points times views
+FOCUS_CONDITION = 1e-3  # least singular value of the mean of (I - d dᵀ) over axes that meet; 0: parallel
 
 
 def axis_projectors(axes: np.ndarray) -> np.ndarray | None:
@@ -44,9 +40,8 @@ def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     axes = np.array([view.to_world[:3, 2] for view in views], dtype=np.float64).reshape(-1, 3)
     projectors = axis_projectors(axes)
     if projectors is None:
-        raise InputError(
-            "views: cameras: they do not look at one point from several sides; give the bounds of the scene"
-        )
+        what, remedy = "they do not look at one point from several sides", "give the bounds of the scene"
+        raise InputError(what, "views", "cameras", remedy)
     # Σ (I - d dᵀ)(p - o) = 0.
     right = np.einsum("nij,nj->i", projectors, origins) / len(views)
     focus = np.linalg.solve(projectors.mean(axis=0), right)
@@ -117,18 +112,16 @@ class Hull:
 def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | None = None) -> Hull:
     """The set of points inside every mask (alpha > 0.5, blurred by half a voxel).
 
-    `resolution` is the number of voxels per edge; by default HULL_RESOLUTION, fewer for small images. Only
-    views that see a point carve it, and a quarter of the views must see it. Raises InputError if nothing is
-    inside every mask.
+    `resolution`: voxels per edge. Only views that see a point carve it, and a quarter of the views must see
+    it. Raises InputError if nothing is inside every mask.
     """
     low, high = np.asarray(bounds, dtype=np.float64)
     if resolution is None:
-        edge = max((max(view.width, view.height) for view in views), default=HULL_LEAST)
+        edge = max(max(view.width, view.height) for view in views)
         resolution = min(max(edge, HULL_LEAST), HULL_RESOLUTION)
     voxel = (high - low) / resolution
     centres = np.stack(np.meshgrid(*[np.arange(resolution)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = np.ones(resolution**3, dtype=np.float32)
-    witnesses = np.zeros(resolution**3, dtype=np.int32)
+    inside, witnesses = np.ones(resolution**3, np.float32), np.zeros(resolution**3, np.int32)
     alive = np.arange(resolution**3)
     middle = (low + high) / 2
     for view in views:
@@ -149,20 +142,18 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
     # voxel inside the box.
     field = np.pad(inside.reshape((resolution,) * 3), 1)
     if not np.any(field > HULL_LEVEL):
-        raise InputError(
-            "views: alpha: no point is inside every mask; check cameras and masks, or do not use alpha"
-        )
+        remedy = "check cameras and masks, or do not use alpha"
+        raise InputError("no point is inside every mask", "views", "alpha", remedy)
     return Hull(field, low - 0.5 * voxel, voxel)
 
 
 def median_colours(
     points: np.ndarray, views: Sequence[View], background: np.ndarray, normals: np.ndarray | None = None
 ) -> np.ndarray:
-    """Median linear colour (N, 3) of the points over the views that show them with alpha > 0.5.
+    """Median linear colour (N, 3) of the points over at most 32 views that show them with alpha > 0.5.
 
     `background` (3,) is that of the views. Points that no view shows are 0.5 grey. With `normals`, only views
-    in front of a point count. There is no occlusion test: the median of many views is robust to it. At most
-    32 evenly spaced views are read.
+    in front of a point count. There is no occlusion test: the median of many views is robust to it.
     """
     if not views or not len(points):
         return np.full((len(points), 3), 0.5)

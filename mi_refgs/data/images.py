@@ -30,13 +30,10 @@ from mi_refgs.io.images import (
     with_ending,
 )
 
-CACHE_BYTES = 2**30
-"""Largest size of the decoded images that a data set keeps: 28 of 12 Mpx, or a thousand of 600 × 600. 300
-photographs of 12 Mpx would need 11 GB."""
-BAND = 256
-"""Rows of a file that are converted to floating point at a time; a large image would need half a gigabyte."""
+CACHE_BYTES = 2**30  # of decoded images that a data set keeps: 28 of 12 Mpx, a thousand of 600 × 600
+BAND = 256  # rows of a file that are converted to floating point at a time, for less memory
 IMAGES, MASKS = "images", "masks"  # names of folders
-COPIES = (8, 4, 2)  # factors of the smaller copies of images, in `images_8` and so on
+COPIES = ("images_2", "images_4", "images_8")  # folders of smaller copies, the largest first
 
 
 @dataclass(frozen=True)
@@ -48,8 +45,9 @@ class Mask:
 
     def read(self) -> np.ndarray:
         """Alpha (H, W) float32; raises InputError for a file that cannot be read."""
-        grey = None if self.below is None else read_grey(self.path)[0] < self.below
-        return read_mask(self.path) if grey is None else grey.astype(np.float32)
+        if self.below is None:
+            return read_mask(self.path)
+        return (read_grey(self.path)[0] < self.below).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -71,10 +69,8 @@ class ImageFile:
         """
         width, height = image_size(path)
         if min(width, height) < downscale:
-            raise InputError(
-                f"{path}: downscale: {width} × {height} pixels are less than a block of {downscale}²; "
-                "give a smaller number"
-            )
+            what = f"{width} × {height} pixels are less than a block of {downscale}²"
+            raise InputError(what, path, "downscale", "give a smaller number")
         return cls(path, width, height, downscale, mask)
 
     @property
@@ -86,49 +82,31 @@ class ImageFile:
     def is_linear_radiance(self) -> bool:
         return self.path.suffix.lower() == ".exr"
 
-    @property
-    def _is_unchanged(self) -> bool:
-        """Whether the view shows the 8-bit numbers of the file."""
-        changed = self.downscale > 1 or self.mask is not None or self.undistortion is not None
-        return not changed and not self.is_linear_radiance
-
-    @property
-    def decoded_bytes(self) -> int:
-        """Upper bound of the size of what `decode` returns."""
-        width, height = self.size
-        return 4 * width * height * (1 if self._is_unchanged else 4)
-
     def has_alpha(self) -> bool:
         """Whether there is alpha, by the file's header."""
         header = exr_has_alpha if self.is_linear_radiance else has_alpha
         return self.mask is not None or header(self.path)
 
     def decode(self) -> np.ndarray:
-        """Decode the file to what `compose` takes, (H, W, 3 or 4): uint8 as in the file if it is unchanged,
-        else float32, premultiplied.
+        """Decode the file to what `compose` takes, (H, W, 3 or 4): uint8 where the view shows the numbers of
+        the file, else float32, averaged and premultiplied.
 
         Raises InputError for a file that cannot be read and for a mask of another size.
         """
-        if self._is_unchanged:
-            return read_bytes(self.path)[0]
-        averaged = self._averaged()
-        return averaged if self.undistortion is None else self.undistortion.resample(averaged)
-
-    def _averaged(self) -> np.ndarray:
-        """Premultiplied colour, and alpha if there is any, averaged over blocks: (H, W, 3 or 4) float32."""
-        linear = self.is_linear_radiance
+        linear, factor = self.is_linear_radiance, 1
         if linear:
-            pixels, factor = read_exr_image(self.path), 1
+            pixels = read_exr_image(self.path)
             if pixels.shape[-1] < 3:
-                raise InputError(f"{self.path}: channels: no R, G, B; export a colour image")
+                raise InputError("no R, G, B", self.path, "channels", "export a colour image")
         else:
             pixels, factor = read_bytes(self.path, 1 if self.mask else self.downscale)
+            if self.downscale == 1 and self.mask is None and self.undistortion is None:
+                return pixels
         mask = None if self.mask is None else self.mask.read()
         if mask is not None and self.mask is not None and mask.shape != (self.height, self.width):
-            raise InputError(
-                f"{self.mask.path}: mask: {mask.shape[1]} × {mask.shape[0]} pixels, but {self.path.name} "
-                f"has {self.width} × {self.height}; make both of one size"
-            )
+            what = f"{mask.shape[1]} × {mask.shape[0]} pixels, but {self.path.name} has "
+            what += f"{self.width} × {self.height}"
+            raise InputError(what, self.mask.path, "mask", "make both of one size")
         width, height = self.size
         block = self.downscale // factor
         bands, step = [], max(BAND // block, 1)
@@ -146,7 +124,8 @@ class ImageFile:
             if band.shape[-1] == 4 and not linear:
                 band[..., :3] *= band[..., 3:]
             bands.append(box_downscale(band, block))
-        return np.concatenate(bands)
+        averaged = np.concatenate(bands)
+        return averaged if self.undistortion is None else self.undistortion.resample(averaged)
 
 
 class Pixels(NamedTuple):
@@ -204,10 +183,6 @@ class ImageCache:
                 self.bytes -= self._kept.popitem(last=False)[1].nbytes
         return decoded
 
-    def has_room_for(self, file: ImageFile) -> bool:
-        """Whether the image can be kept without dropping others."""
-        return self.bytes + file.decoded_bytes <= self.budget
-
 
 @dataclass(frozen=True)
 class ImageSource:
@@ -217,16 +192,6 @@ class ImageSource:
     background: float
     cache: ImageCache
     has_alpha: bool  # if False, alpha of the file is ignored
-
-    @classmethod
-    def of(cls, file: ImageFile, background: float, cache: ImageCache, decode: bool = True) -> ImageSource:
-        """`decode`: decode the file now if the cache has room, so that a broken file is refused early.
-
-        Raises InputError as `ImageFile.decode` does.
-        """
-        decoded = cache.pixels(file) if decode and cache.has_room_for(file) else None
-        has_alpha = file.has_alpha() if decoded is None else decoded.shape[-1] == 4
-        return cls(file, background, cache, has_alpha)
 
     def without_alpha(self) -> ImageSource:
         return replace(self, has_alpha=False)
@@ -238,54 +203,41 @@ class ImageSource:
 
 
 @dataclass(frozen=True)
-class ImageFolders:
-    """Folders of images as COLMAP and LLFF have them: `images`, smaller copies in `images_2` …, and `masks`.
+class ImageFolder:
+    """The folder of images of COLMAP's and LLFF's layouts, `images`, and the folder `masks` beside it."""
 
-    The largest images have factor 1: those of `images`, or of copies where it is missing.
-    """
-
-    root: Path
-    folders: dict[int, Path]  # by their factor
+    path: Path
     masks: Path | None
 
     @classmethod
-    def of(cls, root: Path, flat: bool = False) -> ImageFolders:
-        """The folders below `root`; `flat`: `root` itself may contain the images if there are none.
+    def of(cls, root: Path, flat: bool = False) -> ImageFolder:
+        """`images` below `root`, or if it is missing, the largest copies, such as `images_4`; `flat`: `root`
+        itself may contain the images if there are none.
 
         Raises InputError if there is no folder of images.
         """
-        names = {**{k: f"{IMAGES}_{k}" for k in COPIES}, 1: IMAGES}
-        found = {k: root / name for k, name in names.items() if (root / name).is_dir()}
+        found = [root / name for name in (IMAGES, *COPIES) if (root / name).is_dir()]
         if not found and flat and any(map(_is_image, root.iterdir())):
-            found[1] = root
+            found = [root]
         if not found:
-            raise InputError(f"{root}: images: no such folder; put the images there")
-        folders = {k // min(found): folder for k, folder in found.items()}
-        return cls(root, folders, root / MASKS if (root / MASKS).is_dir() else None)
+            raise InputError("no such folder", root, IMAGES, "put the images there")
+        return cls(found[0], root / MASKS if (root / MASKS).is_dir() else None)
 
     def names(self) -> list[str]:
-        """Sorted paths of the largest images relative to their folder, those in subfolders included."""
-        folder = self.folders[1]
-        pattern = "*" if folder == self.root else "**/*"
-        return sorted(str(path.relative_to(folder)) for path in folder.glob(pattern) if _is_image(path))
+        """Sorted paths of the images, those in subfolders included, unless masks and others are beside."""
+        pattern = "**/*" if self.path.name in (IMAGES, *COPIES) else "*"
+        return sorted(str(path.relative_to(self.path)) for path in self.path.glob(pattern) if _is_image(path))
 
-    def find(self, name: str, downscale: int) -> tuple[Path, int] | None:
-        """The file of an image, and the factor by which it still has to be averaged; None without a file.
+    def find(self, name: str) -> Path | None:
+        """The file of an image, which may have another ending than the name; None without a file.
 
-        The smallest copy whose factor divides `downscale` is used; with masks, the largest. A copy may
-        have another ending than the name. Raises InputError for a name that leads out of the folder.
+        Raises InputError for a name that leads out of the folder.
         """
-        for factor, folder in sorted(self.folders.items(), reverse=True):
-            if downscale % factor or (self.masks is not None and factor > 1):
-                continue
-            file = inside(folder, name)
-            if file is None:
-                raise InputError(
-                    f"{self.root}: {abbreviated(name)} names no file in {folder.name}; move the image there"
-                )
-            if found := file if is_file(file) else with_ending(file.with_suffix("")):
-                return found, downscale // factor
-        return None
+        file = inside(self.path, name)
+        if file is None:
+            what = f"{abbreviated(name)} names no file in {self.path.name}"
+            raise InputError(what, self.path.parent, remedy="move the image there")
+        return file if is_file(file) else with_ending(file.with_suffix(""))
 
     def mask(self, name: str) -> Mask | None:
         """The mask of an image; None without a folder of masks. Raises InputError as `mask_in`."""
@@ -301,7 +253,8 @@ def mask_in(folder: Path, name: str) -> Mask:
         file = inside(folder, candidate)
         if file is not None and is_file(file):
             return Mask(file)
-    raise InputError(f"{folder / (name + '.png')}: mask: missing; add it, or remove the folder of masks")
+    remedy = "add it, or remove the folder of masks"
+    raise InputError("missing", folder / f"{name}.png", "mask", remedy)
 
 
 def _is_image(path: Path) -> bool:

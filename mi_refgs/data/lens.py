@@ -24,9 +24,7 @@ from mi_refgs.errors import InputError
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 MAX_ZOOM = 2.0  # factor of the focal length beyond which less than a quarter of the image would be left
 ZOOM_STEPS = 30  # bisections: 1e-9 of the focal length, 1e-6 pixels
-GRID = 65
-"""Points along each side at which a zoom is checked; between them edges bend by less than 0.01 pixels."""
-NEWTON_STEPS = 10  # of the inverse: a fisheye's, 60° off its axis, is right to 1e-6 after 6
+GRID = 65  # points a side at which a zoom is checked; between them edges bend by less than 0.01 pixels
 ROWS = 64  # rows of an image whose source pixels are computed together
 _lock = Lock()
 
@@ -71,18 +69,6 @@ class Lens:
             x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x),
             y * factor + 2 * p2 * x * y + p1 * (square + 2 * y * y),
         )
-
-    def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Image points (x, y) at unit distance that the lens distorts to these; any where there are none."""
-        wanted_x, wanted_y, step = x, y, 1e-4
-        with np.errstate(all="ignore"):
-            for _ in range(NEWTON_STEPS):
-                u, v = self.distort(x, y)
-                (ux, vx), (uy, vy) = self.distort(x + step, y), self.distort(x, y + step)
-                a, b, c, d = (z / step for z in (ux - u, uy - u, vx - v, vy - v))
-                off_x, off_y, det = wanted_x - u, wanted_y - v, a * d - b * c
-                x, y = x + (d * off_x - b * off_y) / det, y + (a * off_y - c * off_x) / det
-        return x, y
 
     def _series(self, square: np.ndarray) -> np.ndarray:
         total = np.zeros_like(square)
@@ -159,10 +145,8 @@ def undistortion(
     with np.errstate(over="ignore", invalid="ignore"):  # coefficients may be anything; NaN is not valid
         low, high = 1.0, MAX_ZOOM
         if not valid(high):
-            raise InputError(
-                "the distortion moves the image's edges more than half-way in, or folds it; "
-                "correct the coefficients"
-            )
+            what = "the distortion moves the image's edges more than half-way in, or folds it"
+            raise InputError(what, remedy="correct the coefficients")
         high = low if valid(low) else high
         for _ in range(ZOOM_STEPS if high > low else 0):
             middle = (low + high) / 2

@@ -21,40 +21,32 @@ from scipy.spatial.distance import cdist
 from mi_refgs.data.region import CAMERA_SHARE, Plane, Region
 from mi_refgs.data.view import View, evenly_spread
 
-PLANE_REACH = 2.0  # distance from the centre, in radii, up to which points determine support planes
-PLANE_MARGIN = 0.04
-"""Height, in radii, above a plane at which the region begins. Half as much leaves surfels of the table with
-the object, which adds 4 % to its outline in short fits."""
-PLANE_DRAWS = 2_000
-"""Planes through three points that are compared: 30 good ones if a quarter of the points is on one."""
-MOST_POINTS = 5_000  # of the points on a plane, and twice as many of a group: time and memory grow with them
-PLANE_COUNT = 3  # most support planes: a table, and a corner of two walls
-PLANE_POINTS = 50  # fewest points on a support plane
-PLANE_SHARE = 0.05  # the same, of the points within PLANE_REACH
-BELOW_SHARE = 0.5
-"""Most points below a support plane over those on it. A face of the object has the object below; below a
-table is what its polish mirrors."""
-ABOVE_SHARE = 0.9  # fraction of the cameras that are above a support plane
-PARALLEL = 0.9  # cosine of two support planes' normals from which the second is what the first has left
+# Support planes; lengths in radii of the region.
+PLANE_REACH = 2.0  # distance from the centre up to which points determine them
+PLANE_MARGIN = 0.04  # height above at which the region begins; half leaves 4 % of the outline to the table
+PLANE_DRAWS = 2_000  # planes through three points: 30 good ones if a quarter of the points is on one
+PLANE_COUNT = 3  # at most: a table, and a corner of two walls
+PLANE_POINTS, PLANE_SHARE = 50, 0.05  # fewest points on one, and their share of those within PLANE_REACH
+BELOW_SHARE = 0.5  # most points below over those on it: a table mirrors some, the face of an object has more
+ABOVE_SHARE = 0.9  # fraction of the cameras that are above
+PARALLEL = 0.9  # cosine of two normals from which the second is what the first has left
 REFITS = 5  # rounds of least squares that follow the best draw
-SEEN_SHARE = 0.4  # fraction of the views that show a point of the object; close views leave some parts out
-FREE_SHARE = 0.15
-"""Depth over that of the region's centre, up to which the space in front of a camera is empty. The table is
-deeper than 0.18 in the image of a camera that is 5° above it and has a field of view of 42°."""
-LINK_COUNT = 5  # points within that distance, itself included, of a point that is no stray one
-WHOLE = 0.95  # fraction of the group in an image that shows the whole object
-GROUP_POINTS = 50  # points of the group that make it an object: fewer are texture on a part of it
-WITHIN_SHARE = 0.95  # fraction of the group inside of the region at which the region stays
+# The group of points of the object.
+MOST_POINTS = 5_000  # of the points on a plane, and twice as many of a group: time and memory grow with them
+SEEN_SHARE = 0.4  # fraction of the views that show a point; close views leave some parts out
+LINK_COUNT = 5  # points within the distance of neighbours, itself included, of a point that is no stray one
+GROUP_POINTS = 50  # fewest points of an object: fewer are texture on a part of it
+WITHIN_SHARE = 0.95  # fraction inside of the region at which the region stays
+LEAST_WITHIN = 0.5  # the same of points on fitted surfaces, below which something connects it to the scene
+WHOLE = 0.95  # fraction in an image that shows the whole object
+FREE_SHARE = 0.15  # of the centre's depth, empty before a camera; a table seen from 5° above begins at 0.18
+# Balls around the group.
 SPHERE_SAMPLES = 2_000  # points of a sphere by which it is enclosed together with a group
-ENCLOSED = 1.05  # radius of the region over that of the smallest ball around the group and the sphere's part
-LEAST_WITHIN = 0.5
-"""Fraction of a group on fitted surfaces inside of the region, below which it is no object: something
-connects it to the scene."""
-FITTED_BALL = 1.1  # radius of the region over that of the smallest ball around a group on fitted surfaces
-BOX_MARGIN = 0.2  # distance of that group, in radii, from planes beside it: thin parts may be missing
-BALL_CENTRES = 100  # points of a group towards which centres of its ball are tried
-BALL_SHARES = (0.0, 0.25, 0.5, 0.75)  # fractions of the way from its middle to them, where they are
-BALL_ROUNDS = 500  # rounds of the smallest enclosing ball: the radius is right to 1/√500 … 0.2 % in practice
+ENCLOSED, FITTED_BALL = 1.05, 1.1  # radius over that of the smallest ball: of sparse points, of fitted ones
+BOX_MARGIN = 0.2  # distance of fitted points, in radii, from planes beside them: thin parts may be missing
+BALL_CENTRES = 100  # points of a group towards which centres are tried
+BALL_SHARES = (0.0, 0.25, 0.5, 0.75)  # fractions of the way from its middle to them
+BALL_ROUNDS = 500  # of the smallest enclosing ball: its radius is right to 0.2 %
 
 
 @dataclass(frozen=True)
@@ -66,14 +58,9 @@ class Scatter:
     lift: float = 0.0  # height above a plane up to which inaccurate points of the plane may lie
 
 
-SPARSE = Scatter(0.01, 0.15)
-"""Points of structure from motion: 98 % of those on the cloth of *tabletop* (images of 135 × 240)."""
-DENSE = Scatter(0.02, 0.08, 0.1)
-"""Points of stereo: widths of 0.015 and 0.02, links from 0.06 to 0.1 and lifts from 0.05 to 0.15 find the
-objects of the four rooms of `scenes/README.md`."""
-FITTED = Scatter(0.1, 0.08)
-"""Points on surfaces halfway through a fit: the varnished table of *figure* is off by a tenth of a radius.
-Widths from 0.06 to 0.15 find it, 0.03 does not."""
+SPARSE = Scatter(0.01, 0.15)  # structure from motion: holds 98 % of the points on the cloth of *tabletop*
+DENSE = Scatter(0.02, 0.08, 0.1)  # stereo: widths from 0.015, links to 0.1, lifts to 0.15 find the same
+FITTED = Scatter(0.1, 0.08)  # halfway through a fit, a varnished table is off by 0.1; 0.06 to 0.15 find it
 
 Seen = Callable[[np.ndarray], np.ndarray]
 """Fraction (N,) of the views that show points (N, 3)."""
@@ -102,10 +89,9 @@ def support_planes(
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         normal /= np.where(length > 0, length, 1)
-        normal *= np.sign(np.median(origins @ normal.T - np.sum(normal * corner[:, 0], axis=1), axis=0))[
-            :, None
-        ]
         offset = np.sum(normal * corner[:, 0], axis=1)
+        upwards = np.sign(np.median(origins @ normal.T - offset, axis=0))
+        normal, offset = normal * upwards[:, None], offset * upwards
 
         # The one that most points are on, of those that have little below.
         height = points @ normal.T - offset

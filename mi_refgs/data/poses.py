@@ -47,7 +47,7 @@ def rigid(matrix: np.ndarray, field: str) -> np.ndarray:
             and np.abs(matrix[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE
         )
     if not fine:
-        raise InputError(f"{field}: not a rotation and a translation; remove scale, shear and mirroring")
+        raise InputError("not a rotation and a translation", field, None, "remove scale, shear and mirroring")
     return matrix
 
 

@@ -22,14 +22,10 @@ from mi_refgs.io.files import read_json, write_json
 
 REGION_FILE = "region.json"
 """File in the folder of a data set: the `content` of its region, in scene units."""
-REGION_SHARE = 0.8
-"""Radius of the region estimated from cameras over that of the sphere that the median view shows entirely."""
+REGION_SHARE = 0.8  # radius estimated from cameras over that of the sphere that the median view shows whole
 CAMERA_SHARE = 0.8  # its largest radius over the nearest camera's distance: cameras are outside of the region
-SAME = 1e-6
-"""Difference of two regions, in radii, up to which they are the same: solvers differ in the last digits."""
-SMALLEST = 1e-6
-"""Its smallest radius over the largest coordinate of a camera: float32 resolves no smaller lengths."""
-
+SAME = 1e-6  # difference of two regions, in radii, up to which they are the same: last digits of solvers
+SMALLEST = 1e-6  # least radius over the largest coordinate of a camera: float32 resolves no smaller lengths
 
 Plane = tuple[float, float, float, float]
 """Unit normal (a, b, c) and offset d of the half-space a x + b y + c z ≥ d."""
@@ -52,24 +48,21 @@ class Region:
         Raises InputError for anything else, and for numbers that no scene has.
         """
         content = content if isinstance(content, dict) else {}
-        centre = content.get("centre")
-        numbers = [*centre, content.get("radius")] if isinstance(centre, list) else []
-        if len(numbers) != 4 or not all(map(_usable, numbers)) or not numbers[3] >= 1 / MAX_NUMBER:
-            raise InputError(
-                f"{source}: centre, radius: not three numbers and a positive one; correct or remove them"
-            )
-        x, y, z, radius = map(float, numbers)
+        centre, remedy = _numbers(content.get("centre"), 3), "correct or remove them"
+        radius = _numbers([content.get("radius")], 1)
+        if centre is None or radius is None or not radius[0] >= 1 / MAX_NUMBER:
+            raise InputError("not three numbers and a positive one", source, "centre, radius", remedy)
         planes, rows = list[Plane](), content.get("planes", [])
         for row in rows if isinstance(rows, list) else [rows]:
-            usable = isinstance(row, list) and len(row) == 4 and all(map(_usable, row))
-            length = float(np.linalg.norm(row[:3])) if usable else 0.0
-            if not length >= 1 / MAX_NUMBER:
-                raise InputError(
-                    f"{source}: planes: not [a, b, c, d] of a x + b y + c z ≥ d each; correct or remove them"
-                )
-            a, b, c, d = (float(number) / length for number in row)
+            plane = _numbers(row, 4)
+            length = 0.0 if plane is None else float(np.linalg.norm(plane[:3]))
+            if plane is None or not length >= 1 / MAX_NUMBER:
+                what = "not [a, b, c, d] of a x + b y + c z ≥ d each"
+                raise InputError(what, source, "planes", remedy)
+            a, b, c, d = (number / length for number in plane)
             planes.append((a, b, c, d))
-        return Region((x, y, z), radius, tuple(planes), content.get("estimated") is True)
+        x, y, z = centre
+        return Region((x, y, z), radius[0], tuple(planes), content.get("estimated") is True)
 
     @property
     def content(self) -> dict[str, Any]:
@@ -119,9 +112,12 @@ class Region:
         return np.array(self.centre) + self.radius * offset
 
 
-def _usable(number: Any) -> bool:
-    """Whether a value of a JSON file is a number that a scene may have."""
-    return type(number) in (int, float) and abs(number) <= MAX_NUMBER
+def _numbers(value: Any, count: int) -> list[float] | None:
+    """A list of so many numbers that a scene may have; None for anything else."""
+    if not isinstance(value, list) or len(value) != count:
+        return None
+    usable = all(type(number) in (int, float) and abs(number) <= MAX_NUMBER for number in value)
+    return [float(number) for number in value] if usable else None
 
 
 def region_of(views: Sequence[View]) -> Region:
@@ -136,7 +132,8 @@ def region_of(views: Sequence[View]) -> Region:
     half_angle = np.array([np.arctan(min(v.width / v.fx, v.height / v.fy) / 2) for v in views])
     radius = region_radius(distance, half_angle)
     if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):
-        raise InputError("views: cameras: they do not look at one point in front of them; give a region.json")
+        what = "they do not look at one point in front of them"
+        raise InputError(what, "views", "cameras", "give a region.json")
     x, y, z = (float(c) for c in focus)
     return Region((x, y, z), radius, estimated=True)
 

@@ -10,17 +10,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mi_refgs.data.view import View
 from mi_refgs.io.images import box_downscale
 
-STEP = 0.1
-"""Pixels of the averaged image that the image moves by for a difference."""
+STEP = 0.1  # pixels of the averaged image that the image moves by for a difference
 COARSEST = 48  # pixels along the shorter side of the image that is averaged most, at least
 ROUNDS = 5  # Gauss-Newton steps per image size
-DAMPING = 1e-3
-"""Fraction of the diagonal that is added to it [Levenberg 1944]: flat scenes hardly distinguish rotation from
-translation."""
+DAMPING = 1e-3  # of the diagonal [Levenberg 1944]: flat scenes hardly distinguish rotation from translation
 ENOUGH = 1e-3  # relative decrease of the squared error below which a size is finished
 
 Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a view's camera
@@ -30,11 +28,12 @@ def registered(view: View, render: Render, distance: float, where: np.ndarray | 
     """The view with the pose whose render differs least from its image.
 
     `distance`: of what the camera looks at, scene units. `where` (H, W) bool: pixels that count, by default
-    all. The pose stays if no other is better.
+    all; averaged images are as small as it has whole blocks. The pose stays if no other is better.
     """
     view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
     pixels = np.ones((view.height, view.width), bool) if where is None else where
-    while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
+    size = min(view.width, view.height)
+    while size // (2 * blocks[0]) >= COARSEST and _whole(pixels, 2 * blocks[0]).any():
         blocks.insert(0, 2 * blocks[0])
     found = view
     for block in blocks:
@@ -49,8 +48,12 @@ def _difference(view: View, render: Render, where: np.ndarray, block: int) -> np
     Renders are averaged, too: a smaller render would show other details, and fit best at another pose.
     """
     shown, truth = (box_downscale(np.clip(image, 0, 1), block) for image in (render(view), view.displayed))
-    chosen = where[::block, ::block][: truth.shape[0], : truth.shape[1]]
-    return np.asarray((shown - truth)[chosen], np.float64).ravel()
+    return np.asarray((shown - truth)[_whole(where, block)], np.float64).ravel()
+
+
+def _whole(where: np.ndarray, block: int) -> np.ndarray:
+    """Whether all pixels of block × block pixels count."""
+    return np.asarray(box_downscale(where[..., None].astype(np.float32), block)[..., 0] == 1)
 
 
 def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> View:
@@ -81,8 +84,6 @@ def _fitted(view: View, render: Render, distance: float, where: np.ndarray, bloc
 
 def _moved(view: View, motion: np.ndarray) -> View:
     """The view with its camera rotated (3, radians) and moved (3, scene units) along its own axes."""
-    from scipy.spatial.transform import Rotation
-
     change = np.eye(4)
     change[:3, :3], change[:3, 3] = Rotation.from_rotvec(motion[:3]).as_matrix(), motion[3:]
     return replace(view, to_world=view.to_world @ change)

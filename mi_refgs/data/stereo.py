@@ -29,9 +29,7 @@ DEPTHS = 64  # depths that are compared, evenly spaced in 1/z
 NEAREST = 0.35  # the first of them, in distances of the cameras from the region's centre
 FARTHEST = 20.0  # the last one, in radii of the region beyond its centre; random points end there, too
 PATCH = 5  # side of a compared patch, pixels
-CONTRAST = 0.0045
-"""Standard deviation of the display-encoded values of a patch, 0 … 1, below which it has no texture: that of
-about one grey level of 256."""
+CONTRAST = 0.0045  # standard deviation of a patch, 0 … 1, below which it has no texture: one level of 256
 SIMILAR = 0.75  # correlation from which a depth counts
 SIMILAR_CONFIRMING = 0.5  # the same of a view that confirms the depth
 VOXEL = 0.03  # side of the voxels that are left with one point, in contracted space
@@ -66,7 +64,8 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     if len(views) < FEWEST:
         return None
     centre = np.array(region.centre)
-    small = [_small(views[i]) for i in evenly_spread(len(views), VIEWS)]
+    small = [views[i] for i in evenly_spread(len(views), VIEWS)]
+    small = [v.averaged(max(1, round(math.sqrt(v.width * v.height / PIXELS)))) for v in small]
     grey = [view.displayed.mean(axis=-1, dtype=np.float32) for view in small]
     distance = float(np.median([np.linalg.norm(view.to_world[:3, 3] - centre) for view in small]))
     farthest = distance + FARTHEST * region.radius
@@ -80,11 +79,8 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     # The pixels whose depth others confirm, and the rest.
     position, on, off = [], [], []
     for one in swept:
-        view, ray, colour = (
-            one.view,
-            one.view.rays(*np.indices(one.nearness.shape)),
-            one.view.colour(np.zeros(3)),
-        )
+        view, ray = one.view, one.view.rays(*np.indices(one.nearness.shape))
+        colour = view.colour(np.zeros(3))
         points = view.to_world[:3, 3] + ray / one.nearness[..., None]
         known = _confirmed(one, points, [swept[j] for j in one.near], tolerance)
         position.append(points[known])
@@ -92,24 +88,15 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
         origin = np.broadcast_to(view.to_world[:3, 3], ray[~known].shape)
         off.append((origin, ray[~known], colour[~known]))
     points, colours = np.concatenate(position), np.concatenate(on)
-    spaced = points[_thinned(region.contract(points))]
+    voxel = np.floor(region.contract(points) / VOXEL)
+    _, first, count = np.unique(voxel, axis=0, return_index=True, return_counts=True)
+    spaced = points[first[count >= VOXEL_POINTS]]  # one in each voxel
     if len(spaced) < LEAST:
         return None
     rays = [np.concatenate(parts) for parts in zip(*off, strict=True)]
     rng = np.random.default_rng(0)
     some, rest = rng.permutation(len(points))[:MOST], rng.permutation(len(rays[0]))[:MOST]
     return Stereo(PointCloud(points[some], colours[some]), spaced, PixelRays(*(part[rest] for part in rays)))
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """Index of one of the points (N, 3) in each voxel that has VOXEL_POINTS."""
-    _, first, count = np.unique(np.floor(points / VOXEL), axis=0, return_index=True, return_counts=True)
-    return np.asarray(first[count >= VOXEL_POINTS])
-
-
-def _small(view: View) -> View:
-    """The view averaged to about PIXELS pixels."""
-    return view.averaged(max(1, round(math.sqrt(view.width * view.height / PIXELS))))
 
 
 def _neighbours(views: Sequence[View], centre: np.ndarray) -> list[list[int]]:

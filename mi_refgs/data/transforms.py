@@ -1,16 +1,15 @@
 """Reader of the Blender / NeRF layout: `transforms_{split}.json` beside images, and its relatives.
 
-Keys: `camera_angle_x` (radians) or `fl_x`, and `camera_angle_y`, `fl_y`, `cx`, `cy`, `w`, `h` (pixels), each
-per frame or for the whole file; `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model` (`data.lens` undoes
-the distortion); `frames` with `file_path` (with or without extension) and `transform_matrix` (camera to
-world, OpenGL axes); optional `exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along the viewing
-axis), `albedo_path` (R, G, B, A), `roughness_path` and `metallic_path` (Y, A; A: defined there) as
-`synthesis.make_dataset` writes them. Shiny Blender's maps beside the images are found by their names.
+Keys, per frame or for the whole file: `camera_angle_x` (radians) or `fl_x`, `camera_angle_y`, `fl_y`, `cx`,
+`cy`, `w`, `h` (pixels), and of the lens `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model`. `frames` have
+`file_path` (with or without extension), `transform_matrix` (camera to world, OpenGL axes) and optionally
+`exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along the viewing axis), `albedo_path` (R, G, B, A),
+`roughness_path`, `metallic_path` (Y, A; A: defined there), as `synthesis.make_dataset` writes them. Shiny
+Blender's maps are found by their names.
 
 nerfstudio's `mask_path` (bright: object) becomes alpha; without it, and without alpha, the file of the
-image's name in the folder `masks`. `ply_file_path` names points in the frame of the poses:
-`applied_transform` is applied to both. `train_filenames` and `test_filenames` (or `val_filenames`) list the
-images of a split.
+image's name in the folder `masks`. `ply_file_path` names points in the frame of the poses.
+`train_filenames` and `test_filenames` (or `val_filenames`) list the images of a split.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import inside, is_file, read_json, require_file
-from mi_refgs.io.images import ENDINGS, image_size, linear_from_srgb, with_ending
+from mi_refgs.io.images import ENDINGS, linear_from_srgb, with_ending
 from mi_refgs.io.ply import read_vertices
 
 SUFFIXES = (*ENDINGS, ".exr")
@@ -56,17 +55,13 @@ class TransformsReader:
         """Whether the folder contains a transforms file."""
         return any(folder.glob("transforms*.json"))
 
-    def size(self, folder: Path, images: str) -> tuple[int, int]:
-        """Width and height of the first training image in its file."""
-        return image_size(_image(_frames(folder, "train")[0], images))
-
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         """Read the views of one split; the environment map is `environment.exr`."""
         frames = _frames(folder, split)
         views = tuple(_view(frame, options) for frame in frames)
         light, file, points = folder / "environment.exr", frames[0].file, None
         if name := frames[0].given.get("ply_file_path"):
-            points = read_points(_inside(file, f"{file}: ply_file_path", name))
+            points = read_points(_inside(file, "ply_file_path", name))
         return Recording(views, points, light if light.is_file() else None, source=file)
 
 
@@ -75,7 +70,7 @@ class Frame:
     """One frame of a transforms file; methods raise InputError that names file and field."""
 
     file: Path
-    where: str  # file and frame, for messages
+    place: str  # of the frame in the file, for messages
     own: dict[str, Any]  # the keys of the frame
     given: dict[str, Any]  # the same, and those of the whole file that it lacks
 
@@ -85,11 +80,11 @@ class Frame:
         content = read_json(file)
         frames = content.get("frames")
         if not isinstance(frames, list):
-            raise InputError(f"{file}: frames: missing or not a list; add one entry per image")
+            raise InputError("missing or not a list", file, "frames", "add one entry per image")
         for i, own in enumerate(frames):
             if not isinstance(own, dict):
-                raise InputError(f"{file}: frames[{i}]: not an object; give it a file_path")
-        return [Frame(file, f"{file}: frames[{i}]", own, content | own) for i, own in enumerate(frames)]
+                raise InputError("not an object", file, f"frames[{i}]", "give it a file_path")
+        return [Frame(file, f"frames[{i}]", own, content | own) for i, own in enumerate(frames)]
 
     @property
     def name(self) -> str:
@@ -97,37 +92,36 @@ class Frame:
         name = self.own.get("file_path")
         return name if isinstance(name, str) else ""
 
-    def field(self, key: str) -> str:
-        """Where a key is, for messages."""
-        return f"{self.where}.{key}" if key in self.own else f"{self.file}: {key}"
+    def refuse(self, key: str, what: str, remedy: str) -> InputError:
+        """The InputError for the value of a key."""
+        return InputError(what, self.file, f"{self.place}.{key}" if key in self.own else key, remedy)
 
     def path(self, key: str) -> Path | None:
         """The file of a key; None where the frame has no such key, or an empty name."""
         name = self.own.get(key)
-        return None if name in (None, "") else _inside(self.file, f"{self.where}.{key}", name)
+        return None if name in (None, "") else _inside(self.file, f"{self.place}.{key}", name)
 
     def number(self, key: str, positive: bool = False) -> float | None:
         """The number of a key; None without one."""
         value = self.given.get(key)
         if value is None:
             return None
-        if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER:
-            raise InputError(f"{self.field(key)}: {abbreviated(value)} is not a number; correct it")
-        if positive and value <= 0:
-            value = abbreviated(float(value))
-            raise InputError(f"{self.field(key)}: {value} is not a positive number; correct it")
+        if type(value) not in (int, float) or not abs(value) <= MAX_NUMBER or (positive and value <= 0):
+            kind = "a positive number" if positive else "a number"
+            raise self.refuse(key, f"{abbreviated(value)} is not {kind}", "correct it")
         return float(value)
 
     def to_world(self) -> np.ndarray:
         """`View.to_world`, from `transform_matrix`."""
-        field = f"{self.where}.transform_matrix"
+        field = f"{self.place}.transform_matrix"
         try:
             matrix = np.array(self.own["transform_matrix"], dtype=np.float64)
         except (KeyError, TypeError, ValueError, OverflowError):
             matrix = np.empty(0)
         if matrix.shape != (4, 4):
-            raise InputError(f"{field}: missing or not 4 × 4 numbers; give the camera-to-world matrix")
-        return rigid(matrix, field) @ MITSUBA_FROM_OPENGL
+            remedy = "give the camera-to-world matrix"
+            raise InputError("missing or not 4 × 4 numbers", self.file, field, remedy)
+        return rigid(matrix, f"{self.file}: {field}") @ MITSUBA_FROM_OPENGL
 
     def lens(self) -> Lens | None:
         """The lens; None for a pinhole."""
@@ -135,17 +129,14 @@ class Frame:
         fisheye = self.given.get("is_fisheye") or False
         odd = [key for key in OTHER_LENSES if self.given.get(key)]
         if not isinstance(model, str) or model not in CAMERA_MODELS or not isinstance(fisheye, bool) or odd:
-            raise InputError(
-                f"{self.field(odd[0] if odd else 'camera_model')}: this lens is not supported; "
-                "undistort the images, or give OpenCV's perspective or fisheye coefficients"
-            )
+            remedy = "undistort the images, or give OpenCV's perspective or fisheye coefficients"
+            raise self.refuse(odd[0] if odd else "camera_model", "this lens is not supported", remedy)
         fisheye = fisheye or model.endswith("FISHEYE")
         given = {key: self.number(key) or 0.0 for key in COEFFICIENTS}
-        if (given["p1"] or given["p2"]) if fisheye else given["k4"]:
-            field, kind = ("p1, p2", "fisheye") if fisheye else ("k4", "perspective")
-            raise InputError(
-                f"{self.where}.{field}: not supported for a {kind} lens; undistort the images, or set it to 0"
-            )
+        for key in ("p1", "p2") if fisheye else ("k4",):
+            if given[key]:
+                what = f"not supported for a {'fisheye' if fisheye else 'perspective'} lens"
+                raise self.refuse(key, what, "undistort the images, or set it to 0")
         return Lens.of(fisheye, given)
 
     def focal_lengths(self, width: float, height: float) -> tuple[float, float]:
@@ -155,12 +146,12 @@ class Frame:
             pixels, radians = self.number(length, positive=True), self.number(angle, positive=True)
             if pixels is None and radians is not None:
                 if not 1 / MAX_NUMBER < radians < math.pi:
-                    raise InputError(f"{self.field(angle)}: {radians:g} is not between 0 and π; give radians")
+                    raise self.refuse(angle, f"{radians:g} is not between 0 and π", "give radians")
                 pixels = 0.5 * size / math.tan(radians / 2)
             focal.append(pixels)
         fx, fy = focal
         if fx is None:
-            raise InputError(f"{self.file}: camera_angle_x: missing; give radians, or fl_x in pixels")
+            raise InputError("missing", self.file, "camera_angle_x", "give radians, or fl_x in pixels")
         return fx, fy or fx
 
 
@@ -171,20 +162,18 @@ def _frames(folder: Path, split: str) -> list[Frame]:
     # A training file beside a test file is used whole; alone, it is shared by both splits.
     whole = own.is_file() and (split != "train" or (folder / "transforms_test.json").is_file())
     if not whole and (split not in ("train", "test") or not shared):
-        raise InputError(
-            f"{folder}: transforms_{split}.json: missing; give a complete data set in the Blender convention"
-        )
+        remedy = "give a complete data set in the Blender convention"
+        raise InputError("missing", folder, own.name, remedy)
     file = own if whole else shared[0]
     frames = Frame.all_of(file)
     if not whole and frames:
         names = _split_names(frames, split)
-        if names is not None:
-            frames = [frame for frame in frames if frame.name in names]
-        else:
+        if names is None:
             frames = held_out(sorted(frames, key=lambda frame: frame.name), split)
+        else:
+            frames = [frame for frame in frames if frame.name in names]
     if not frames:
-        kind = {"train": "training", "test": "test"}.get(split, split)
-        raise InputError(f"{file}: frames: zero {kind} views; add images")
+        raise InputError(f"zero {split} views", file, "frames", "add images")
     return frames
 
 
@@ -194,15 +183,12 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
     for key in ("train", "val", "test"):
         names = frames[0].given.get(f"{key}_filenames") or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(
-                f"{frames[0].file}: {key}_filenames: not a list of paths; correct it, or remove it"
-            )
+            field, remedy = f"{key}_filenames", "correct it, or remove it"
+            raise InputError("not a list of paths", frames[0].file, field, remedy)
         lists[key] = {*names}
     test = lists["test"] or lists["val"]
-    if not test:
-        return None
-    if split == "test":
-        return test
+    if not test or split == "test":
+        return test or None
     return lists["train"] or {frame.name for frame in frames} - test - lists["val"]
 
 
@@ -210,10 +196,8 @@ def _inside(transforms: Path, field: str, name: object) -> Path:
     """The file in the data set's folder that a transforms file names."""
     file = inside(transforms.parent, name)
     if file is None:
-        raise InputError(
-            f"{field}: {abbreviated(name)} names no file in the data set's folder; move the file there and "
-            "give its relative path"
-        )
+        what = f"{abbreviated(name)} names no file in the data set's folder"
+        raise InputError(what, transforms, field, "move the file there and give its relative path")
     return file
 
 
@@ -228,7 +212,7 @@ def read_points(path: Path) -> PointCloud | None:
         vertices = read_vertices(path, file)
     names = vertices.dtype.names or ()
     if not {"x", "y", "z"} <= {*names}:
-        raise InputError(f"{path}: vertex: no x, y, z; export the points again")
+        raise InputError("no x, y, z", path, "vertex", "export the points again")
     position = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=-1)
     usable = (np.abs(position) <= MAX_NUMBER).all(axis=1)
     if not usable.any():
@@ -246,20 +230,14 @@ def _view(frame: Frame, options: ReadOptions) -> View:
     file = _image(frame, options.images)
     image = ImageFile.of(file, options.downscale)
     image = replace(image, mask=_mask(frame, image))
-    view, straight = make_view(
-        image,
-        options,
-        frame.where,
-        name=_stem(str(Path(frame.name))),
-        intrinsics=_intrinsics(frame, image),
-        lens=frame.lens(),
-        to_world=frame.to_world(),
-    )
+    name, pinhole = _stem(str(Path(frame.name))), _intrinsics(frame, image)
+    pose, lens, where = frame.to_world(), frame.lens(), f"{frame.file}: {frame.place}"
+    view, straight = make_view(image, options, where, name, pinhole, pose, lens)
     if not options.truth:
         return view
     size = (image.height, image.width)
     maps = {
-        name: _map(path, f"{frame.where}.{name}_path", (*size, channels), options.downscale, straight)
+        name: _map(path, f"{frame.place}.{name}_path", (*size, channels), options.downscale, straight)
         for name, channels in MAPS.items()
         if (path := frame.path(f"{name}_path"))
     }
@@ -284,29 +262,25 @@ def _mask(frame: Frame, image: ImageFile) -> Mask | None:
     if not masks.is_dir():
         return None
     name = file.relative_to(frame.file.parent)
-    below = name.relative_to(name.parts[0]) if name.parts[0].startswith(IMAGES) else name
-    return mask_in(masks, str(below))
+    return mask_in(masks, str(name.relative_to(name.parts[0]) if name.parts[0].startswith(IMAGES) else name))
 
 
 def _image(frame: Frame, images: str) -> Path:
     """The image file of a frame; `images` as in `ReadOptions`."""
     path = frame.path("file_path")
     if path is None:
-        raise InputError(f"{frame.where}.file_path: missing; name the image")
+        raise InputError("missing", frame.file, f"{frame.place}.file_path", "name the image")
     stem = path.with_name(_stem(path.name))
+    linear = frame.path("exr_path") or with_ending(stem, (".exr",))
     if images == "exr":
-        found = frame.path("exr_path") or with_ending(stem, (".exr",))
-        return found or stem.with_name(f"{stem.name}.exr")
+        return linear or stem.with_name(f"{stem.name}.exr")
     file = path if is_file(path) else with_ending(stem)
     if file is None:
         file = stem.with_name(stem.name + ENDINGS[0])
-        linear = frame.path("exr_path") or with_ending(stem, (".exr",))
         if linear is not None and is_file(linear):
-            raise InputError(
-                f"{file}: images: missing, but there is {linear.name}; give data.images=exr to read EXR files"
-            )
+            file = linear
     if file.suffix.lower() == ".exr":
-        raise InputError(f"{file}: images: an EXR file; give data.images=exr to read EXR files")
+        raise InputError("an EXR file", file, "images", "give data.images=exr to read EXR files")
     return file
 
 
@@ -316,10 +290,8 @@ def _intrinsics(frame: Frame, image: ImageFile) -> tuple[float, float, float, fl
     for key, size in (("w", width), ("h", height)):
         wanted = frame.number(key, positive=True)
         if wanted is not None and wanted != size:
-            raise InputError(
-                f"{image.path}: {key}: the image has {width} × {height} pixels, but {frame.file.name} says "
-                f"{key} = {wanted:g}; restore the image, or give only camera_angle_x"
-            )
+            what = f"{width} × {height} pixels, but {frame.file.name} says {key} = {wanted:g}"
+            raise InputError(what, image.path, "size", "restore the image, or give only camera_angle_x")
     cx, cy = frame.number("cx", positive=True), frame.number("cy", positive=True)
     return *frame.focal_lengths(width, height), cx or width / 2, cy or height / 2
 
@@ -334,10 +306,8 @@ def _map(
     """
     pixels = read_exr_image(file, vectors=True)
     if pixels.shape != expected:
-        raise InputError(
-            f"{file}: {field}: has shape {pixels.shape} but the image needs {expected}; export both at one "
-            "size or remove the key"
-        )
+        remedy = "export both at one size or remove the key"
+        raise InputError(f"has shape {pixels.shape} but the image needs {expected}", file, field, remedy)
     masked = expected[-1] in (2, 4)
     covered = np.clip(pixels[..., -1:], 0, 1) if masked else np.any(pixels != 0, axis=-1, keepdims=True)
     mean, fraction = block_mean(pixels, covered, downscale, straight)

@@ -69,10 +69,8 @@ class View:
         for name, pixels, channels in (("image", self.pixels.image, (3,)), ("alpha", self.pixels.alpha, ())):
             shape = (self.height, self.width, *channels)
             if pixels is not None and np.shape(pixels) != shape:
-                raise InputError(
-                    f"{self.name}: pixels: {name} has shape {np.shape(pixels)}; give {shape}, as the "
-                    "view's width and height say"
-                )
+                what, remedy = f"{name} has shape {np.shape(pixels)}", f"give {shape}, the size of the view"
+                raise InputError(what, self.name, "pixels", remedy)
         return self
 
     @property
@@ -127,10 +125,8 @@ class View:
         smaller than one block.
         """
         if min(self.width, self.height) < block:
-            raise InputError(
-                f"{self.name}: data.coarse: {self.width} × {self.height} pixels are less than a block of "
-                f"{block}²; give a smaller one"
-            )
+            what = f"{self.width} × {self.height} pixels are less than a block of {block}²"
+            raise InputError(what, self.name, "data.coarse", "give a smaller one")
         loaded = self.load()
         alpha = None if loaded.alpha is None else box_downscale(loaded.alpha[..., None], block)[..., 0]
         pinhole = {name: getattr(self, name) / block for name in ("fx", "fy", "cx", "cy")}

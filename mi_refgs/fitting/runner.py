@@ -300,7 +300,7 @@ def method_for(
     method = load_method(name, preset, of_data)
     if not (other := method.about.without_alpha):
         return name
-    views = read_views(method, data, "train", truth=False, decode=False)
+    views = read_views(method, data, "train", truth=False)
     if views.has_alpha or views.region is None:
         return name
     say(f"{data}: images without alpha: fitted with their background, by --method {other}")

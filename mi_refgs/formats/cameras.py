@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.data.colmap_model import write_cameras, write_images, write_points, write_test_list
+from mi_refgs.data.colmap_model import write_model
 from mi_refgs.data.lens import COEFFICIENTS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.transforms import Frame
@@ -42,10 +42,8 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     cameras = [((file.width, file.height, *map(float, file.intrinsics)), file.lens) for file in files]
     numbered = {camera: i for i, camera in enumerate(dict.fromkeys(cameras), 1)}
     below = _below_images(names)
-    write_cameras(sparse, numbered)
-    write_images(sparse, below, poses, [numbered[camera] for camera in cameras], [""] * len(shots))
-    write_points(sparse, [])
-    write_test_list(sparse, [name for name, shot in zip(below, shots, strict=True) if shot.split == "test"])
+    tests = [name for name, shot in zip(below, shots, strict=True) if shot.split == "test"]
+    write_model(sparse, numbered, below, poses, [numbered[camera] for camera in cameras], tests)
     written = "cameras.txt", "images.txt", "points3D.txt", "test.txt"
     return [target / TRANSFORMS, *(sparse / file for file in written)]
 
@@ -103,12 +101,10 @@ def read_cameras(path: Path) -> list[Camera]:
 def _camera(frame: Frame) -> Camera:
     if frame.lens() is not None:
         field = next((key for key in (*COEFFICIENTS, "is_fisheye") if frame.given.get(key)), "camera_model")
-        raise InputError(f"{frame.field(field)}: no pinhole; undistort the images, and give those cameras")
+        raise frame.refuse(field, "no pinhole", "undistort the images, and give those cameras")
     width, height = (frame.number(key) or 0.0 for key in ("w", "h"))
     if not all(1 <= side <= SIZE_MAX and side.is_integer() for side in (width, height)):
-        raise InputError(
-            f"{frame.field('w')}: {width:g} × {height:g} is no size of an image; correct w and h"
-        )
+        raise frame.refuse("w", f"{width:g} × {height:g} is no size of an image", "correct w and h")
     fx, fy = frame.focal_lengths(width, height)
     cx, cy = (frame.number(key, positive=True) for key in ("cx", "cy"))
     return Camera.from_pose(

@@ -65,12 +65,12 @@ class Provenance:
         """Whether the data set is known and exists."""
         return self.data is not None and self.data.is_dir()
 
-    def views(self, split: str, decode: bool = True) -> Dataset:
+    def views(self, split: str) -> Dataset:
         """Read a split of the data set; raises InputError for one that is unknown, missing or unreadable."""
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(f"views: {split}: {gone}; use cameras(), or restore the data set")
-        views = with_region(read_views(self.method, self.data, split, decode=decode), self.region)
+        views = with_region(read_views(self.method, self.data, split), self.region)
         return with_poses(views, self.records.get(CAMERAS, {}))
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
@@ -82,11 +82,11 @@ class Provenance:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
         shots = []
         for split in splits:
-            data = read_views(self.method, self.data, split, truth=False, decode=False)
+            data = read_views(self.method, self.data, split, truth=False)
             views, originals = with_poses(data, self.records.get(CAMERAS, {})).views, data.views
             if (self.method.data.downscale or 1) > 1:  # image files are those on disk
                 whole = self.method.downscaled(1)
-                originals = read_views(whole, self.data, split, truth=False, decode=False).views
+                originals = read_views(whole, self.data, split, truth=False).views
             for view, original in zip(views, originals, strict=True):
                 shots.append(Shot(view.name, split, view.camera(), self._relative(original.file)))
         return shots

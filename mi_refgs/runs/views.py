@@ -38,7 +38,7 @@ def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: No
     return method.downscaled(factor)
 
 
-def read_views(method: Method, path: Path, split: str, truth: bool = True, decode: bool = True) -> Dataset:
+def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Dataset:
     """Read a split of a data set with the image options of a method; raises InputError as `read_dataset`
     does."""
     options = method.data
@@ -49,13 +49,10 @@ def read_views(method: Method, path: Path, split: str, truth: bool = True, decod
         background=options.background,
         images=options.images,
         truth=truth,
-        decode=decode,
     )
 
 
-def views_of_run(
-    run: Run, method: Method, split: str, path: Path | None = None, decode: bool = True
-) -> Dataset:
+def views_of_run(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
     """Read a split of the data set of a run, or of the one at `path`, with the options of the method.
 
     Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
@@ -67,7 +64,7 @@ def views_of_run(
             raise InputError(f"{record}: path: the run records no data set; name one with --data")
         if not os.path.isdir(path):  # False for impossible names too
             raise InputError(f"{record}: path: {path} is gone; name the data set's folder with --data")
-    return with_region(read_views(method, path, split, decode=decode), run.region())
+    return with_region(read_views(method, path, split), run.region())
 
 
 def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:

@@ -1,20 +1,11 @@
 """Ground truth from a Mitsuba scene: materials of its BSDFs at surface points, and its surface as a mesh.
 
-Which of them a BSDF defines follows from the names of its parameters (T: textures count):
-
-    parameters                      albedo                          roughness   metallic   BSDFs
-    albedo, roughness, metallic     albedo                          roughness   metallic   refgs_bsdf
-    base_color, roughness           base_color                      roughness   metallic   principled
-    reflectance                     reflectance                     -           0          diffuse
-    eta, k                          F0 specular_reflectance         √α          1          (rough)conductor
-    diffuse_reflectance             what the base reflects          √α          0          (rough)plastic
-
-Albedo is that of this project's shading: the reflectance of the diffuse base, or F0 of a metal. The base of a
-nonlinear plastic multiplies the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). α of an anisotropic metal is the
-geometric mean of both; a smooth interface has roughness 0. The roughness of `diffuse` is undefined.
-`twosided`, `mask`, `bumpmap` and `normalmap` have the materials of their nested BSDF, a `blendbsdf` those of
-the one with all the weight. Everything else (glass, hair, measured, a `principled` that transmits) is
-unknown: A = 0.
+Which of them a BSDF defines follows from the names of its parameters, see RULES. Albedo is the reflectance of
+the diffuse base, or F0 of a metal; a texture counts where it is. The base of a nonlinear plastic multiplies
+the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). Roughness is √α, for an anisotropic metal of the geometric mean
+of both; that of `diffuse` is undefined. `twosided`, `mask`, `bumpmap` and `normalmap` have the materials of
+their nested BSDF, a `blendbsdf` those of the one with all the weight. Everything else (glass, hair, measured,
+a `principled` that transmits) is unknown: A = 0.
 """
 
 from __future__ import annotations
@@ -30,8 +21,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.types import Bool, Color3f, Float
 
 OPAQUE = 1e-3  # fraction of transmitted light, or weight of the other BSDF of a blend, that is neglected
-SPHERE_SUBDIVISIONS = 5
-"""Subdivisions of an icosahedron: 20,480 triangles, whose centres are 1.5e-4 radii inside the sphere."""
+SPHERE_SUBDIVISIONS = 5  # of an icosahedron: the centres of 20,480 triangles are 1.5e-4 radii inside
 ROUND_SIDES = 256  # sides of a circle: the centre of a side is 8e-5 radii inside it
 
 
@@ -218,16 +208,11 @@ def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     name = shape.class_name()
     params = mi.traverse(shape)
     if name not in UNIT_SHAPES or "to_world" not in params:
-        raise InputError(
-            f"shape '{shape.id()}': a {name} cannot be tessellated; use a mesh, sphere, disk or cylinder"
-        )
+        what, remedy = f"a {name} cannot be tessellated", "use a mesh, sphere, disk or cylinder"
+        raise InputError(what, field=f"shape '{shape.id()}'", remedy=remedy)
     unit = UNIT_SHAPES[name]()
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     return np.asarray(unit.vertices) @ matrix[:3, :3].T + matrix[:3, 3], np.asarray(unit.faces)
-
-
-def _sphere() -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS)
 
 
 def _disk() -> trimesh.Trimesh:
@@ -246,5 +231,9 @@ def _cylinder(wall: bool = True) -> trimesh.Trimesh:
     return closed
 
 
-UNIT_SHAPES = {"Sphere": _sphere, "Disk": _disk, "Cylinder": _cylinder}
+UNIT_SHAPES = {
+    "Sphere": lambda: trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS),
+    "Disk": _disk,
+    "Cylinder": _cylinder,
+}
 """Tessellations of the unit shapes that Mitsuba transforms by `to_world`."""

@@ -2,33 +2,26 @@
 
 A data set folder contains
 
-    transforms_train.json, transforms_test.json   cameras in the Blender / NeRF convention, written after
-                                                  the views
+    transforms_train.json, transforms_test.json   cameras in the Blender / NeRF convention, written last
     train/r_000.png    RGBA, 8 bit: straight alpha, colour = sRGB(radiance / alpha), clipped
     train/r_000.exr    RGBA, float32, linear: premultiplied radiance and alpha
-    train/r_000_normal.exr     X, Y, Z: unit shading normal at the pixel centre, world space, towards the
-                               camera
-    train/r_000_depth.exr      Y: distance at the pixel centre, along the viewing axis (not along the ray)
-    train/r_000_albedo.exr     R, G, B: diffuse reflectance, or F0 of a metal, at the pixel centre
-                               (see `synthesis.ground_truth`)
-    train/r_000_roughness.exr  Y: √α of GGX; like albedo and metallic with A = 1 where the BSDF defines it,
-                               else 0
-    train/r_000_metallic.exr   Y: 0 … 1
+    train/r_000_NAME.exr   maps at pixel centres, 0 off the object: normal (X, Y, Z: unit, world space,
+                       towards the camera), depth (Y: along the viewing axis), and with A = 1 where the BSDF
+                       defines them albedo (R, G, B, A), roughness (Y, A: √α of GGX) and metallic (Y, A)
     environment.exr    lat-long radiance of the environment for a Mitsuba `envmap` without `to_world`; in an
                        open scene the radiance that arrives at the object's centre without the object
     surface.ply        triangles of all shapes, world space
     region.json        only for an open scene: a sphere around the object
-    relight/NAME/      the test views under another environment map, a data set with a test split:
-                       test/r_000.png and .exr, environment.exr, transforms_test.json
+    relight/NAME/      the test views under another environment map, a data set with a test split
     dataset.json       the settings, which decide whether a folder may be resumed; and other environment maps
 
-Maps are 0 off the object. An open scene is an object in its surroundings: images are RGB without alpha, maps,
-materials and surface are those of the object only, and so are relit views, which have alpha.
+An open scene is an object in its surroundings: images are RGB without alpha, maps and surface are those of
+the object only, and so are relit views, which have alpha.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -36,12 +29,11 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, pinhole
-from mi_refgs.data.region import REGION_FILE, Region, write_region
+from mi_refgs.data.region import Region, write_region
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import read_exr, read_exr_image, write_exr
+from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
-from mi_refgs.io.images import read_png, srgb_from_linear, straight_srgb, write_png
-from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.progress import with_bar
 from mi_refgs.synthesis.ground_truth import surface_mesh
@@ -63,13 +55,9 @@ from mi_refgs.synthesis.settings import (
     under_light,
     without,
 )
-from mi_refgs.synthesis.write_colmap import colmap_output, write_colmap
 
-SURFACE_VOXELS = 2048
-"""Voxels along the diameter of `surface.ply`, which decide how far from it rays start: 2 voxels are 0.1 % of
-the size, ten times the error of a tessellated sphere."""
-REGION_MARGIN = 1.2
-"""Radius of the region over that of the object's bounding sphere, which includes adjacent surfaces."""
+SURFACE_VOXELS = 2048  # along the diameter of surface.ply: rays start 2 off, ten times a sphere's error
+REGION_MARGIN = 1.2  # radius of the region over that of the object's bounding sphere: adjacent surfaces
 
 
 def make_dataset(
@@ -77,7 +65,6 @@ def make_dataset(
     out: str | Path,
     *,
     relight: str | Path | Sequence[str | Path] = (),
-    colmap: str | Path | None = None,
     overwrite: bool = False,
     progress: bool = True,
     **options: Any,
@@ -91,22 +78,22 @@ def make_dataset(
     `options`: those of `DatasetOptions`, such as `views`, `size`, `spp`.
     `relight`: maps (or one) under which the test views are traced again, each in a folder of its name without
     suffix.
-    `colmap`: folder for the same data set as COLMAP's text files (`write_colmap`).
     `overwrite`: remove the views in the folder.
 
     A folder that the same settings left unfinished is continued. Files are written atomically. A Dr.Jit
     variant must be set.
 
     Raises InputError if an option is unknown or out of range, the scene or a light cannot be loaded, a shape
-    cannot be tessellated, a camera does not see the object, the folder cannot be written, or it contains a
+    cannot be tessellated, a camera is at the object, the folder cannot be written, or it contains a
     data set of other settings or foreign files and `overwrite` is false.
     """
     # Settings.
     scene, out = Path(scene), Path(out)
     known = [field.name for field in fields(DatasetOptions)]
     for name in options.keys() - known:
-        raise InputError(f"make_dataset: {name}: unknown option; use some of {', '.join(known)}")
-    given = DatasetOptions(**options).checked(scene)
+        raise InputError("unknown option", "make_dataset", name, f"use some of {', '.join(known)}")
+    given = DatasetOptions(**options)
+    given.check(scene)
     lights = [relight] if isinstance(relight, str | Path) else relight
     settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
 
@@ -118,7 +105,7 @@ def make_dataset(
     try:
         vertices, faces = surface_mesh(shapes)
     except InputError as error:
-        raise InputError(f"{scene}: {error}") from error
+        raise error.at(file=scene) from error
     relit = [under_light(loaded, other.path, about) for other in others]
 
     # Cameras.
@@ -126,24 +113,22 @@ def make_dataset(
     cameras = Cameras(given, centre, radius, reach(loaded.shapes(), centre) if about else radius, about)
     x, y, z = (float(c) for c in centre)
     region = Region((x, y, z), REGION_MARGIN * radius, estimated=True)  # fits look for what supports it
-    if about:
-        require_clear_view(loaded, cameras, region, scene)
+    if about and cameras.distance[0] <= region.radius:
+        what = f"{cameras.distance[0]:.4g} is inside of the region around the object"
+        raise InputError(f"{what}, whose radius is {region.radius:.4g}", scene, "--distance", "give more")
 
     # Output.
-    points = None if colmap is None else colmap_output(Path(colmap), out, cameras)
-    output = prepare_folder(out, settings, overwrite, others)
+    prepare_folder(out, settings, overwrite, others)
     if about:
-        write_region(output.own(REGION_FILE).parent, region)
-    if not output.own(SURFACE).exists():
+        write_region(out, region)
+    if not (out / SURFACE).exists():
         voxel = 2 * radius / SURFACE_VOXELS
         write_mesh(out / SURFACE, Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel))
     tracer = Tracer(lit, cameras)
-    write_views(output, "", ("train", "test"), tracer, progress)
-    if points is not None:
-        write_colmap(points, out, tracer)
+    write_views(out, ("train", "test"), tracer, MAPS, progress)
     for other, scene_there in zip(others, relit, strict=True):
         alone = Tracer(scene_there, replace(cameras, objects=()))
-        write_views(output, f"{RELIGHT}/{other.name}/", ("test",), alone, progress)
+        write_views(out / RELIGHT / other.name, ("test",), alone, {}, progress)
     return out
 
 
@@ -153,58 +138,18 @@ def named_shapes(scene: Any, ids: Sequence[str], file: Path) -> list[Any]:
     missing = [name for name in ids if not name or name not in found]
     if missing:
         known = ", ".join(sorted(name for name in found if name)) or "none"
-        raise InputError(
-            f"{file}: --shapes: no shape has the id '{missing[0]}'; give one of those there: {known}"
-        )
+        raise InputError(f"no shape has the id '{missing[0]}'", file, "--shapes", f"give one of {known}")
     return [found[name] for name in dict.fromkeys(ids)]
 
 
-def require_clear_view(scene: Any, cameras: Cameras, region: Region, file: Path) -> None:
-    """Raise InputError if a camera is in the region, or something hides its centre."""
-    import drjit as dr
-    import mitsuba as mi
-
-    origin = np.stack([pose[:3, 3] for split in ("train", "test") for pose, _ in cameras.of(split)])
-    toward = np.array(region.centre) - origin
-    distance = np.linalg.norm(toward, axis=1)
-    if distance.min() <= region.radius:
-        raise InputError(
-            f"{file}: --distance: {distance.min():.4g} is inside of the region around the object, whose "
-            f"radius is {region.radius:.4g}; give more"
-        )
-    with dr.suspend_grad():
-        start, along = (np.ascontiguousarray(a.T, np.float32) for a in (origin, toward / distance[:, None]))
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), mi.Vector3f(along)))
-        own = mi.Bool(False)
-        for shape in cameras.objects:
-            own |= hit.shape == mi.ShapePtr(shape)
-        hidden = np.array(hit.is_valid() & ~own) & (np.array(hit.t) < distance - region.radius)
-    if hidden.any():
-        raise InputError(
-            f"{file}: --distance: something is between {int(hidden.sum())} of {len(origin)} cameras and "
-            f"the object, at {distance[hidden].min():.4g} … {distance[hidden].max():.4g}; give a shorter "
-            "distance, or another --elevation"
-        )
-
-
 def write_views(
-    output: OutputFolder, part: str, splits: Sequence[str], tracer: Tracer, progress: bool
+    out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str, str], progress: bool
 ) -> None:
-    """Write the environment map, the views, and then the transforms of some splits.
-
-    `part` is the folder of the files: "" with maps, or "relight/NAME/" without.
-    """
-    # The files.
-    out, cameras, maps = output.path / part, tracer.cameras, {} if part else MAPS
-    endings = (".png", ".exr", *(f"_{name}.exr" for name in maps))
+    """Write the environment map, the views with `maps`, and then the transforms of some splits."""
+    cameras = tracer.cameras
     views = {
         split: [(f"{split}/r_{i:03d}", *job) for i, job in enumerate(cameras.of(split))] for split in splits
     }
-    files = ["environment.exr", *(f"transforms_{split}.json" for split in splits)]
-    files += [f"{name}{ending}" for split in splits for name, *_ in views[split] for ending in endings]
-    output.claim(*(f"{part}{file}" for file in files))
-
-    # Their content.
     light, height = out / "environment.exr", cameras.options.environment_height
     if height and cameras.objects and not light.exists():
         room = without(tracer.scene, cameras.objects)
@@ -228,26 +173,16 @@ def write_views(
         write_json(out / f"transforms_{split}.json", {**intrinsics, "frames": frames})
 
 
-def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: Iterable[str]) -> None:
-    """Trace the missing and broken files of a view."""
-    if _whole(read_png, f"{stem}.png") and _whole(read_exr, f"{stem}.exr"):
-        rgba = None
-    else:
-        rgba = tracer.image(pose, seed)
-        write_exr(f"{stem}.exr", rgba)
-        write_png(f"{stem}.png", straight_srgb(rgba) if rgba.shape[-1] == 4 else srgb_from_linear(rgba))
-    missing = [name for name in maps if not _whole(read_exr, f"{stem}_{name}.exr")]
-    if missing:
-        image = read_exr_image(f"{stem}.exr") if rgba is None else rgba
-        found = tracer.maps(pose, image[..., -1] > 0 if image.shape[-1] == 4 else np.array(True))
-        for name in missing:
-            write_exr(f"{stem}_{name}.exr", found[name], names=MAPS[name])
-
-
-def _whole(read: Callable[[str], object], file: str) -> bool:
-    """Whether a file exists and can be read."""
-    try:
-        read(file)
-    except InputError:
-        return False
-    return True
+def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: dict[str, str]) -> None:
+    """Trace a view, unless all of its files are there."""
+    shown, linear = (stem.with_name(f"{stem.name}{ending}") for ending in (".png", ".exr"))
+    files = {name: stem.with_name(f"{stem.name}_{name}.exr") for name in maps}
+    if all(file.exists() for file in (shown, linear, *files.values())):
+        return
+    rgba = tracer.image(pose, seed)
+    write_exr(linear, rgba)
+    write_png(shown, straight_srgb(rgba) if rgba.shape[-1] == 4 else srgb_from_linear(rgba))
+    if maps:
+        found = tracer.maps(pose, rgba[..., -1] > 0 if rgba.shape[-1] == 4 else np.array(True))
+        for name, file in files.items():
+            write_exr(file, found[name], names=maps[name])

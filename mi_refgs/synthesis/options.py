@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from tyro.conf import Suppress, arg
 
 from mi_refgs.errors import InputError, abbreviated
@@ -22,10 +21,26 @@ from mi_refgs.io.files import require_file
 optional = partial(arg, help_behavior_hint="")
 Count = Annotated[int, arg(metavar="N")]
 Range = tuple[float, float]
-NUMPY = np.ndarray | np.generic
-REAL = float | int
-OPTIONS = {"spp": "--samples", "test_views": "--test-views", "max_depth": "--max-depth"}
-"""Options of `refgs dataset` of another name than the field."""
+OPTIONS = {
+    "spp": "--samples",
+    "test_views": "--test-views",
+    "resolution": "--size",
+}  # of `refgs dataset`, of another name
+WHOLE = (lambda n: n >= 1 and n % 1 == 0, "give a whole number of at least 1")
+RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **dict.fromkeys(("views", "spp", "max_depth", "test_views"), WHOLE),
+    "seed": (lambda n: n >= 0 and n % 1 == 0, "give a whole number of at least 0"),
+    "environment_height": (lambda n: n >= 0 and n % 1 == 0, "give a whole number of at least 0"),
+    "resolution": (lambda size: len(size) == 2 and all(map(WHOLE[0], size)), "give pixels, or WIDTH, HEIGHT"),
+    "elevation": (lambda e: -90 < e[0] < e[1] < 90, "give two angles in degrees, -90 < low < high < 90"),
+    "azimuth": (
+        lambda a: -360 <= a[0] < a[1] <= a[0] + 360,
+        "give two angles in degrees, -360 <= low < high <= low + 360",
+    ),
+    "fov": (lambda angle: 0 < angle < 170, "give degrees between 0 and 170"),
+    "distance": (lambda d: 0 < d[0] <= d[1] < math.inf, "give two lengths, 0 < NEAR <= FAR"),
+}
+"""What each option must be, and the remedy; None of those that may be None is fine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +65,6 @@ class DatasetOptions:
     """azimuth of cameras, degrees from +x, counter-clockwise seen from above; less than 360° before a wall"""
     fov: Annotated[float, arg(metavar="DEG")] = 40.0
     """field of view of the shorter side"""
-    fill: Annotated[float, Suppress] = 0.95
-    """fraction of the shorter side that the object's bounding sphere fills, where `distance` is not given"""
     seed: Count = 0
     """seed of cameras and paths"""
     max_depth: Count = 6
@@ -77,42 +90,20 @@ class DatasetOptions:
             return self.views
         return max(1, self.views // 4) if self.test_views is None else self.test_views
 
-    def checked(self, scene: Path) -> DatasetOptions:
-        """These options as plain Python values; raises InputError for one of a wrong type or out of range."""
-        plain = {name: x.tolist() if isinstance(x, NUMPY) else x for name, x in vars(self).items()}
-
-        def need(field: str, kind: Any, good: Callable[..., bool], remedy: str, count: int = 1) -> None:
-            value = plain[field]
-            parts = tuple(value) if isinstance(value, list | tuple) else (value,)
-            if len(parts) != count or not all(isinstance(x, kind) for x in parts) or not good(*parts):
+    def check(self, scene: Path) -> None:
+        """Raise InputError for an option of a wrong type or out of range."""
+        for field, (good, remedy) in RANGES.items():
+            value = getattr(self, field)
+            try:
+                fine = good(value) if value is not None else field in ("test_views", "distance")
+            except (TypeError, IndexError):  # another type
+                fine = False
+            if not fine:
                 option = f"{field} ({OPTIONS[field]})" if field in OPTIONS else field
-                raise InputError(f"{scene}: {option}: {abbreviated(value)} is out of range; {remedy}")
-            plain[field] = parts if count > 1 else parts[0]
-
-        for field in ("views", "spp", "max_depth", *(["test_views"] if self.test_views is not None else [])):
-            need(field, int, lambda number: number >= 1, "give a whole number of at least 1")
-        for field in ("seed", "environment_height"):
-            need(field, int, lambda number: number >= 0, "give a whole number of at least 0")
-        sides = 2 if isinstance(plain["size"], list | tuple) else 1
-        remedy = "give pixels per side, or width and height"
-        need("size", int, lambda *numbers: min(numbers) >= 1, remedy, sides)
-        remedy = "give two angles in degrees, -90 < low < high < 90"
-        need("elevation", REAL, lambda low, high: -90 < low < high < 90, remedy, 2)
-        remedy = "give two angles in degrees, -360 <= low < high <= low + 360"
-        need("azimuth", REAL, lambda low, high: -360 <= low < high <= low + 360, remedy, 2)
-        need("fov", REAL, lambda angle: 0 < angle < 170, "give degrees between 0 and 170")
-        need("fill", REAL, lambda fraction: 0 < fraction <= 1, "give a fraction between 0 and 1")
-        if self.distance is not None:
-            remedy = "give two lengths, 0 < NEAR <= FAR"
-            need("distance", REAL, lambda near, far: 0 < near <= far < np.inf, remedy, 2)
-        if isinstance(self.objects, str):
-            plain["objects"] = (self.objects,)
-        return DatasetOptions(**plain)
+                raise InputError(f"{abbreviated(value)} is out of range", scene, option, remedy)
 
     def record(self, scene: Path) -> dict[str, Any]:
-        """The content of dataset.json, of `checked` options; raises InputError for a scene or light that
-        cannot be read.
-        """
+        """The content of dataset.json; raises InputError for a scene or light that cannot be read."""
         light = None if self.light is None else LightFile.of(Path(self.light))
         width, height = self.resolution
         values = vars(self) | {
@@ -148,12 +139,12 @@ class LightFile:
 def scene_hash(scene: Path) -> str:
     """SHA-256 of a scene's XML and the files in it; raises InputError if it is missing or no XML."""
     if not scene.is_file():
-        raise InputError(f"{scene}: scene: missing; give the path of a Mitsuba XML file")
+        raise InputError("missing", scene, "scene", "give the path of a Mitsuba XML file")
     content = scene.read_bytes()
     try:
         root = ElementTree.fromstring(content)
     except ElementTree.ParseError as error:
-        raise InputError(f"{scene}: scene: not XML ({error}); give a Mitsuba scene") from error
+        raise InputError(f"not XML ({error})", scene, "scene", "give a Mitsuba scene") from error
     digest = hashlib.sha256(content)
     names = [e.get("value") for e in root.iter("string") if e.get("name") == "filename"]
     for name in [*names, *(e.get("filename") for e in root.iter("include"))]:

@@ -15,13 +15,12 @@ from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis.ground_truth import materials_at
 from mi_refgs.synthesis.options import DatasetOptions
-from mi_refgs.types import Color3f, Point2f, Vector3f
+from mi_refgs.types import Color3f, Vector3f
 
-SAMPLES_PER_LAUNCH = 1 << 24
-"""Largest number of paths per launch; the path tracer keeps about 100 bytes for each."""
+SAMPLES_PER_LAUNCH = 1 << 24  # most paths per launch; the path tracer keeps about 100 bytes for each
 SURFACE_SAMPLES = 4096  # points per shape that measure the scene's size; the farthest is found to about 1 %
-ENVIRONMENT_OVERSAMPLING = 4
-"""Directions per texel and axis of a rotated environment map, so that a small sun keeps its energy."""
+ENVIRONMENT_OVERSAMPLING = 4  # directions per texel and axis of a rotated map: a small sun keeps its energy
+FILL = 0.95  # of the shorter side that the object's bounding sphere fills, unless distances are given
 MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "metallic": "YA"}
 """Channels of the maps of a view; A is 1 where the BSDF defines the material, 0 where it does not."""
 
@@ -154,7 +153,7 @@ class Cameras:
     @property
     def distance(self) -> tuple[float, float]:
         """Distance from the centre to the nearest and the farthest camera."""
-        filling = self.radius / (self.options.fill * math.sin(math.radians(self.options.fov) / 2))
+        filling = self.radius / (FILL * math.sin(math.radians(self.options.fov) / 2))
         return self.options.distance or (filling, filling)
 
     def of(self, split: str) -> list[tuple[np.ndarray, int]]:
@@ -231,7 +230,8 @@ class Tracer:
 
         with dr.suspend_grad():
             index = dr.arange(mi.UInt32, width * height)
-            ray = self._rays(mi.Point2f((index % width + 0.5) / width, (index // width + 0.5) / height))
+            film = mi.Point2f((index % width + 0.5) / width, (index // width + 0.5) / height)
+            ray, _ = self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))
             si = self.scene.ray_intersect(ray)
             normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
             wanted = si.is_valid() if not self.objects else mi.Bool(False)
@@ -244,26 +244,6 @@ class Tracer:
                 planes = [plane(x) for x in (value if dr.depth_v(value) > 1 else [value])]
                 found[name] = np.stack([*planes, plane(known)], axis=-1)
         return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
-
-    def points(self, pose: np.ndarray, film: np.ndarray) -> np.ndarray:
-        """World points (N, 3) that a view shows at film positions (N, 2), 0 … 1 from the upper left.
-
-        NaN where it shows none.
-        """
-        import drjit as dr
-        import mitsuba as mi
-
-        self._look(pose)
-        with dr.suspend_grad():
-            si = self.scene.ray_intersect(self._rays(mi.Point2f(np.ascontiguousarray(film.T, np.float32))))
-            seen = np.array(si.is_valid()) & np.ones(len(film), dtype=bool)
-            return np.where(seen[:, None], np.array(si.p, dtype=np.float64).T, np.nan)
-
-    def _rays(self, film: Point2f) -> Any:
-        """Rays (mi.RayDifferential3f) through film positions, 0 … 1."""
-        import mitsuba as mi
-
-        return self.sensor.sample_ray(0, 0.5, film, mi.Point2f(0.5))[0]
 
     def _look(self, pose: np.ndarray) -> None:
         import mitsuba as mi

@@ -13,24 +13,20 @@ from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import mitsuba_exr
 from mi_refgs.io.files import make_folder, read_json, write_json
-from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.options import LightFile
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
 RELIGHT = "relight"  # folder of the test views under other environment maps
-OWN_FILES = (
+FILES = (
     "transforms_*.json",
     REGION_FILE,
     "environment.exr",
     *(f"{split}/*.{ending}" for split in ("train", "test") for ending in ("png", "exr")),
 )
-VIEW_FILES = (*OWN_FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in OWN_FILES))
-"""Files of a data set except its settings; overwriting removes them."""
+"""Files of a data set, and of its views under another map, which overwriting removes."""
 Z_UP = (1, 0, 0), 90.0
 """Axis and angle in degrees that rotate y of a lat-long map to z, in scenes without an `envmap`."""
-LATER = {"light": "", "light_sha256": "", "height": 0, "objects": [], "distance": [0, 0], "azimuth": [0, 360]}
-"""Values of settings that records of older versions lack."""
 
 
 def load_scene(scene: Path, whole: bool = False) -> Any:
@@ -44,11 +40,12 @@ def load_scene(scene: Path, whole: bool = False) -> Any:
         with mitsuba_exr():
             loaded = mi.load_file(str(scene), optimize=not whole)
     except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
-        raise InputError(f"{scene}: scene: Mitsuba cannot load it: {error}; correct the scene") from error
+        what = f"Mitsuba cannot load it: {error}"
+        raise InputError(what, scene, "scene", "correct the scene") from error
     if not loaded.shapes():
-        raise InputError(f"{scene}: shapes: the scene has none; add an object to look at")
+        raise InputError("the scene has none", scene, "shapes", "add an object to look at")
     if not loaded.emitters():
-        raise InputError(f"{scene}: emitters: the scene has none; add an environment emitter")
+        raise InputError("the scene has none", scene, "emitters", "add an environment emitter")
     return loaded
 
 
@@ -96,48 +93,42 @@ def _scene_of(parts: Sequence[Any]) -> Any:
 
 def prepare_folder(
     out: Path, wanted: dict[str, Any], overwrite: bool, relight: Sequence[LightFile] = ()
-) -> OutputFolder:
+) -> None:
     """Make the folders and record the settings `wanted`.
 
-    Raises InputError for a folder with a data set of other settings or with foreign files; `overwrite`
-    removes the former.
+    Raises InputError for a folder that contains anything but a data set with a RECORD, and for one of other
+    settings, which `overwrite` removes.
     """
-    # Recorded settings.
-    record = out / RECORD
-    found: dict[str, Any] | None = None
+    names = [light.name for light in relight]
+    if len({*names}) < len(names):
+        files = ", ".join(str(light.path) for light in relight)
+        raise InputError("two have one name", files, f"--{RELIGHT}", "rename one of the files")
+    record, found = out / RECORD, dict[str, Any]()
     with contextlib.suppress(InputError):
         content = read_json(record)
-        found = LATER | content if "scene_sha256" in content else None  # runs also have a dataset.json
-    output = OutputFolder(out, "dataset", (RECORD, *VIEW_FILES), RECORD if found else "", overwrite=overwrite)
+        found = content if "scene_sha256" in content else {}  # runs also have a dataset.json
+    if not found and out.is_dir() and any(out.iterdir()):
+        raise InputError("not empty, and no data set of this command", out, "output", "choose another folder")
 
     # Files that do not match the settings or a light, and the options that say so.
-    differing = [name for name, value in wanted.items() if found and found.get(name) != value]
-    changed = [*dict.fromkeys(_option(name) for name in differing)]
-    same = found is not None and not changed
-    stale = [] if same else [f for pattern in VIEW_FILES for f in sorted(out.glob(pattern))]
-    lights = recorded_lights(record) if same else {}
-    if len({light.name for light in relight}) < len(relight):
-        names = ", ".join(str(light.path) for light in relight)
-        raise InputError(f"{names}: --relight: two have one name; rename one of the files")
-    for light in relight if same else ():
+    changed = [*dict.fromkeys(_option(name) for name in wanted if found and found.get(name) != wanted[name])]
+    stale = [*FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in FILES)] if changed else []
+    lights = {} if changed else recorded_lights(record)
+    for light in relight:
         if lights.get(light.name, light.sha256) != light.sha256:
-            stale += [f for pattern in OWN_FILES for f in sorted((out / RELIGHT / light.name).glob(pattern))]
+            stale += [f"{RELIGHT}/{light.name}/{pattern}" for pattern in FILES]
             changed.append(f"--{RELIGHT} {light.name}")
-    if stale and not overwrite:
-        raise InputError(
-            f"{record if found else out}: {', '.join(changed) or 'output'}: the folder contains another "
-            "data set; give another folder, the same settings, or --overwrite"
-        )
+    if changed and not overwrite:
+        remedy = "give another folder, the same settings, or --overwrite"
+        raise InputError("the folder contains another data set", record, ", ".join(changed), remedy)
 
     # Remove them, make the folders, and record the settings.
     lights |= {light.name: light.sha256 for light in relight}
-    if not same:
-        output.require_free()
-    output.remove(file.relative_to(out).as_posix() for file in stale)
+    for file in (path for pattern in stale for path in out.glob(pattern)):
+        file.unlink()
     for folder in (out / "train", out / "test", *(out / RELIGHT / name / "test" for name in lights)):
         make_folder(folder)
-    write_json(output.own(RECORD), wanted | {RELIGHT: lights})
-    return output
+    write_json(record, wanted | {RELIGHT: lights})
 
 
 def _option(field: str) -> str:

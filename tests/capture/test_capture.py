@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from benchmarks import capture as capture_benchmark
 from benchmarks.capture import best_similarity, pose_errors
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
-from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
-from mi_refgs.capture.output import LAST, is_complete, prepare, replace_output
+from mi_refgs.capture.frame import region_of_interest, up_direction
+from mi_refgs.capture.output import prepare
 from mi_refgs.capture.photographs import find_masks, find_photographs, mask_pixels
 from mi_refgs.capture.pipeline import require_placed
 from mi_refgs.cli import main
@@ -30,7 +30,7 @@ from tests.scenes import photographed as scene
 
 COUNT = 9
 NAMES = [f"{i:02} ({i}).png" for i in range(COUNT)]
-needs_colmap = pytest.mark.skipif(not colmap.installed(), reason='pip install "mi_refgs[capture]"')
+needs_colmap = pytest.mark.skipif(not find_spec("pycolmap"), reason='pip install "mi_refgs[capture]"')
 
 
 @pytest.fixture(scope="module")
@@ -84,18 +84,6 @@ def test_cameras_are_found_up_to_a_similarity(captured: Path) -> None:
     block = np.array([0, 0, scene.BLOCK[2] / 2])
     assert np.linalg.norm(similarity.translation - block) < 0.5 * similarity.scale
     assert 0.5 < similarity.scale < 2
-
-
-@needs_colmap
-def test_captured_points_are_on_the_surfaces(captured: Path) -> None:
-    solved = _model(captured / "data")
-    similarity = best_similarity(solved.origin, np.array([shot.origin for shot in scene.around(COUNT)]))
-    points = similarity.apply(solved.points)
-    ground = abs(points[:, 2])
-    sides = [abs(abs(points[:, i]) - scene.BLOCK[i]) for i in (0, 1)]
-    top = abs(points[:, 2] - scene.BLOCK[2])
-    assert len(points) > 300
-    assert np.quantile(np.min([ground, top, *sides], axis=0), 0.9) < 0.02
 
 
 @needs_colmap
@@ -168,6 +156,7 @@ def test_second_capture_computes_nothing(captured: Path, monkeypatch: pytest.Mon
     assert (region["centre"], region["radius"]) == ([0.1, 0.2, 0.3], 0.5) and "estimated" not in region
 
 
+@pytest.mark.slow
 @needs_colmap
 def test_interrupted_capture_is_continued(
     captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -189,6 +178,7 @@ def test_interrupted_capture_is_continued(
     np.testing.assert_allclose(_model(data).origin, _model(captured / "data").origin, atol=1e-6)
 
 
+@pytest.mark.slow
 @needs_colmap
 def test_distorted_lens_is_estimated_and_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shots = scene.around(10)
@@ -215,7 +205,7 @@ def test_distorted_lens_is_estimated_and_undone(tmp_path: Path, monkeypatch: pyt
 
 @needs_colmap
 def test_other_lens_rewrites_images(captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Images and cameras share one lens; files of the user are kept, masks removed if none are given."""
+    """Images and cameras share one lens; a list of test views is kept, masks removed if none are given."""
     data = tmp_path / "data"
     shutil.copytree(captured / "data", data)
     (data / "sparse" / "0" / "test.txt").write_text(NAMES[3])
@@ -228,65 +218,22 @@ def test_other_lens_rewrites_images(captured: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(output, "straighten", longer)
     [before] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
     command = ["capture", str(captured / "photographs"), "-o", str(data)]
-    assert main([*command, "--masks", str(captured / "masks")]) == 0
+    monkeypatch.setattr(output, "write_model", stopped)
+    assert main(command) == 130 and not (data / "sparse/0/images.bin").exists()
+    monkeypatch.undo()
+    monkeypatch.setattr(output, "straighten", longer)
+    assert main(command) == 0 and not (data / "masks").exists()
     [after] = colmap.load().Reconstruction(data / "sparse" / "0").cameras.values()
     assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
-    assert (data / "images" / NAMES[0]).stat().st_ino != inode and (data / "masks").is_dir()
-    assert main(command) == 0 and not (data / "masks").exists()
+    assert (data / "images" / NAMES[0]).stat().st_ino != inode
     assert [view.name for view in read_loaded(data, "test").views] == [NAMES[3]]
 
 
+def stopped(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 # ---------- The folder ----------
-
-
-def _output(folder: Path, *names: str) -> Path:
-    for name in names:
-        (_made((folder / name).parent) / folder.joinpath(name).name).write_text(folder.name)
-    return folder
-
-
-def _files(folder: Path) -> dict[str, str]:
-    """What the files of a data set hold; none of those that record it."""
-    files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_text() for name, path in files.items() if not name.startswith(".")}
-
-
-def test_capture_replaces_only_files_of_the_last_capture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data, own = tmp_path / "data", {"masks/x.png": "own", "sparse/0/test.txt": "own"}
-    prepare(data, [tmp_path / "photographs"])
-    first = ("images/a.png", "images/b.png", "masks/a.png", LAST)
-    replace_output(data, _output(tmp_path / "1", *first, "images/.a.png.0123456789ab.tmp.png"), "1")
-    assert _files(data) == dict.fromkeys(first, "1") and is_complete(data, "1") and not is_complete(data, "2")
-    for name, text in own.items():
-        (data / name).write_text(text)
-    prepare(data, [])
-    second = ("images/a.png", "images/c.png", LAST)
-    replace_output(data, _output(tmp_path / "2", *second), "2")
-    assert _files(data) == dict.fromkeys(second, "2") | own and is_complete(data, "2")
-    third = _output(tmp_path / "3", "masks/x.png", LAST)
-    refused(lambda: replace_output(data, third, "3"), "masks/x.png: output: not written by a capture; move")
-    assert _files(data) == dict.fromkeys(second, "2") | own and is_complete(data, "2")
-    # Between two files of the next output the process ends; the next one completes it.
-    whole = Path.rename
-    moved: list[Path] = []
-
-    def interrupted(path: Path, target: Path) -> Path:
-        if moved:
-            raise KeyboardInterrupt
-        moved.append(path)
-        return whole(path, target)
-
-    monkeypatch.setattr(Path, "rename", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        replace_output(data, _output(tmp_path / "4", *first), "4")
-    assert not (data / LAST).exists() and not is_complete(data, "4")
-    monkeypatch.setattr(Path, "rename", whole)
-    replace_output(data, _output(tmp_path / "4", *first), "4")
-    assert _files(data) == dict.fromkeys(first, "4") | own and is_complete(data, "4")
-    (data / "images" / "b.png").unlink()
-    assert not is_complete(data, "4")
 
 
 @needs_colmap
@@ -301,9 +248,7 @@ def test_output_around_the_source_is_refused(captured: Path) -> None:
 
 def test_foreign_output_folder_is_refused(tmp_path: Path) -> None:
     """Whatever its folders are called."""
-    kept = _made(tmp_path / ".work") / "thesis.txt"
-    kept.write_text("own")
-    (tmp_path / "capture.json").write_text("{}")
+    (_made(tmp_path / ".work") / "thesis.txt").write_text("own")
     refused(lambda: prepare(tmp_path, []), "not empty, and no capture")
 
 
@@ -312,13 +257,6 @@ def test_foreign_output_folder_is_refused(tmp_path: Path) -> None:
 
 def _flat(i: int, images: list[np.ndarray]) -> np.ndarray:
     return np.full((96, 128, 3), 100 + i, dtype=np.uint8)
-
-
-def _blurred(i: int, images: list[np.ndarray]) -> np.ndarray:
-    from scipy.ndimage import gaussian_filter
-
-    ramp = np.linspace(0, 255, 128)[None, :, None] * np.ones((96, 1, 3))
-    return gaussian_filter(np.roll(ramp, 9 * i, axis=1), (12, 12, 0)).astype(np.uint8)
 
 
 def _unrelated(i: int, images: list[np.ndarray]) -> np.ndarray:
@@ -336,12 +274,10 @@ def _one_place(i: int, images: list[np.ndarray]) -> np.ndarray:
     ("make", "words"),
     [
         (_flat, "patterned ground"),
-        (_blurred, "hold still"),
         (_unrelated, "two thirds"),
-        (_one_place, "walk around"),
-        (lambda i, images: images[0], "walk around"),
+        pytest.param(_one_place, "walk around", marks=pytest.mark.slow),
     ],
-    ids=["flat", "blurred", "unrelated", "one place", "all alike"],
+    ids=["flat", "unrelated", "one place"],
 )
 def test_failed_reconstruction_names_a_remedy(
     make: object, words: str, images: list[np.ndarray], tmp_path: Path
@@ -354,9 +290,9 @@ def test_failed_reconstruction_names_a_remedy(
 
 
 def test_disconnected_groups_are_counted(tmp_path: Path) -> None:
-    check = partial(require_placed, groups=[["a"] * 4, ["b"] * 3], longest_gap="c.jpg")
-    refused(lambda: check(tmp_path, 9), "2 groups that share nothing (4, 3 images)", "around c.jpg")
-    check(tmp_path, 8)
+    groups = [["a"] * 4, ["b"] * 3]
+    refused(lambda: require_placed(tmp_path, 9, groups), "only 4, 3 could be placed together, in 2 groups")
+    require_placed(tmp_path, 8, groups)
 
 
 def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
@@ -406,7 +342,7 @@ def test_exif_gives_orientation_and_focal_length(tmp_path: Path) -> None:
         upright = shown[orientation]
         assert photograph.size == upright.shape[1::-1] and photograph.stored_size == (6, 4)
         # EXIF's focal length is whole: 32 mm.
-        assert photograph.focal_pixels((30, 40)) == pytest.approx(0.75 * 50, rel=0.05)
+        assert photograph.focal == pytest.approx(0.75, rel=0.05)
         # All lie one way, and `up` says where the top of the upright image went.
         lying = np.rot90(upright) if photograph.lying else upright
         np.testing.assert_array_equal(np.asarray(photograph.load()), lying)
@@ -491,14 +427,3 @@ def test_region_of_interest_is_what_most_cameras_look_at(rng: np.random.Generato
     assert np.linalg.norm(np.array(region.centre) - [0.2, 0, 0.4]) < 0.1
     assert 0.4 < region.radius < 1.3
     assert np.mean(region.contains(near)) > 0.9
-
-
-def test_best_similarity_is_recovered(rng: np.random.Generator) -> None:
-    points = rng.normal(size=(20, 3))
-    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    rotation *= np.linalg.det(rotation)
-    wanted = Similarity(2.5, rotation, np.array([1.0, 2, 3]))
-    found = best_similarity(points, wanted.apply(points))
-    assert found.scale == pytest.approx(2.5)
-    np.testing.assert_allclose(found.rotation, rotation, atol=1e-9)
-    np.testing.assert_allclose(found.translation, [1, 2, 3], atol=1e-9)

@@ -99,7 +99,6 @@ KEPT: dict[str, dict[str, Row]] = {
         "--size": refuses("--size", "6"),
         "--shapes": refuses("--shapes", "a"),
         "--distance": refuses("--distance", "3", "4"),
-        "--colmap": Shows(("--colmap", "{out}/colmap"), "colmap/**/cameras.txt"),
         "--samples": refuses("--samples", "2"),
         "--seed": refuses("--seed", "1"),
         "--max-depth": refuses("--max-depth", "3"),

@@ -64,23 +64,6 @@ def test_visual_hull_of_sphere_masks_is_the_sphere(rng: np.random.Generator) -> 
     assert np.all(facing[~seen] == 0.5) and np.mean(facing[seen] == 0) > 0.8
 
 
-def test_inner_points_of_sphere_are_uniform(rng: np.random.Generator) -> None:
-    """Uniform in the ball: (distance / radius)³ is uniform, whatever the unit; nothing outside the hull."""
-    centre = np.array([0.4, -0.3, 0.2])
-    views = sphere_views(40, 64, centre, 0.8, rng)
-    shape = hull.visual_hull(views, hull.camera_bounds(views), resolution=40)
-    points = shape.inner_points(4000, np.random.default_rng(1))
-    distance = np.linalg.norm(points - centre, axis=1)
-    assert points.shape == (4000, 3) and distance.max() < 0.8 + 2 * 2.5 / 40
-    volume = distance**3
-    assert kstest(volume / volume.max(), "uniform").statistic < 0.05
-    tiny = hull.Hull(shape.field, shape.origin * 1e-6, shape.voxel * 1e-6)
-    again = tiny.inner_points(4000, np.random.default_rng(1)) * 1e6
-    np.testing.assert_allclose(again, points, rtol=0, atol=1e-12)
-    # Every view sees every point, whatever its side: colours are the median of all views.
-    assert np.all(np.abs(hull.median_colours(points[distance < 0.7], views, BLACK) - 0.5) < 0.06)
-
-
 def test_inner_points_are_uniform_across_voxels(rng: np.random.Generator) -> None:
     """A field that falls by 1/2 over 4.3 voxels in the sum of |x|, |y|, |z| bounds an octahedron exactly."""
     radius, voxel = 4.3, np.array([0.1, 0.2, 0.3])

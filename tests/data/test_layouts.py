@@ -13,19 +13,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.data.array_pickle import read_arrays
 from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import linear_from_srgb, read_png, write_png
-from tests.helpers import refused
+from tests.helpers import read_loaded, refused
 from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import (
     SHOTS,
     change_transforms,
     ply_bytes,
     write_colmap,
-    write_copies,
     write_glossy,
     write_llff,
     write_nerfstudio,
@@ -101,9 +99,8 @@ def test_file_path_matches_any_ending(name: str, written: bool, tmp_path: Path) 
 
 @pytest.mark.parametrize("write", [write_nerfstudio, write_llff, write_colmap])
 def test_masks_become_alpha(write: Callable[[Path], Path], tmp_path: Path) -> None:
-    """Masks have the size of the largest images, so that smaller copies are not used; all images need one."""
+    """All images need one."""
     data = write(tmp_path)
-    write_copies(data, 2)
     (data / "masks").mkdir()
     mask = np.zeros((72, 96, 3))
     mask[36:] = 1
@@ -113,48 +110,42 @@ def test_masks_become_alpha(write: Callable[[Path], Path], tmp_path: Path) -> No
         change_transforms(data, lambda made: [f.update(mask_path="masks/b.png") for f in made["frames"]])
     view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
-    assert not view.image[:18].any() and view.image[18:].max() > 0.9  # not of the copies
+    assert not view.image[:18].any() and view.image[18:].max() > 0.9
     if write is write_nerfstudio:
         for path in (data / "images").glob("*.png"):
             write_exr(path.with_suffix(".exr"), read_png(path)[..., :3])
         linear = read_dataset(data, "train", downscale=2, images="exr").views[0].load()
         np.testing.assert_array_equal(linear.alpha, view.alpha)
     (data / "masks/b.png").unlink()
-    refused(lambda: read_dataset(data, "train"), "masks/b.png", "missing")
+    refused(lambda: read_loaded(data, "train"), "masks/b.png", "missing")
 
 
-@pytest.mark.parametrize("images", ["images", "images_4", "train"])
+@pytest.mark.parametrize("images", ["images_4", "train"])
 def test_masks_beside_transforms_become_alpha(images: str, tmp_path: Path) -> None:
     """By the path of the image, without its folder if that is one of `images`; `mask_path` comes first."""
     data = write_nerfstudio(tmp_path)
     (data / "images").rename(data / images)
-    change_transforms(
-        data,
-        lambda made: [f.update(file_path=f"{images}/{Path(f['file_path']).name}") for f in made["frames"]],
-    )
     masks = data / "masks" / ("train" if images == "train" else "")
     masks.mkdir(parents=True)
     for i, shot in enumerate(SHOTS):
-        mask = np.zeros((72, 96, 3))
-        mask[: 8 * i] = 1
-        write_png(masks / shot.name, mask)
+        write_png(masks / shot.name, np.repeat((np.indices((72, 96))[0] < 8 * i)[..., None], 3, axis=2))
 
-    def rows() -> dict[str, int]:
-        alphas = {view.name: view.load().alpha for view in read_dataset(data, "train").views}
-        return {
-            Path(name).name: int((alpha == 1).all(axis=1).sum())
-            for name, alpha in alphas.items()
-            if alpha is not None
-        }
+    def rename(made: dict[str, Any]) -> None:
+        for frame in made["frames"]:
+            frame["file_path"] = f"{images}/{Path(frame['file_path']).name}"
 
-    wanted = {Path(shot.name).stem: 8 * i for i, shot in enumerate(SHOTS)}
-    assert rows() == {name: wanted[name] for name in rows()}
+    def rows() -> list[int]:
+        alphas = [view.load().alpha for view in read_dataset(data, "train").views]
+        return [int((alpha == 1).all(axis=1).sum()) for alpha in alphas if alpha is not None]
+
+    change_transforms(data, rename)
+    assert rows() == [8 * i for i in range(1, 8)]
     named = str((masks / "c.png").relative_to(data))
     change_transforms(data, lambda made: [f.update(mask_path=named) for f in made["frames"]])
-    assert {*rows().values()} == {16}
+    assert rows() == [16] * 7
     change_transforms(data, lambda made: [f.pop("mask_path") for f in made["frames"]])
     (masks / "b.png").unlink()
-    refused(lambda: read_dataset(data, "train"), "b.png.png: mask: missing", "remove the folder")
+    refused(rows, "b.png.png: mask: missing", "remove the folder")
 
 
 # ---------------- Shiny Blender ----------------
@@ -223,9 +214,8 @@ def test_llff_cameras_project_points_onto_images(factor: int, tmp_path: Path) ->
     for view in train.views:
         shot = next(shot for shot in SHOTS if shot.name == view.name)
         check(view, replace(shot, focal=(107.0, 107.0), centre=(48.0, 36.0)))
-    write_copies(data, 2)
     view = read_dataset(data, "train", downscale=4).views[0].load()
-    assert view.width == 24 and view.fx == pytest.approx(107 / 4) and view.image.max() <= 0.5
+    assert view.width == 24 and view.fx == pytest.approx(107 / 4)
     assert fitting_downscale(data, "png", 2000) == (2, 96, 72)
 
 
@@ -233,7 +223,7 @@ def test_broken_llff_poses_are_refused(tmp_path: Path) -> None:
     data = write_llff(tmp_path)
     path = data / "poses_bounds.npy"
     good, whole = np.load(path), path.read_bytes()
-    for length in range(0, len(whole), 7):
+    for length in range(0, len(whole), 101):
         path.write_bytes(whole[:length])
         refused(partial(read_dataset, data, "train"), "poses_bounds.npy: NumPy")
     path.write_bytes(whole.replace(b"(9, 17)", b"(10000000000, 17)").replace(b" " * 10, b"", 1))
@@ -265,7 +255,7 @@ class Code:
 # ---------------- NeRO ----------------
 
 
-@pytest.mark.parametrize("protocol", range(5))
+@pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_glossy_synthetic_is_read(protocol: int, tmp_path: Path) -> None:
     data = write_glossy(tmp_path, protocol)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
@@ -283,79 +273,42 @@ def test_glossy_synthetic_is_read(protocol: int, tmp_path: Path) -> None:
         check(view, shot)
 
 
-class Global:
-    """Pickled, it names a function of another module."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (np.memmap, ("/etc/passwd",))
-
-
-def shared(depth: int = 60) -> bytes:
-    """Instructions that leave a tuple of 2^depth leaves, each level of which contains the next one twice."""
-    return b")" + b"2\x86" * depth
-
-
-def array_of(
-    shape: bytes = b"(K\x03t", code: bytes = b"X\x02\0\0\0f8", order: bytes = b"X\x01\0\0\0<"
-) -> bytes:
-    """A list of one array of three numbers, by instructions for its shape and for their type and order."""
-    made = b"cnumpy.core.multiarray\n_reconstruct\n)R"
-    dtype = b"cnumpy\ndtype\n" + code + b"\x85R(K\x03" + order + b"tb"
-    return b"\x80\x03]" + made + b"(K\x01" + shape + dtype + b"\x89" + b"C\x18" + bytes(24) + b"tba."
-
-
 def test_hostile_pickles_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "0-camera.pkl"
+    """Nothing in them is run, and a file without the arrays of a camera is refused."""
+    data, path, good = write_glossy(tmp_path), tmp_path / "1-camera.pkl", b""
+    good = path.read_bytes()
     array = np.eye(3)
-    good = pickle.dumps([array, array], 4)
-    path.write_bytes(good)
-    np.testing.assert_array_equal(read_arrays(path)[1], array)
-    path.write_bytes(array_of())
-    np.testing.assert_array_equal(read_arrays(path), [np.zeros(3)])
     hostile = {
-        "code of shared tuples": array_of(code=shared()),
-        "order of shared tuples": array_of(order=shared()),
-        "shape of shared tuples": array_of(shape=shared()),
-        "side of shared tuples": array_of(shape=b"(K\x03" + shared() + b"t"),
-        "name of shared tuples": b"\x80\x04" + shared() + b"2\x93.",
-        "sum of shared tuples": b"\x80\x04]" + shared() + b"a.",
         "code": pickle.dumps([Code(), array]),
-        "global": pickle.dumps([Global()]),
         "object array": pickle.dumps([np.array([Code()], dtype=object)]),
-        "structured": pickle.dumps([np.zeros(2, dtype=[("a", "f8")])]),
+        "big-endian": pickle.dumps([np.eye(4)[:3].astype(">f8"), array]),
         "huge memo": b"\x80\x04]r\xff\xff\xff\xff.",
         "huge bytes": b"\x80\x05\x96" + (2**40).to_bytes(8, "little") + b"a.",
-        "persistent": b"Pa\n.",
-        "extension": b"\x80\x04\x82\x01.",
-        "no list": pickle.dumps(3),
         "long": pickle.dumps([np.zeros(20_000)]),
-        "other size": good.replace((72).to_bytes(4, "little"), (9).to_bytes(4, "little")),
-        "state of a name": b"cnumpy\ndtype\n(lb.",
-        "a value called": b"\x80\x04]K\x01)R.",
+        "other shape": pickle.dumps([np.eye(4)[:, :3], array]),
         "empty": b"",
-    }
-    for name, data in hostile.items():
+    } | {f"cut at {i}": good[:i] for i in range(0, len(good) - 9, 40)}
+    for name, content in hostile.items():
         print(name)
-        path.write_bytes(data)
-        refused(partial(read_arrays, path), "0-camera.pkl: pickle: no list of arrays")
-    for length in range(len(good)):
-        path.write_bytes(good[:length])
-        refused(partial(read_arrays, path))
+        path.write_bytes(content)
+        refused(partial(read_dataset, data, "train"), "1-camera.pkl: pickle: ")
+    path.write_bytes(good[:-2] + pickle.dumps(Code())[2:])  # after the arrays; it would run if it were loaded
+    assert len(read_dataset(data, "train").views) == 7
+    (data / "0-depth.png").unlink()
+    refused(lambda: read_dataset(data, "test"), "0-depth.png: file: missing")
 
 
-def test_pickle_cannot_change_numpy(tmp_path: Path) -> None:
-    """Whatever it does to NumPy's names stays in records of its own."""
-    path = tmp_path / "0-camera.pkl"
-    path.write_bytes(b"cnumpy\nndarray\n}(Vshape\nI1\nsb.")  # sets attributes of a class
-    shape = np.ndarray.shape
-    refused(lambda: read_arrays(path))
-    assert np.ndarray.shape is shape
+def test_transposed_pose_is_read_by_columns(tmp_path: Path) -> None:
+    data = write_glossy(tmp_path)
+    pose, matrix = pickle.loads((data / "1-camera.pkl").read_bytes())
+    before = read_dataset(data, "train").views[0].to_world
+    (data / "1-camera.pkl").write_bytes(pickle.dumps([np.asfortranarray(pose), matrix]))
+    np.testing.assert_array_equal(read_dataset(data, "train").views[0].to_world, before)
 
 
 @pytest.mark.parametrize(
     ("pose", "matrix", "said"),
     [
-        (np.zeros((4, 4)), np.eye(3), "not a pose of 3 × 4"),
         (np.ones((3, 4)), np.eye(3), "not a rotation"),
         (np.full((3, 4), np.nan), np.eye(3), "not a rotation"),
         (np.eye(4)[:3], np.zeros((3, 3)), "K: no matrix"),
@@ -367,8 +320,6 @@ def test_cameras_that_make_no_sense(pose: Any, matrix: Any, said: str, tmp_path:
     data = write_glossy(tmp_path)
     (data / "1-camera.pkl").write_bytes(pickle.dumps([pose, matrix]))
     refused(lambda: read_dataset(data, "train"), "1-camera.pkl:", said)
-    (data / "0-depth.png").unlink()
-    refused(lambda: read_dataset(data, "test"), "0-depth.png: file: missing")
 
 
 def test_glossy_without_training_views_is_refused(tmp_path: Path) -> None:

@@ -93,16 +93,6 @@ def test_undistorted_points_are_those_of_a_pinhole(tmp_path: Path, name: str) ->
         assert 1.02 < view.fx / PINHOLE["fl_x"] < 1.2
 
 
-def test_undistorted_image_has_no_empty_pixel(tmp_path: Path) -> None:
-    """At the smallest zoom the image of one edge touches the image's, and none leaves it."""
-    view = read_dataset(dataset(tmp_path, LENSES["pincushion"]), "train", images="exr").views[0].load()
-    x = (np.array([0.5, WIDTH - 0.5]) - view.cx) / view.fx
-    y = (np.array([0.5, HEIGHT - 0.5]) - view.cy) / view.fy
-    corners = np.array([seen_by(LENSES["pincushion"], a, b) for a in x for b in y])
-    gaps = np.concatenate([(corners - 0.5).ravel(), (np.array([WIDTH, HEIGHT]) - 0.5 - corners).ravel()])
-    assert -0.01 < gaps.min() < 0.01
-
-
 def test_alpha_and_maps_are_undistorted_like_the_image(tmp_path: Path) -> None:
     data = read_dataset(dataset(tmp_path, LENSES["barrel"], alpha=True), "train", images="exr")
     view = data.views[0].load()
@@ -113,17 +103,6 @@ def test_alpha_and_maps_are_undistorted_like_the_image(tmp_path: Path) -> None:
         if 5 < u < WIDTH - 5 and 5 < v < HEIGHT - 5:
             assert view.depth[v, u] == pytest.approx(3)
     assert set(np.unique(view.depth.round(5))) == {0, 3}
-
-
-def test_downscaled_undistortion_has_the_same_camera(tmp_path: Path) -> None:
-    folder = dataset(tmp_path, LENSES["pincushion"])
-    full = read_dataset(folder, "train", images="exr").views[0].load()
-    half = read_dataset(folder, "train", images="exr", downscale=2).views[0].load()
-    doubled = [2 * half.fx, 2 * half.cx, 2 * half.cy]
-    np.testing.assert_allclose(doubled, [full.fx, full.cx, full.cy], rtol=3e-3)
-    for x, y in DOTS[5:9]:
-        u, v = half.fx * x + half.cx, half.fy * y + half.cy
-        assert math.dist(centroid(half.image[..., 0], u, v), (u, v)) < 0.1
 
 
 def test_zero_distortion_changes_no_pixel(tmp_path: Path) -> None:
@@ -140,15 +119,11 @@ def test_zero_distortion_changes_no_pixel(tmp_path: Path) -> None:
     ("lens", "words"),
     [
         ({"camera_model": "EQUIRECTANGULAR"}, ["camera_model", "undistort"]),
-        ({"camera_model": ["OPENCV"]}, ["camera_model"]),
         ({"is_fisheye": "yes"}, ["camera_model"]),
         ({"ftheta_p0": 0.1}, ["ftheta_p0"]),
         ({"k1": 0.1, "k6": 0.1}, ["k6"]),
         ({"k4": 0.1}, ["k4", "perspective"]),
         ({"is_fisheye": True, "p1": 0.1}, ["p1", "fisheye"]),
-        ({"k1": "wide"}, ["k1", "'wide'"]),
-        ({"k1": math.nan}, ["k1", "nan"]),
-        ({"k1": 10**400}, ["k1"]),
         ({"k1": -5.0}, ["frames[0]", "folds"]),
         ({"k1": 1e9}, ["frames[0]", "half-way"]),
     ],

@@ -25,9 +25,8 @@ from mi_refgs.data.dataset import (
 )
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
-from mi_refgs.io.images import box_downscale, image_size, read_png, write_png
+from mi_refgs.io.images import box_downscale, read_png, write_png
 from mi_refgs.surfels.ply import read_ply
-from tests.helpers import refused, run_python
 from tests.scenes.tiny import RADIUS, train_command, write_data, write_method
 
 
@@ -39,9 +38,6 @@ class TableReader:
 
     def recognises(self, folder: Path) -> bool:
         return (folder / "cameras.txt").is_file()
-
-    def size(self, folder: Path, images: str) -> tuple[int, int]:
-        return image_size(folder / self._lines(folder, "train")[0][0])
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         views = [self._view(folder, line, options.downscale) for line in self._lines(folder, split)]
@@ -88,6 +84,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_registered_layout_is_recognised_and_read(folder: Path, reader: None) -> None:
     train, test = read_dataset(folder, "train"), read_dataset(folder, "test", downscale=2)
+    assert next(iter(READERS)) == TableReader.name
     assert (len(train.views), len(test.views)) == (9, 2) and test.views[0].width == train.views[0].width // 2
     assert train.points is not None and train.points.position.shape == (300, 3)
     assert fitting_downscale(folder, "png", 100) == (2, 20, 20)
@@ -99,19 +96,3 @@ def test_fit_starts_from_points_of_the_reader(folder: Path, tmp_path: Path, read
     position = read_ply(run / "surfels.ply").to_numpy()["position"]
     assert np.abs(np.linalg.norm(position, axis=1) - RADIUS).mean() < 0.1 * RADIUS
     assert main(["eval", str(run)]) == 0
-
-
-def test_unrecognised_folder_is_refused(folder: Path) -> None:
-    words = ("table: data set: no layout is recognised", "transforms_train.json")
-    refused(lambda: read_dataset(folder, "train"), *words)
-
-
-def test_registered_reader_comes_first(tmp_path: Path) -> None:
-    """Also where it is registered before any data set was read."""
-    code = (
-        "import mi_refgs\nclass Own:\n    name = looks_for = 'own'\n"
-        "    def recognises(self, folder): return True\n"
-        "own = Own()\nmi_refgs.register_reader(own)\nfrom mi_refgs.data.dataset import READERS\n"
-        "assert next(iter(READERS.values())) is own and len(READERS) > 1"
-    )
-    run_python(code, folder=tmp_path)

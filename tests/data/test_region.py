@@ -78,13 +78,8 @@ def test_contraction_is_identity_inside_and_bounded_by_two() -> None:
     np.testing.assert_allclose(region.contract(inside), (inside - [1, 2, 3]) / 0.5)
     # Twice the radius away: 2 − 1/2.
     np.testing.assert_allclose(region.contract(np.array([[2.0, 2.0, 3.0]])), [[1.5, 0, 0]])
-    far = region.contract(np.array([[1e6, 2.0, 3.0]]))
-    assert 1.999 < np.linalg.norm(far) < 2
-
-
-def test_expansion_inverts_contraction() -> None:
-    region = Region((-1.0, 0.5, 2.0), 3.0)
     points = np.random.default_rng(0).normal(size=(200, 3)) * 20
+    assert np.linalg.norm(region.contract(points), axis=1).max() < 2
     np.testing.assert_allclose(region.expand(region.contract(points)), points, rtol=1e-9, atol=1e-9)
 
 

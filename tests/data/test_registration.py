@@ -60,6 +60,15 @@ def test_disturbed_pose_is_found(half: bool, rng: np.random.Generator) -> None:
     assert degrees < 0.02 and moved < 5e-4
 
 
+def test_pixels_that_do_not_count_count_at_no_size(rng: np.random.Generator) -> None:
+    """Also where the smallest averaged image has blocks larger than the squares of a chequered mask."""
+    view, _ = disturbed(rng)
+    where = np.indices((SIZE, SIZE)).sum(axis=0) % 2 == 0
+    other = replace(view, pixels=Pixels(np.where(where[..., None], view.image, 0.5).astype(np.float32)))
+    first, second = (registered(one, render, DISTANCE, where).to_world for one in (view, other))
+    np.testing.assert_array_equal(first, second)
+
+
 def test_pose_stays_where_no_other_is_better() -> None:
     """At the pose of the image, and for renders that do not depend on it."""
     pose = look_at(DISTANCE * np.array([0.6, 0.7, 0.4]), np.zeros(3))

@@ -12,7 +12,6 @@ from mi_refgs.data import stereo as sweep
 from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.region import Region
 from mi_refgs.data.stereo import Stereo, stereo
-from mi_refgs.data.view import View
 from mi_refgs.fitting.initial import open_points
 from mi_refgs.fitting.runner import begin
 from mi_refgs.methods import load
@@ -81,6 +80,7 @@ def test_some_points_are_spaced_evenly(found: Stereo) -> None:
     assert np.median(off) < 0.02 and np.quantile(off, 0.95) < 0.08
 
 
+@pytest.mark.slow
 def test_exposure_changes_no_point(data: Dataset, points: PointCloud) -> None:
     """Every other image at two thirds of its brightness and contrast."""
     darker = tuple(
@@ -91,23 +91,6 @@ def test_exposure_changes_no_point(data: Dataset, points: PointCloud) -> None:
     assert found is not None
     assert len(found.points.position) == pytest.approx(len(points.position), rel=0.1)
     assert np.median(off_surface(found.points.position)) < 0.02
-
-
-def test_points_follow_the_frame(data: Dataset, points: PointCloud) -> None:
-    """A scene a thousand times as large and elsewhere has the same points there."""
-    scale, offset = 1000.0, np.array([300.0, -50, 20])
-
-    def moved(view: View) -> View:
-        pose = view.to_world.copy()
-        pose[:3, 3] = scale * pose[:3, 3] + offset
-        return replace(view, to_world=pose)
-
-    centre = scale * np.array(REGION.centre) + offset
-    region = Region(tuple(map(float, centre)), scale * REGION.radius)  # type: ignore[arg-type]
-    found = stereo([moved(view) for view in data.views], region)
-    assert found is not None
-    assert len(found.points.position) == pytest.approx(len(points.position), rel=0.01)
-    assert np.median(off_surface((found.points.position - offset) / scale)) < 0.02
 
 
 def test_correlation_is_that_of_the_patches() -> None:
@@ -125,7 +108,7 @@ def test_correlation_is_that_of_the_patches() -> None:
 
 
 def test_images_without_texture_have_no_points(data: Dataset) -> None:
-    flat = [with_pixels(view, image=np.full_like(view.image, 0.4)) for view in data.views]
+    flat = [with_pixels(view, image=np.full_like(view.image, 0.4)) for view in data.views[:3]]
     assert stereo(flat, REGION) is None
     assert stereo(data.views[:2], REGION) is None
 

@@ -53,9 +53,7 @@ def colmap(folder: Path, camera: str, values: tuple[float, ...]) -> Path:
 
 
 def llff(folder: Path, masks: bool = False) -> Path:
-    """LLFF with smaller copies of another ending."""
     data = layouts.write_llff(folder)
-    layouts.write_copies(data, 2, ".jpg")
     if masks:
         shutil.copytree(data / "images", data / "masks")
     return data
@@ -76,7 +74,7 @@ LAYOUTS: dict[str, dict[str, Callable[[Path], Path]]] = {
         "full": lambda folder: colmap(folder, "FULL_OPENCV", (*PINHOLE, 0.05, -0.02, 1e-3, 0, 0.01, 0, 0, 0)),
         "fisheye": lambda folder: colmap(folder, "OPENCV_FISHEYE", (*PINHOLE, 0.05, -0.02, 0, 0)),
     },
-    "LLFF": {"copies": llff, "masks": lambda folder: llff(folder, True)},
+    "LLFF": {"plain": llff, "masks": lambda folder: llff(folder, True)},
     "NeRO Glossy Synthetic": {"depths": layouts.write_glossy},
 }
 """Ways to write a data set, by the name of the reader; a new reader adds its own."""

@@ -15,7 +15,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from benchmarks.common.colmap_files import ColmapCamera, ColmapImage, Model, colmap_binary, colmap_text
-from mi_refgs.io.images import box_downscale, read_png, write_png
 from tests.scenes.dots import COLOURS, POINTS, Shot
 
 SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
@@ -91,14 +90,6 @@ def change_transforms(data: Path, change: Callable[[dict[str, Any]], object], sp
         content = json.loads(path.read_text())
         change(content)
         path.write_text(json.dumps(content))
-
-
-def write_copies(data: Path, factor: int, ending: str = ".png") -> None:
-    """Smaller copies of the images, half as bright, so that an image tells its file."""
-    (data / f"images_{factor}").mkdir()
-    for path in sorted((data / "images").iterdir()):
-        small = 0.5 * box_downscale(read_png(path), factor)
-        write_png(data / f"images_{factor}" / path.with_suffix(ending).name, small)
 
 
 def ply_bytes(columns: dict[str, np.ndarray], kind: str = "binary_little_endian") -> bytes:

@@ -192,10 +192,6 @@ def test_downscaled_maps_are_means_of_defined_pixels(made: Path) -> None:
         np.testing.assert_allclose(half.materials[name], np.concatenate([mean, share], -1), atol=1e-6)
 
 
-def test_materials_are_not_read_without_truth(made: Path) -> None:
-    assert read_loaded(made, "train", truth=False).views[0].materials == {}
-
-
 def test_map_of_other_size_is_refused(made: Path, tmp_path: Path) -> None:
     shutil.copytree(made, tmp_path / "data")
     path = tmp_path / "data" / "test" / "r_000_albedo.exr"

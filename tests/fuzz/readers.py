@@ -1,0 +1,195 @@
+"""The readers of the package, each with a folder of files that it accepts and a call that reads them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import trimesh
+from PIL import Image
+
+from mi_refgs import methods
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import read_exr_image
+from mi_refgs.io.images import read_png, read_tiff
+from mi_refgs.io.resources import resource_dir
+from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
+from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import views_of_run
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.surfels.attributes import ATTRIBUTES
+from mi_refgs.surfels.ply import read_ply, write_ply
+from mi_refgs.surfels.table import Surfels
+from tests.helpers import read_loaded
+from tests.scenes import layouts
+from tests.scenes.dots import COLOURS, POINTS
+from tests.scenes.tiny import write_data
+
+RGBA = np.random.default_rng(0).random((9, 11, 4))
+
+
+class Reader(NamedTuple):
+    """One way into the package."""
+
+    make: Callable[[Path], object]  # writes files that are accepted into a folder
+    mutated: str  # pattern of the files that are mutated
+    read: Callable[[Path], Iterable[Any]]  # reads a file; returns the arrays that must be finite
+
+
+def _data_set(path: Path) -> list[Any]:
+    """The data set in whose folder a file is."""
+    places = [path.parent, *path.parents[:3]]
+    folder = next(p for p in places if (p / "images").is_dir() or p.joinpath("0.png").is_file())
+    data = read_loaded(folder, "train")
+    cameras = [np.array([view.fx, view.fy, view.cx, view.cy]) for view in data.views]
+    maps = [x for v in data.views for x in (v.image, v.alpha, v.depth, v.to_world) if x is not None]
+    return [*cameras, *maps, *([] if data.points is None else [data.points.position])]
+
+
+def _nerfstudio(folder: Path) -> None:
+    columns = dict(zip("xyz", POINTS.T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), COLOURS.T.astype(np.uint8), strict=True))
+    (folder / "points.ply").write_bytes(layouts.ply_bytes(columns))
+    lens = {"k1": 0.03, "k2": -0.01, "p1": 1e-3, "p2": -1e-3}
+    names = {"train_filenames": ["images/b.png"], "test_filenames": ["images/a.png"]}
+    layouts.write_nerfstudio(folder, layouts.SHOTS[:3], ply_file_path="points.ply", **lens, **names)
+
+
+def _surfels(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    table = {name: rng.normal(size=(7, channel.width(1))) for name, channel in ATTRIBUTES.items()}
+    write_ply(folder / "a.ply", Surfels.from_numpy(table))
+    columns = "x y z opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3 metallic".split()
+    for kind in ("ascii", "binary_big_endian"):
+        content = layouts.ply_bytes({name: rng.normal(size=3) for name in columns}, kind)
+        (folder / f"{kind}.ply").write_bytes(content)
+
+
+def _meshes(folder: Path) -> None:
+    ball = trimesh.creation.icosphere(1)
+    mesh = Mesh(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32), 0.1)
+    write_mesh(folder / "a.ply", mesh)
+    (folder / "b.ply").write_bytes(ball.export(file_type="ply", encoding="ascii"))
+    for ending in ("obj", "stl", "off"):
+        ball.export(folder / f"a.{ending}")
+
+
+def _read_mesh(path: Path) -> list[Any]:
+    """Rays through the mesh as well: Embree reads what a wrong index names."""
+    mesh = read_mesh(path)
+    points = np.random.default_rng(0).normal(size=(3, 64)).astype(np.float32)
+    Occluder(mesh).visible(mi.Point3f(points), mi.Vector3f(-points)).numpy()
+    return [mesh.vertices, mesh.voxel]
+
+
+def _exr_files(folder: Path) -> None:
+    for kind in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "DWAA"):
+        header = {"compression": getattr(OpenEXR, f"{kind}_COMPRESSION"), "type": OpenEXR.scanlineimage}
+        planes = {name: RGBA[..., i].astype(np.float16) for i, name in enumerate("RGBA")}
+        OpenEXR.File(header, planes).write(str(folder / f"{kind}.exr"))
+    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    OpenEXR.File(tiles, {"Y": RGBA[..., 0].astype(np.float32)}).write(str(folder / "tiled.exr"))
+
+
+def _images(folder: Path) -> None:
+    image = Image.fromarray((255 * RGBA).astype(np.uint8))
+    for mode in ("RGBA", "RGB", "L", "LA", "P", "1"):
+        image.convert(mode).save(folder / f"{mode}.png")
+    image.convert("P").save(folder / "b.png", transparency=3)
+    for mode in ("RGB", "L", "CMYK"):
+        image.convert(mode).save(folder / f"{mode}.jpg", progressive=mode == "L")
+
+
+def _tiffs(folder: Path) -> None:
+    for dtype in (np.float32, np.uint16):
+        for kind in ("raw", "tiff_lzw", "tiff_adobe_deflate"):
+            name = folder / f"{kind}_{np.dtype(dtype).name}.tiff"
+            Image.fromarray(np.ones((6, 8), dtype)).save(name, compression=kind)
+
+
+def _lights(folder: Path) -> None:
+    bitmap = mi.Bitmap(np.random.default_rng(0).random((8, 16, 3)).astype(np.float32))
+    for ending in ("hdr", "exr"):
+        bitmap.write(str(folder / f"a.{ending}"))
+
+
+def _methods(folder: Path) -> None:
+    for path in sorted(resource_dir("variants").glob("*.toml")):
+        (folder / path.name).write_bytes(path.read_bytes())
+
+
+def _read_method(path: Path) -> list[Any]:
+    method = methods.load(str(path), "quick", ["loss.ssim=0.3"])
+    assert methods.dump(method)
+    method.stage_at(1)
+    return []
+
+
+def _run(folder: Path) -> None:
+    _surfels(folder)
+    (folder / "a.ply").rename(folder / "surfels.ply")
+    shading = {"at": "pixel", "reflectance": "radiance", "diffuse": "sh", "occlusion": False}
+    content = {"iteration": 3, "seconds": 1.5, "surfels": 7, "shading": shading}
+    (folder / "model.json").write_text(json.dumps(content))
+    (folder / "dataset.json").write_text(json.dumps({"path": str(write_data(folder / "data"))}))
+
+
+def _scenes(folder: Path) -> None:
+    _surfels(folder)
+    strings = {"filename": "a.ply", "shade_at": "pixel", "aovs": "n:normal,d:depth", "terms": "diffuse"}
+    strings |= {"reflectance": "split_sum", "diffuse": "sh"}
+    inner = "".join(f'<string name="{name}" value="{value}"/>' for name, value in strings.items())
+    inner += '<boolean name="dominant" value="true"/><rgb name="background" value="1, 0.5, 0"/>'
+    scene = f'<scene version="3.0.0"><integrator type="refgs">{inner}</integrator></scene>'
+    (folder / "a.xml").write_text(scene)
+
+
+def _read_scene(path: Path) -> list[Any]:
+    """Mitsuba wraps what a plugin raises in a RuntimeError with the traceback's text."""
+    try:
+        mi.load_file(str(path))
+    except RuntimeError as error:
+        if "Traceback" in str(error) and "InputError: " not in str(error):
+            raise
+        raise InputError(str(error), path) from error
+    except UnicodeDecodeError as error:  # Mitsuba's sentence quotes bytes of the file
+        raise InputError("no UTF-8", path) from error
+    return []
+
+
+def _colmap(kind: str) -> Callable[[Path], object]:
+    values = (*layouts.VALUES, 0.03, -0.01, 1e-3, -1e-3)
+    return lambda folder: layouts.write_colmap(
+        folder, kind, layouts.SHOTS[:3], camera="OPENCV", values=values
+    )
+
+
+READERS = {
+    "ply": Reader(_surfels, "*.ply", lambda path: read_ply(path).to_numpy().values()),
+    "mesh": Reader(_meshes, "*.*", _read_mesh),
+    "transforms": Reader(_nerfstudio, "transforms.json", _data_set),
+    "points": Reader(_nerfstudio, "points.ply", _data_set),
+    "colmap-binary": Reader(_colmap("bin"), "sparse/0/*", _data_set),
+    "colmap-text": Reader(_colmap("txt"), "sparse/0/*", _data_set),
+    "glossy": Reader(layouts.write_glossy, "1-camera.pkl", _data_set),
+    "llff": Reader(layouts.write_llff, "*.npy", _data_set),
+    "exr": Reader(_exr_files, "*.exr", lambda path: [read_exr_image(path)]),
+    "image": Reader(_images, "*.*", lambda path: [read_png(path)]),
+    "disparity": Reader(_tiffs, "*.tiff", lambda path: [read_tiff(path)]),
+    "light": Reader(_lights, "*.*", lambda path: [EnvironmentLight.from_file(path).radiance().numpy()]),
+    "method": Reader(_methods, "*.toml", _read_method),
+    "model": Reader(_run, "model.json", lambda path: [TrainedScene.read(path.parent).seconds]),
+    "run-data": Reader(
+        _run,
+        "dataset.json",
+        lambda path: views_of_run(Run(path.parent), methods.load("ref_gaussian"), "train").views and [],
+    ),
+    "scene": Reader(_scenes, "*.xml", _read_scene),
+}
