@@ -55,8 +55,8 @@ class Compare:
     set: Settings = ()
     workers: Annotated[int | None, optional("N", "(default: 1)")] = None
     """simultaneous jobs, which share the cores"""
-    cluster: Annotated[str | None, optional("local|ADDRESS")] = None
-    """run the jobs by dask.distributed, here or on a scheduler whose workers must see the same folders"""
+    cluster: Annotated[str | None, optional("ADDRESS")] = None
+    """run the jobs by dask.distributed, on a scheduler whose workers must see the same folders"""
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -74,8 +74,7 @@ class Compare:
                 if self.cluster is None:
                     execute.execute_all(wanted, workers, report)
                 else:
-                    address = None if self.cluster == "local" else self.cluster
-                    execute.run_on_cluster(wanted, address, workers, report)
+                    execute.run_on_cluster(wanted, self.cluster, report)
             except KeyboardInterrupt as error:
                 raise type(error)(f"interrupted; the same command continues, from {self.output}") from None
         else:

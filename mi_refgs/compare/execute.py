@@ -8,10 +8,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
 
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.compare.worker import DONE, FAILURE, GRACE
@@ -117,7 +116,7 @@ def threads_each(workers: int, threads: int | None) -> int | None:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not 1 <= workers <= 4 * cores:
-        raise InputError(f"--workers: {workers} is out of range; give 1 to {4 * cores}")
+        raise InputError(f"{workers} is out of range", "--workers", remedy=f"give 1 to {4 * cores}")
     if threads is not None or workers == 1:
         return threads
     return max(cores // workers, 1)
@@ -126,8 +125,8 @@ def threads_each(workers: int, threads: int | None) -> int | None:
 # ---------- dask.distributed ----------
 
 
-def run_on_cluster(jobs: Sequence[Job], address: str | None, workers: int, report: Report) -> None:
-    """Run jobs on the scheduler at `address`, or, if None, on `workers` processes of this machine.
+def run_on_cluster(jobs: Sequence[Job], address: str, report: Report) -> None:
+    """Run jobs on the scheduler at `address`.
 
     Workers must see the data sets and the comparison's folder under the same paths. A job whose worker died
     is restarted from its checkpoint on another one, at most RETRIES times.
@@ -136,52 +135,34 @@ def run_on_cluster(jobs: Sequence[Job], address: str | None, workers: int, repor
     TerminatedError after a signal, when the jobs are cancelled.
     """
     try:
+        import dask
         import distributed
     except ImportError as error:
-        raise InputError(
-            "--cluster: dask.distributed is not installed; pip install 'mi_refgs[cluster]'"
-        ) from error
-    with held_interrupts() as release, _client(distributed, address, workers) as client:
-        pending = {client.submit(execute, job, key=job.folder, pure=False): job for job in jobs}
-        try:
-            while pending:
-                with contextlib.suppress(TimeoutError):
-                    distributed.wait(list(pending), timeout=POLL, return_when="FIRST_COMPLETED")
-                for future in [future for future in pending if future.done()]:
-                    job = pending.pop(future)
-                    report(job, _reason(job, future))
-                release()
-        finally:
-            client.cancel(list(pending))  # what a scheduler of its own has not begun would outlive us
-
-
-@contextlib.contextmanager
-def _client(distributed: Any, address: str | None, workers: int) -> Iterator[Any]:
-    """Yield a client of the scheduler, or of a local cluster that ends with it."""
-    import dask
-
+        remedy = "pip install 'mi_refgs[cluster]'"
+        raise InputError("dask.distributed is not installed", "--cluster", remedy=remedy) from error
     limits = {"distributed.scheduler.allowed-failures": RETRIES, "distributed.comm.timeouts.connect": CONNECT}
-    with dask.config.set(limits), contextlib.ExitStack() as stack:
-        if address is None:
-            cluster = distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
-            )
-            address = stack.enter_context(cluster)
+    with dask.config.set(limits), held_interrupts() as release:
         try:
             client = distributed.Client(address)
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(
-                f"--cluster: {address}: no scheduler answers there ({error}); start one"
-            ) from error
-        yield stack.enter_context(client)
+            what = f"no scheduler answers there ({error})"
+            raise InputError(what, "--cluster", address, "start one") from error
+        with client:
+            pending = {client.submit(execute, job, key=job.folder, pure=False): job for job in jobs}
+            try:
+                while pending:
+                    with contextlib.suppress(TimeoutError):
+                        distributed.wait(list(pending), timeout=POLL, return_when="FIRST_COMPLETED")
+                    for future in [future for future in pending if future.done()]:
+                        job, failure = pending.pop(future), future.exception()
+                        report(job, future.result() if failure is None else _given_up(job, failure))
+                    release()
+            finally:
+                client.cancel(list(pending))  # what the scheduler has not begun would outlive us
 
 
-def _reason(job: Job, future: Any) -> str | None:
-    """Return None if a job is done, else the reason, which is also written into its run folder."""
-    error = future.exception()
-    if error is None:
-        reason: str | None = future.result()
-        return reason
+def _given_up(job: Job, error: BaseException) -> str:
+    """Write why the cluster gave a job up into its run folder, and return it."""
     reason = f"the cluster gave it up: {type(error).__name__}: {str(error).splitlines()[0]}"
     job.run.write_json(FAILED, {"reason": reason})
     return reason

@@ -10,21 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.formats.baking import bake
 from mi_refgs.formats.format import Shot
 from mi_refgs.formats.gaussians import gaussians
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import linear_from_srgb, srgb_from_linear, to_8_bits
-from mi_refgs.progress import warn
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import SH_DC, sigmoid
 
 Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))  # glTF's world from ours
 Y_UP_QUATERNION = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 """The same as a quaternion (x, y, z, w): the turn by -90° about x that takes +z to +y."""
-CENTRED = 0.5  # pixels by which a principal point may be off the centre of the image without a warning
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, POINTS, VERTICES = 5126, 0, 34962
 """glTF's numbers of a component type, of a mode, and of a buffer's use."""
@@ -36,10 +32,10 @@ FLOAT, POINTS, VERTICES = 5126, 0, 34962
 def write_mesh(
     trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int
 ) -> list[Path]:
-    """glTF 2.0 in one file: a mesh with metallic-roughness textures, and the camera of the first view.
+    """glTF 2.0 in one file: a mesh with metallic-roughness textures.
 
     glTF is in metres with +y up, our world has +z up: (x, y, z) becomes (x, z, −y). It has no environment
-    light, and no principal point of a camera.
+    light.
     """
     import trimesh
     from PIL import Image
@@ -62,28 +58,9 @@ def write_mesh(
     mesh = trimesh.Trimesh(vertices, made.faces, vertex_normals=normals, visual=visual, process=False)
     scene = trimesh.Scene()
     scene.add_geometry(mesh, node_name="object", geom_name="object")
-    data: Any = trimesh.exchange.gltf.export_glb(
-        scene, include_normals=True, tree_postprocessor=lambda tree: _add_camera(tree, shots[0].camera)
-    )
+    data = trimesh.exchange.gltf.export_glb(scene, include_normals=True)
     write_bytes(target, data)
     return [target]
-
-
-def _add_camera(tree: dict[str, Any], camera: Camera) -> None:
-    """Add a camera as a node; glTF's looks along its −z, ours along +z with +x to the left."""
-    right, down = float(camera.cx[0]) - camera.width / 2, float(camera.cy[0]) - camera.height / 2
-    if max(abs(right), abs(down)) > CENTRED:
-        warn(
-            f"gltf-mesh: the camera's principal point is {right:.1f} pixels to the right of the centre and "
-            f"{down:.1f} below; a glTF camera has it at the centre, so its image is shifted by as much"
-        )
-    width, height = camera.width / abs(float(camera.fx[0])), camera.height / abs(float(camera.fy[0]))
-    lens = {"aspectRatio": width / height, "yfov": 2 * float(np.arctan(height / 2)), "znear": 1e-3}
-    tree["cameras"] = [{"type": "perspective", "perspective": lens}]
-    pose = np.eye(4)
-    pose[:3] = np.array(Y_UP) @ camera.pose()[:3] @ MITSUBA_FROM_OPENGL
-    tree["nodes"].append({"name": "camera", "camera": 0, "matrix": pose.T.ravel().tolist()})
-    tree["scenes"][0]["nodes"].append(len(tree["nodes"]) - 1)
 
 
 # ---------------- Gaussians ----------------

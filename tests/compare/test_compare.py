@@ -23,8 +23,6 @@ from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs, page
 from mi_refgs.compare.jobs import Job, Shared
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import write_exr
-from mi_refgs.io.images import read_png
 from mi_refgs.runs.run import Run
 from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS, write_data, write_method
@@ -227,7 +225,7 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Pat
     ) as cluster:
         killer = threading.Thread(target=kill, args=[cluster.scheduler_address])
         killer.start()
-        run_on_cluster([job], cluster.scheduler_address, 1, lambda *said: reports.append(said))
+        run_on_cluster([job], cluster.scheduler_address, lambda *said: reports.append(said))
         killer.join()
     assert killed and reports == [(job, None)] and jobs.finished(job)
     logged = [
@@ -264,21 +262,6 @@ def test_bad_input_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_plan_reads_images_as_methods_do(ball: Path, variants: tuple[Path, Path], tmp_path: Path) -> None:
-    data = shutil.copytree(ball, tmp_path / "ball")
-    for picture in data.glob("*/r_*.png"):
-        write_exr(picture.with_suffix(".exr"), read_png(picture))
-        picture.unlink()
-
-    def plan(*settings: str) -> list[Job]:
-        options = Shared("quick", (*SIX, *settings), threads=1)
-        return jobs.plan(tmp_path / "out", [data], [str(variants[0])], [0], options)
-
-    assert len(plan("data.images='exr'")) == 1
-    with pytest.raises(InputError, match="png"):
-        plan()
-
-
 def test_different_image_sizes_are_refused(
     compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -302,13 +285,6 @@ def test_other_settings_are_refused_by_the_run_itself(
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
     (folder / "compare.json").unlink()
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
-
-
-def test_a_run_on_few_views_is_the_same_again(ball: Path, tmp_path: Path) -> None:
-    """Nothing was tried on them, so the run has no selection."""
-    job = Job(str(tmp_path / "run"), str(ball), "auto", 0, "30:20", (), "llvm_ad_rgb", None)
-    job.run.create(dataclasses.replace(job.method(), select=None), str(ball))
-    jobs.require_same(job)
 
 
 # ---------- The page ----------

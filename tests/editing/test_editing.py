@@ -21,6 +21,7 @@ from mi_refgs.reference.camera import look_at
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import SH_DC, logit
@@ -160,8 +161,10 @@ def test_a_new_colour_scales_all_sh_degrees(scene: TrainedScene) -> None:
 @pytest.mark.parametrize("change", [{"materials": True}, {"set": {"roughness": 0.3}}])
 def test_the_background_stays(change: Any) -> None:
     """Pixels that show only the background are those of before."""
-    scene = with_background(balls(), 0.3)
+    near = NearField(np.zeros(3), np.full((8, 16), 0.2, np.float32))
+    scene = replace(with_background(balls(), 0.3), near=near)
     edited = edit(scene, **change).scene
+    assert edited.near is near
     before, after = image(scene), image(edited)
     alone = [image(replace(x, surroundings=None))[:, 3] for x in (scene, edited)]
     away = alone[0] + alone[1] == 0

@@ -99,14 +99,6 @@ def test_cameras_are_all_around_and_test_views_are_others(imported: Path) -> Non
     )  # scene.xml has this camera: neither from below nor above
 
 
-@pytest.mark.parametrize("stray", [{"x": 500.0}, {"z": -500.0, "opacity": -3.0}])
-def test_strays_do_not_decide_where_cameras_are(stray: dict[str, float], ball: Path, tmp_path: Path) -> None:
-    other = mi_refgs.import_splats(write_ball(tmp_path / "other.ply", **stray))
-    pairs = [shots_around(file.trained.surfels, VIEWS) for file in (mi_refgs.import_splats(ball), other)]
-    for first, second in zip(*pairs, strict=True):
-        np.testing.assert_allclose(second.camera.pose(), first.camera.pose(), atol=0.05)
-
-
 @pytest.mark.parametrize(("preset", "side"), [("quick", 256), ("paper", 800), ("6:9", 400)])
 def test_preset_chooses_the_size_of_the_views(
     preset: str, side: int, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -211,31 +203,6 @@ def test_interrupted_import_resumes(
     again = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET, "--resume"]
     assert main([*again, "--threads", "1"]) == 0
     assert (run / "surfels.ply").read_bytes() == (tmp_path / "straight" / "surfels.ply").read_bytes()
-
-
-def test_interrupted_views_are_rendered_again(
-    ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same command works, with another preset too; another file finds files that are not its own."""
-    run, write = tmp_path / "run", relightable_import.write_png
-
-    def second(path: Path, image: np.ndarray) -> None:
-        if path.name == "r_001.png":
-            raise KeyboardInterrupt
-        write(path, image)
-
-    def call(**more: Any) -> None:
-        options: dict[str, Any] = {"method": method, "preset": PRESET, "progress": Progress()}
-        mi_refgs.import_relightable(ball, run, **{**options, **more})
-
-    with monkeypatch.context() as patch:
-        patch.setattr(relightable_import, "write_png", second)
-        with pytest.raises(KeyboardInterrupt, match="give the same command again"):
-            call()
-    before = tree(run)
-    assert before
-    call(preset="5:90", resume=True)
-    assert mi_refgs.load(run).trained.iteration == 5
 
 
 # ---------------- bad input ----------------
