@@ -69,7 +69,7 @@ PARTS = (
     Part("memory", 6, "benchmarks.memory"),
     *_fits(),
     Part("frames", 2, "mi_refgs profile {run} --json"),
-    Part("viewer", 4, "benchmarks.viewer {run} --minutes 2"),
+    Part("viewer", 2, "benchmarks.viewer {run}"),
 )
 """In this order: those with {run} need groups of fits."""
 

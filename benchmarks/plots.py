@@ -40,7 +40,7 @@ def splatting_time(result: Result, path: Path) -> Path:
         theirs = [row[f"volprim_{kind}_ms"] for row in result["rows"]]
         figures.series(ax, pairs, theirs, "x", "volprim_rf_basic", color="#c0392b")
         line = np.geomspace(min(pairs), max(pairs), 50)
-        bound = 1e-6 * line * FLOPS[kind] / result["peaks"]["gflops"]
+        bound = 1e-6 * line * FLOPS[kind] / result["gflops"]
         figures.series(ax, line.tolist(), bound.tolist(), "k-", "lower bound: peak arithmetic")
     return figures.save(figure, axes, path, 3)
 
@@ -67,7 +67,7 @@ def splitsum_pareto(result: Result, path: Path) -> Path:
     return figures.save(figure, axes, path)
 
 
-def visibility_convergence(result: Result, path: Path) -> Path:
+def visibility_time(result: Result, path: Path) -> Path:
     """Error over the time of a frame by bounces, one panel per scene, at a middling roughness."""
     from matplotlib import ticker
 
@@ -77,9 +77,11 @@ def visibility_convergence(result: Result, path: Path) -> Path:
         list(result["scenes"]), 4, 3.2, 2.9, "ms per frame", f"relMSE, roughness {roughness:g}"
     )
     for ax, scene in zip(axes, result["scenes"], strict=True):
-        rows = where(result["rows"], scene=scene, roughness=roughness, depth="full")
+        rows = where(result["rows"], scene=scene, roughness=roughness)
         for k, bounces in enumerate((0, *result["settings"]["bounces"])):
-            found = [row for row in where(rows, bounces=bounces, dominant=False) if row["rays"]]
+            found = [
+                row for row in where(rows, bounces=bounces, dominant=False) if row["frame_ms"] and row["rays"]
+            ]
             x, y = ([row[key] for row in found] for key in ("frame_ms", "relmse"))
             label = f"{bounces} bounce{'s' * (bounces > 1)}" if bounces else "rays only"
             figures.series(ax, x, y, "o-", label, color=("#c77b30", *BLUES)[k % 5])
@@ -111,7 +113,7 @@ def stability_cases(result: Result, path: Path) -> Path:
 
 
 PLOTS: dict[str, Callable[[Result, Path], Path]] = {
-    f.__name__: f for f in (splatting_time, splitsum_pareto, visibility_convergence, stability_cases)
+    f.__name__: f for f in (splatting_time, splitsum_pareto, visibility_time, stability_cases)
 }
 """Name of an image → what draws it; its first word is the data file."""
 

@@ -230,7 +230,7 @@ def splatting(result: Result) -> Values:
         "most_ratio": number(max(ratios), 2),
         "image_error": f"{max(row['image'] for row in wrong):.0e}",
         "gradient_error": f"{max(row[key] for row in wrong for key in gradients):.0e}",
-        "gflops": number(result["peaks"]["gflops"]),
+        "gflops": number(result["gflops"]),
         "large_seconds": number(result["large_step"]["ms"] / 1e3),
         "large_gib": f"{result['large_step']['whole_process'] / 2**30:.2f}",
     }
@@ -340,7 +340,7 @@ def visibility(result: Result) -> Values:
     least, most = (
         f"{number(row['gain'], 2)}× ({row['scene']}, roughness {row['roughness']:g})" for row in (low, high)
     )
-    mirror, none = (where(result["rows"], depth="full", method=m) for m in ("mirror ray", "no occlusion"))
+    mirror, none = (where(result["rows"], method=m) for m in ("mirror ray", "no occlusion"))
     return {
         "gains": row_table(
             found,

@@ -1,14 +1,12 @@
-"""How fast a page of `refgs view` is, and whether it lasts: in a headless browser, on a run.
+"""How fast a page of `refgs view` is: in a headless browser, on a run.
 
-    python -m benchmarks.viewer RUN [--minutes 10] [--window 1000x640] [--moving 800] -o OUT.json
+    python -m benchmarks.viewer RUN [--window 1000x640] [--moving 800]
 
 Measures, with the viewer in a process of its own:
 
     first_picture_s   from the page's opening until the canvas shows the object
     orbit             while the camera is dragged round: images a second that the page received, and CPU
                       milliseconds of the viewer for each (user and system, of all its threads)
-    clicks            random controls, drags and wheel turns for some minutes: errors in the console, and the
-                      viewer's resident memory at the start, after a tenth of the time, and at the end
 
 The browser draws in software and shares the machine with the viewer: what it takes is given as browser_cpu_s.
 """
@@ -19,7 +17,6 @@ import argparse
 import contextlib
 import json
 import os
-import random
 import re
 import shutil
 import subprocess
@@ -33,7 +30,6 @@ from typing import Any
 import psutil
 
 from benchmarks.common.report import plain_parser
-from mi_refgs.io.files import write_json
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -160,55 +156,6 @@ def orbit(page: Any, viewer: Viewer, seconds: float) -> dict[str, float]:
     return result
 
 
-def click_about(page: Any, viewer: Viewer, seconds: float, seed: int) -> dict[str, Any]:
-    """Random use for some time."""
-    rng, process = random.Random(seed), psutil.Process(viewer.process.pid)
-    box = page.locator("canvas").first.bounding_box()
-    begin, clicks = time.monotonic(), 0
-    memory = {"start": process.memory_info().rss}
-    while (passed := time.monotonic() - begin) < seconds:
-        if "tenth" not in memory and passed > seconds / 10:
-            memory["tenth"] = process.memory_info().rss
-        clicks += 1
-        kind = rng.random()
-        x, y = box["x"] + rng.random() * box["width"], box["y"] + rng.random() * box["height"]
-        if kind < 0.35:  # orbit or pan
-            page.mouse.move(x, y)
-            page.mouse.down(button=rng.choice(("left", "right")))
-            page.mouse.move(x + rng.uniform(-150, 150), y + rng.uniform(-80, 80), steps=6)
-            page.mouse.up(button="left")
-            page.mouse.up(button="right")
-        elif kind < 0.45:
-            page.mouse.move(x, y)
-            page.mouse.wheel(0, rng.uniform(-200, 200))
-        else:
-            inputs = page.locator(
-                "[role=slider], input[type=checkbox], button:not([aria-haspopup]), input[aria-haspopup]"
-            )
-            target = inputs.nth(rng.randrange(max(inputs.count(), 1)))
-            try:
-                target.scroll_into_view_if_needed(timeout=1000)
-                if target.get_attribute("role") == "slider":
-                    target.press(rng.choice(("ArrowLeft", "ArrowRight", "PageUp", "PageDown")), timeout=1000)
-                elif "Upload" not in (target.text_content() or ""):  # it would open a file dialogue
-                    target.click(timeout=1000)
-                    options = page.get_by_role("option")
-                    if options.count():
-                        options.nth(rng.randrange(options.count())).click(timeout=1000)
-            except Exception as error:  # covered, gone, or a folder that is closed
-                if "Timeout" not in type(error).__name__ and "Error" not in type(error).__name__:
-                    raise
-        page.wait_for_timeout(rng.choice((20, 100, 700)))
-    page.wait_for_timeout(2000)
-    memory["end"] = process.memory_info().rss
-    return {
-        "seconds": round(time.monotonic() - begin, 1),
-        "clicks": clicks,
-        "resident_mb": {name: round(value / 2**20, 1) for name, value in memory.items()},
-        "alive": viewer.process.poll() is None,
-    }
-
-
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """All of it."""
     errors: list[str] = []
@@ -230,29 +177,19 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             page.wait_for_timeout(3000)
             orbit(page, viewer, 2)  # the first of this size
             result[f"orbit_{side}"] = orbit(page, viewer, args.seconds)
-        choose(page, "Moving", "automatic")
-        if args.minutes > 0:
-            result["clicks"] = click_about(page, viewer, 60 * args.minutes, args.seed)
         result["console_errors"] = errors
         result["load_after"] = os.getloadavg()[0]
     return result
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure, and print JSON."""
     parser = plain_parser("viewer", __doc__)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--minutes", type=float, default=10.0, help="of random clicks; 0 for none")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each orbit")
     parser.add_argument("--window", default="1000x640", help="pixels of the page")
     parser.add_argument("--moving", type=int, nargs="*", default=[200, 800], help="sizes to orbit at, too")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("-o", "--output", type=Path)
-    args = parser.parse_args()
-    result = measure(args)
-    print(json.dumps(result, indent=1))
-    if args.output is not None:
-        write_json(args.output, result)
+    print(json.dumps(measure(parser.parse_args()), indent=1))
 
 
 if __name__ == "__main__":

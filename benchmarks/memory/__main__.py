@@ -1,7 +1,6 @@
 """Peak memory of images and gradients against size, samples and surfels, measured and predicted.
 
-    python -m benchmarks.memory         a third of the cells, in a few minutes
-    python -m benchmarks.memory --all   all of them
+    python -m benchmarks.memory         in a few minutes
 
 Each cell is a process of its own; cells that are predicted to need more than LIMIT are left out. Writes
 memory.json; `python -m benchmarks.pages` makes the table of docs/memory.md.
@@ -27,15 +26,11 @@ SECONDS = 300
 """After which a cell is given up."""
 
 
-def cells(every: bool) -> list[tuple[str, int, int, int]]:
-    """Kind, pixels along each side, samples per pixel and surfels; few unless `every`."""
-    found = itertools.product(cell.KINDS, SIZES, SAMPLES, SURFELS)
-    if every:
-        return list(found)
-    # Two of: one sample, 512², 10,000 surfels.
+def cells() -> list[tuple[str, int, int, int]]:
+    """Kind, pixels along each side, samples per pixel and surfels: two of 1 sample, 512², 10,000 surfels."""
     return [
         (kind, size, samples, surfels)
-        for kind, size, samples, surfels in found
+        for kind, size, samples, surfels in itertools.product(cell.KINDS, SIZES, SAMPLES, SURFELS)
         if (samples == 1) + (size == 512) + (surfels == 10_000) >= 2
     ]
 
@@ -55,12 +50,11 @@ def measured(kind: str, size: int, samples: int, surfels: int) -> dict[str, Any]
 def main(arguments: list[str] | None = None) -> int:
     """Measure; returns the exit code, 2 for bad input."""
     parser = make_parser("memory", __doc__)
-    parser.add_argument("--all", action="store_true", help="every cell")
     options = parser.parse_args(arguments)
 
     def run() -> dict[str, Any]:
         rows = []
-        for one in cells(options.all):
+        for one in cells():
             rows.append(measured(*one))
             if not options.quiet:
                 print(rows[-1], file=sys.stderr, flush=True)

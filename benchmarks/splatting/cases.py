@@ -38,7 +38,6 @@ class Settings:
     step: tuple[int, int] = (20_000, 200)  # of the training step
     steps: int = 30
     large_step: tuple[int, int] = (1_000_000, 1024)  # memory of one training step
-    triad: int = 1 << 25  # floats of each array that measures the bandwidth
 
 
 PAGE = Settings()
@@ -55,7 +54,6 @@ SMALL = Settings(
     step=(500, 32),
     steps=3,
     large_step=(500, 32),
-    triad=1 << 20,
 )
 
 

@@ -2,7 +2,7 @@
 
 FLOPs of a contributing pair, counted by hand from the formulas, an exponential as 12: forward about 36 for
 the footprint and 24 for compositing; forward and backward 260, where the footprint is evaluated twice.
-Evaluations that do not contribute, sorting and memory are not in it, so `contributing · flops / peak` is a
+Evaluations that do not contribute, sorting and memory are not included, so `contributing · flops / peak` is a
 lower bound of the time of any renderer of these surfels.
 """
 
@@ -29,7 +29,6 @@ from mi_refgs.constants import tile_size
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.profiling.profile import Counts, profile_stage
 from mi_refgs.splat import list_by_tile, project
-from mi_refgs.surfels.primitives.surfel import Surfel
 
 FLOPS = {"forward": 60, "both": 260}
 CHAINS = 16
@@ -38,19 +37,12 @@ STEPS = 4096
 VECTORS = 256
 """SIMD vectors of 16 lanes: enough blocks for every thread."""
 TRIES = 12
-FLOAT = 4  # bytes
-LISTED_BYTES = 24
-"""A listed pair's surfel, tile and depth, written once and read once; a sort's passes are not in it."""
 
 
-def measure_peaks(triad: int) -> dict[str, float]:
-    """Multiply-add rate in GFLOP/s, and triad bandwidth in GB/s (two reads and a write) on all threads.
-
-    The best of some tries: a limit is what nothing exceeds.
-    """
+def measure_peak() -> float:
+    """Return the multiply-add rate of all threads in GFLOP/s: the best of some tries."""
     factors = [dr.opaque(mi.Float, 0.5 + 0.01 * i) for i in range(CHAINS)]
     steps = dr.opaque(mi.UInt32, STEPS)
-    a, b = (dr.opaque(mi.Float, x, triad) for x in (1.0, 2.0))
     lanes = VECTORS * 16 * dr.thread_count()
 
     def multiply_add() -> Any:
@@ -62,24 +54,7 @@ def measure_peaks(triad: int) -> dict[str, float]:
         _, sums = dr.while_loop(state, lambda i, sums: i < steps, body, label="peak")
         return sum(sums, mi.Float(0))
 
-    def add() -> Any:
-        return dr.fma(b, factors[0], a)
-
-    fma, moved = (min(once(call) for _ in range(TRIES)) for call in (multiply_add, add))
-    return {"gflops": 2e-9 * lanes * STEPS * CHAINS / fma, "gbytes": 1e-9 * 3 * FLOAT * triad / moved}
-
-
-def bytes_moved(counts: Counts, features: int) -> dict[str, int]:
-    """Bytes that a view must load and store at least, most of them from caches.
-
-    Forward: what is listed; an index and a row of geometry and features for each visited pair; the maps.
-    Backward again the rows and the maps with their adjoints, and a read and a write of a row of adjoints for
-    each visited pair (a bound from above: not every visited pair contributes).
-    """
-    row = FLOAT * (Surfel.columns + features)
-    maps = FLOAT * (features + 2) * counts.pixels
-    forward = LISTED_BYTES * counts.pairs + (FLOAT + row) * counts.visited + maps
-    return {"forward": forward, "both": forward + (FLOAT + 3 * row) * counts.visited + 2 * maps}
+    return 2e-9 * lanes * STEPS * CHAINS / min(once(multiply_add) for _ in range(TRIES))
 
 
 def lower_bound(counts: Counts, gflops: float) -> dict[str, float]:
@@ -142,8 +117,8 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         for count in settings.surfels
         for size in settings.sizes
     ]
-    peaks = measure_peaks(settings.triad)
-    rows = [case(workload, settings, peaks) for workload in shown(workloads, "cases")]
+    gflops = measure_peak()
+    rows = [case(workload, settings, gflops) for workload in shown(workloads, "cases")]
     wrong = [
         {"surfels": count, "size": size, "spread": spread}
         | compare(sphere(count, size, spread), settings.crop)
@@ -153,7 +128,7 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
     dr.flush_malloc_cache()
     return {
         "settings": asdict(settings),
-        "peaks": peaks,
+        "gflops": gflops,
         "rows": rows,
         "cost": plane(rows, "both_ms", COST) if len(rows) > len(COST) + 1 else None,
         "errors": wrong,
@@ -192,7 +167,7 @@ def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
     return result
 
 
-def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row:
+def case(workload: Workload, settings: Settings, gflops: float) -> Row:
     """One row: counts, times in turns, phases, launches, lower bounds."""
     count, size = workload.count, workload.pinhole.width
     full, colour = Ours.of(workload, FEATURES), Ours.of(workload, COLOUR)
@@ -210,8 +185,7 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
         slow["volprim_both"] = (volprim.both, settings.volprim_repeats)
     times = timing.milliseconds(calls, settings.seconds / len(calls), settings.repeats, slow)
     launches = {kind: full.launches(getattr(full, kind)) for kind in ("forward", "both")}
-    bound = lower_bound(counts, peaks["gflops"])
-    moved = bytes_moved(counts, FEATURES)
+    bound = lower_bound(counts, gflops)
     phases = phase_times(full.both, min(PHASE_REPEATS, settings.repeats))
     row: Row = {"spread": workload.spread, "surfels": count, "size": size}
     names = ("pixels", "covered", "pairs", "evaluated", "contributing")
@@ -220,7 +194,7 @@ def case(workload: Workload, settings: Settings, peaks: dict[str, float]) -> Row
     row |= {f"{name}_ms": times.get(name) for name in (*calls, "volprim_forward", "volprim_both")}
     row |= {f"{phase.replace(' ', '_')}_ms": phases[phase] for phase in PHASES}
     for kind in ("forward", "both"):
-        row |= {f"bound_{kind}_ms": bound[kind], f"bytes_{kind}": moved[kind]}
+        row[f"bound_{kind}_ms"] = bound[kind]
         row |= {f"launches_{kind}": launches[kind][0], f"misses_{kind}": launches[kind][1]}
     return row
 

@@ -17,9 +17,8 @@ from mi_refgs.shade.options import ShadingOptions
 METALLIC = 1.0
 """A metal has no diffuse term: the whole image is the specular one."""
 VOXEL = 5e-5
-"""Resolution the occluder is told, for objects of size 2. Mesh and points are exact: a ray
-leaves the surface by no more than rounding requires. Ten times as much keeps many rays from the exact
-visibility: they then differ from it by 0.003 instead of 0.0004 (plates, roughness 0.1)."""
+"""Resolution the occluder is told, for objects of size 2. Mesh and points are exact: a ray leaves the surface
+by no more than rounding requires."""
 
 
 @dataclass(frozen=True)
@@ -29,25 +28,18 @@ class Settings:
     scenes: tuple[str, ...] = ("bowl", "deep_bowl", "plates")
     meshes: tuple[str, ...] = ()  # files
     roughness: tuple[float, ...] = (0.1, 0.3, 0.6)
-    rays: tuple[int, ...] = (3, 4, 8)  # of the lobe, measured and timed
-    more_rays: tuple[int, ...] = (16, 64, 256)  # for the curve, and the most for the errors; not timed
-    limit: int = 2048  # rays that stand for infinitely many
+    rays: tuple[int, ...] = (3, 4, 8)  # of the lobe
     size: int = 48  # edge of the images whose error is measured
     timing_size: int = 192  # of those that are timed
     light_height: int = 128  # rows, for the path tracer and the prefiltered light alike
     spp: int = 64  # of each batch of the references
     batches: int = 8
-    lattice: int = 610  # points of each lattice of the exact visibility
+    lattice: int = 610  # directions of the fitted harmonics
     bounces: tuple[int, ...] = (1, 2, 3, 4)  # of traced light
     dominant: tuple[bool, ...] = (False, True)  # for traced light: off, and on
     detail: int = 1  # 0: coarse meshes
     timing_seconds: float = 0.2  # spent on each time, at least
     timing_rounds: int = 25  # of each time, at most
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """All numbers of rays, one (the mirror ray) included."""
-        return tuple(sorted({1, *self.rays, *self.more_rays}))
 
 
 PAGE = Settings()
@@ -55,8 +47,6 @@ SMALL = Settings(
     scenes=("bowl", "plates"),
     roughness=(0.3,),
     rays=(4, 64),
-    more_rays=(),
-    limit=512,
     size=32,
     timing_size=64,
     light_height=64,
@@ -105,14 +95,12 @@ PAPER = Rule(1)
 def rules(settings: Settings) -> Iterator[Rule]:
     """All that are measured."""
     yield Rule(0)
-    for rays in settings.counts:
+    for rays in (1, *settings.rays):
         yield Rule(rays)
     for bounces in settings.bounces:
         for dominant in settings.dominant:
             for rays in (1, *settings.rays):
                 yield Rule(rays, bounces, dominant)
-        if settings.more_rays:
-            yield Rule(max(settings.more_rays), bounces)
 
 
 BOWLS = {"bowl": (60.0, -0.15), "deep_bowl": (90.0, -0.42)}

@@ -1,4 +1,4 @@
-"""Measure the specular image by each rule of visibility against the path tracer at two depths."""
+"""Measure the specular image by each rule of visibility against the path tracer at full depth."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from tqdm import tqdm
 from benchmarks.common import errors, timing
 from benchmarks.common import montecarlo as mc
 from benchmarks.common.report import Row, where
-from benchmarks.visibility.cases import PAPER, Rule, Settings, make_scene, rules
+from benchmarks.visibility.cases import PAPER, Settings, make_scene, rules
 from benchmarks.visibility.harmonics import mirror_radiance
 from benchmarks.visibility.setup import TIMED_ROUGHNESS, Setup
 
-DEPTHS = {"direct": 2, "full": 12}
-"""Mitsuba's `max_depth`: light after one reflection, and after up to eleven."""
+DEPTH = 12
+"""Mitsuba's `max_depth`: light after up to eleven reflections."""
 MIRROR = PAPER.name
 """One mirror ray for the whole lobe and no indirect light: what the price is a multiple of."""
 HARMONICS = "mirror ray, spherical harmonics"
@@ -29,7 +29,6 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     """Measure every scene; returns the JSON report."""
     scenes = [make_scene(name, settings.detail) for name in (*settings.scenes, *settings.meshes)]
     rows: list[Row] = []
-    curve: list[Row] = []
     facts: dict[str, Any] = {}
     for concave in tqdm(scenes, desc="scenes", disable=quiet):
         setup = Setup(concave, settings)
@@ -37,7 +36,6 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
         for roughness in tqdm(settings.roughness, desc=setup.name, disable=quiet):
             setup.material(roughness)
             found += _errors(setup, roughness)
-            curve += _curve(setup, roughness)
         times = _times(setup)
         rows += [row | {"frame_ms": times.get(row["method"])} for row in found]
         facts[setup.name] = {
@@ -49,45 +47,19 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
         "settings": vars(settings) | {"meshes": [Path(name).name for name in settings.meshes]},
         "scenes": facts,
         "rows": rows,
-        "curve": curve,
         "tradeoffs": tradeoffs(rows),
     }
 
 
 def _errors(setup: Setup, roughness: float) -> list[Row]:
-    """Return a row per rule and depth."""
+    """Return a row per rule."""
     images = {rule.name: (rule, setup.image(rule)) for rule in rules(setup.settings)}
-    images[HARMONICS] = PAPER, setup.image(PAPER, mirror_radiance(setup, DEPTHS["full"]))
-    found = []
-    for depth, most in DEPTHS.items():
-        reference = mc.estimate(setup.reference(most))
-        for name, (rule, values) in images.items():
-            case = {"scene": setup.name, "roughness": roughness, "method": name, "depth": depth}
-            found.append(case | vars(rule) | errors.compare(values, reference))
-    return found
-
-
-def _curve(setup: Setup, roughness: float) -> list[Row]:
-    """Over rays: distance of the visibility to the exact one, and of the image to that of many rays."""
-    exact, noise = setup.visibility()
-    limit = setup.image(Rule(setup.settings.limit, bounces=1))
-    weight = errors.weight(limit)
-    found = []
-    for rays in (*setup.settings.counts, setup.settings.limit):
-        visibility = np.array(setup.seen(setup.points, Rule(rays)).visibility, np.float64)
-        image = setup.image(Rule(rays, bounces=1))
-        found.append(
-            {
-                "scene": setup.name,
-                "roughness": roughness,
-                "rays": rays,
-                "visibility_rms": float(np.sqrt(np.mean((visibility - exact) ** 2))),
-                "visibility_floor": float(np.sqrt(np.mean(noise**2))),
-                "visibility_bias": float(np.mean(visibility - exact)),
-                "to_limit": float(np.mean((image - limit) ** 2 * weight)),
-            }
-        )
-    return found
+    images[HARMONICS] = PAPER, setup.image(PAPER, mirror_radiance(setup, DEPTH))
+    reference, case = mc.estimate(setup.reference(DEPTH)), {"scene": setup.name, "roughness": roughness}
+    return [
+        case | {"method": name} | vars(rule) | errors.compare(values, reference)
+        for name, (rule, values) in images.items()
+    ]
 
 
 def _times(setup: Setup) -> dict[str, float]:
@@ -109,9 +81,9 @@ def tradeoffs(rows: list[Row]) -> list[Row]:
     found = []
     names = list(dict.fromkeys(row["scene"] for row in rows))
     for scene, roughness in dict.fromkeys((row["scene"], row["roughness"]) for row in rows):
-        full = where(rows, scene=scene, roughness=roughness, depth="full")
+        full = where(rows, scene=scene, roughness=roughness)
         (mirror,), (paper,) = where(full, method=MIRROR), where(full, method=HARMONICS)
-        elsewhere = where(rows, scene=[name for name in names if name != scene] or names, depth="full")
+        elsewhere = where(rows, scene=[name for name in names if name != scene] or names)
         most = BUDGET * mirror["frame_ms"]
         affordable = [row for row in full if row["frame_ms"] is not None and row["frame_ms"] <= most]
         chosen = min(affordable, key=lambda row: _mean_log(where(elsewhere, method=row["method"])))

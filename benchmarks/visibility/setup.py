@@ -7,11 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common import montecarlo as mc
 from benchmarks.common import setup
 from benchmarks.common.view import Points, make_light, rows
 from benchmarks.visibility.cases import METALLIC, VOXEL, Concave, Rule, Settings
@@ -38,8 +36,6 @@ class Setup(setup.Setup):
             path.write_bytes(concave.mesh.export(file_type="ply", vertex_normal=True))
             shape = {"type": "ply", "filename": str(path)}
             super().__init__(concave.name, shape, light, concave.look, settings)
-        constant = mi.load_dict({"type": "scene", "light": {"type": "constant"}, "ball": {"type": "sphere"}})
-        self.constant = constant.environment()
         self.light = light.prefiltered(settings.light_height)
         self.origin = mi.Point3f(concave.look.origin)
         mesh = concave.mesh
@@ -72,21 +68,9 @@ class Setup(setup.Setup):
         return rows(shaded.total())
 
     def reference(self, depth: int) -> np.ndarray:
-        """The path tracer's images: batches (B, P, 3), whose random numbers are those of other depths."""
+        """The path tracer's images: batches (B, P, 3), one seed each."""
         path, settings = setup.path_tracer(depth), self.settings
         return np.stack([self.render(path, settings.spp, seed) for seed in range(1, settings.batches + 1)])
-
-    def reflected(self, emitter: Any, occluder: Any) -> np.ndarray:
-        """The integral of the reflectance and a light, past an occluder unless None: batches (B, P, 3)."""
-        α = dr.square(self.roughness)
-        scale, bias = self.integrate(lambda points: mc.brdf_lobe(points, α), emitter, occluder)
-        return np.asarray(self.albedo * scale + bias)
-
-    def visibility(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean visibility over the reflectance (P,) and its standard error, by the benchmark's own code."""
-        found, free = (self.reflected(self.constant, scene).mean(-1) for scene in (self.scene, None))
-        blocked = found / free.mean(0)
-        return blocked.mean(0), blocked.std(0, ddof=1) / np.sqrt(len(blocked))
 
     def frame_call(self, rule: Rule) -> Callable[[], Any]:
         """The product's own frame: the surfels splatted, visibility, shading."""

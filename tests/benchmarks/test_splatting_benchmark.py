@@ -15,7 +15,6 @@ from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability import measure as stability
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.exact import product_order, scene_of
-from mi_refgs.profiling.profile import Counts
 from mi_refgs.reference import image as reference
 
 BENCHMARK = "splatting"
@@ -56,13 +55,6 @@ def test_counts_match_reference(make: Any) -> None:
     assert np.abs(np.array(counts.pixels_of_surfel) - shown.sum(axis=1)).max() <= 2
     if make is opaque:
         assert counts.visited < 0.9 * counts.pairs  # or this would not test that pixels end
-
-
-def test_bytes_and_lower_bound_are_linear_in_counts() -> None:
-    counts = Counts(10, 16, 16, 100, 50, 400, 16, None)
-    forward = measure.bytes_moved(counts, 14)["forward"]
-    assert forward == 24 * 100 + (4 + 4 * 24) * 50 + 4 * 16 * 16
-    assert measure.lower_bound(counts, 1.0) == pytest.approx({"forward": 0.024, "both": 0.104})
 
 
 def test_volprim_shows_the_same_object() -> None:

@@ -26,24 +26,16 @@ SCENES = ("bowl", "plates")
 
 @pytest.mark.slow
 def test_small_instance_is_ordered(result: dict[str, Any]) -> None:
-    """More rays and bounces reduce the error, and many rays converge to the exact visibility."""
+    """More rays and more bounces reduce the error."""
     for scene in SCENES:
-        direct, full = (
-            {row["method"]: row["relmse"] for row in where(result["rows"], scene=scene, depth=depth)}
-            for depth in ("direct", "full")
-        )
+        error = {row["method"]: row["relmse"] for row in where(result["rows"], scene=scene)}
         for rule in ("mirror ray", "4 rays", "64 rays"):
-            assert direct[rule] < 0.1 * direct["no occlusion"]
-            assert full[f"{rule}, 4 bounces"] < full[f"{rule}, 1 bounce"] < 0.85 * full[rule]
+            assert error[f"{rule}, 4 bounces"] < error[f"{rule}, 1 bounce"] < 0.85 * error[rule]
         for bounces in ("1 bounce", "4 bounces"):
-            few, many = (full[f"{rays} rays, {bounces}"] for rays in (4, 64))
-            assert many < few < full[f"mirror ray, {bounces}"]
-        assert full["64 rays, 4 bounces"] < 0.25 * full["mirror ray"]
-        assert full[HARMONICS] < 0.5 * full["mirror ray"]
-        curve = {row["rays"]: row for row in where(result["curve"], scene=scene)}
-        distance = [curve[k]["visibility_rms"] for k in sorted(curve)]
-        assert distance == sorted(distance, reverse=True) and distance[-1] < 0.01
-        assert distance[-1] < 4 * curve[max(curve)]["visibility_floor"]
+            few, many = (error[f"{rays} rays, {bounces}"] for rays in (4, 64))
+            assert many < few < error[f"mirror ray, {bounces}"]
+        assert error["64 rays, 4 bounces"] < 0.25 * error["mirror ray"]
+        assert error[HARMONICS] < 0.5 * error["mirror ray"]
 
 
 def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
@@ -62,7 +54,7 @@ def test_setting_is_chosen_on_other_scenes_within_budget() -> None:
     """`lucky` is best here, `steady` on the other scene, which decides; `dear` is over the budget."""
     here = {"mirror ray": (1.0, 10.0), "lucky": (0.1, 29.0), "steady": (0.2, 20.0), "dear": (0.01, 31.0)}
     there = {"mirror ray": 1.0, "lucky": 0.9, "steady": 0.3, "dear": 0.01}
-    fixed = {"roughness": 0.3, "depth": "full"}
+    fixed = {"roughness": 0.3}
     rows: list[dict[str, Any]] = [
         {"scene": "here", "method": name, "relmse": error, "frame_ms": time, **fixed}
         for name, (error, time) in here.items()
