@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import check_size, replace_file, require_file, strip_rows
+from mi_refgs.io.files import check_size, replace_file, require_file
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"  # first bytes of every EXR file
 SAMPLE_BYTES = 2  # bytes per sample at least: those of half floats; integers and floats have 4
@@ -58,17 +58,6 @@ def read_exr_image(path: str | Path, vectors: bool = False) -> np.ndarray:
     channels = read_exr(path)
     names = _image_channels(Path(path), channels, _header(Path(path)), vectors)
     return np.stack([channels[name] for name in names], axis=-1)
-
-
-def exr_strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
-    """Height and width of an EXR file, and strips of its rows from the top: linear float32 (n, W, 3).
-
-    One channel, with or without alpha, is grey. Raises InputError as `read_exr_image` does, except for NaN
-    and infinite values; the iterator raises it for broken strips.
-    """
-    width, height = exr_size(path)
-    names = _header_channels(path)
-    return (height, width), _strips(path, names[:3] if len(names) > 2 else names[:1], width, height)
 
 
 def exr_has_alpha(path: Path) -> bool:
@@ -126,22 +115,6 @@ def _image_channels(
     raise InputError(
         f"found {found}", path, "channels", f"export R, G, B (and A), {wanted}or one channel (and A)"
     )
-
-
-def _strips(path: Path, names: list[str], width: int, height: int) -> Iterator[np.ndarray]:
-    """Rows of three channels, or of one as three."""
-    import Imath
-    import OpenEXR
-
-    kind, step = Imath.PixelType(Imath.PixelType.FLOAT), strip_rows(width)
-    with _readable(path):
-        file = OpenEXR.InputFile(str(path))  # `OpenEXR.File` reads all rows
-        first = file.header()["dataWindow"].min.y
-        for top in range(0, height, step):
-            count = min(step, height - top)
-            rows = file.channels(names, kind, first + top, first + top + count - 1)
-            planes = [np.frombuffer(row, np.float32).reshape(count, width) for row in rows]
-            yield np.stack(planes * (3 // len(planes)), axis=-1)
 
 
 @contextlib.contextmanager

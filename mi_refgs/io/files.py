@@ -22,10 +22,6 @@ ANY_FILE = 2**24  # bytes of pixels that a header of any file may promise
 MAX_EXPANSION = 1100
 """Bytes of pixels per byte of a larger file that its header may promise: DEFLATE expands by at most 1,032."""
 MAX_PIXELS = 2**28  # largest number of pixels of an image file: twice those of a 16K panorama
-STRIP_PIXELS = 2**22
-"""Pixels of a large image that are converted to floating point at a time: 50 MB of three channels."""
-STRIP_ROWS = 256
-"""Largest number of rows of such a strip: that of the largest compression block of EXR files (DWAB)."""
 POLL = 0.1  # seconds between two tries to take a lock
 _OWN = threading.local()  # `held`: paths of the locks of this thread
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -209,8 +205,3 @@ def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> Non
         raise InputError(
             f"{width} × {height} pixels are more than the file can hold", path, "size", "export it again"
         )
-
-
-def strip_rows(width: int) -> int:
-    """Rows of an image of this width that are read at a time."""
-    return max(1, min(STRIP_ROWS, STRIP_PIXELS // width))

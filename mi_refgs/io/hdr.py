@@ -3,56 +3,46 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import check_size, require_file, strip_rows
+from mi_refgs.io.files import check_size, require_file
 
 MAX_HDR_HEADER = 2**16  # bytes within which the size of a Radiance image must be given
 SCALES = np.append(0, np.ldexp(1.0, np.arange(1, 256) - 136)).astype(np.float32)
 """Factor of red, green and blue by the byte of their exponent."""
 
 
-def hdr_strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
-    """Height and width of a Radiance image (.hdr), and strips of its rows: linear float32 (n, W, 3).
+def read_hdr(path: Path) -> np.ndarray:
+    """A Radiance image (.hdr) as linear float32 (H, W, 3).
 
     Mitsuba's reader is not used: it writes out of bounds where a run is longer than its row. Layout: Ward,
-    "Real Pixels", 1991. Raises InputError if the file is missing or no such image; the iterator raises it for
-    broken strips.
+    "Real Pixels", 1991. Raises InputError if the file is missing or no such image.
     """
     require_file(path)
-    with path.open("rb") as file:
-        header = file.read(MAX_HDR_HEADER)
-    size = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", header)
-    if not header.startswith(b"#?") or b"32-bit_rle_xyze" in header or size is None:
+    data = path.read_bytes()
+    size = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:MAX_HDR_HEADER])
+    if not data.startswith(b"#?") or b"32-bit_rle_xyze" in data[:MAX_HDR_HEADER] or size is None:
         raise InputError("no Radiance image of rows from the top", path, "header", "save it as EXR")
-    height, width = int(size.group(1)), int(size.group(2))
+    height, width, position = int(size.group(1)), int(size.group(2)), size.end()
     check_size(path, width, height, 4)
-    return (height, width), _strips(path, height, width, size.end())
-
-
-def _strips(path: Path, height: int, width: int, position: int) -> Iterator[np.ndarray]:
-    """The rows from a position in the file on, run-length encoded or not."""
-    marker, data = bytes((2, 2, width >> 8 & 255, width & 255)), path.read_bytes()
-    step = strip_rows(max(width, 1))
-    for top in range(0, height, step):
-        rgbe = np.empty((min(step, height - top), width, 4), np.uint8)
-        try:
-            for row in rgbe:
-                if data[position : position + 4] != marker or not 8 <= width < 32768:
-                    row[:] = np.frombuffer(data, np.uint8, 4 * width, position).reshape(width, 4)
-                    position += 4 * width
-                    continue
-                position += 4
-                for channel in range(4):
-                    values, position = _runs(data, position, width)
-                    row[:, channel] = np.frombuffer(values, np.uint8)
-        except (IndexError, ValueError) as error:
-            raise InputError("truncated or broken", path, "pixels", "export it again") from error
-        yield rgbe[..., :3] * SCALES[rgbe[..., 3:]]
+    marker = bytes((2, 2, width >> 8 & 255, width & 255))
+    rgbe = np.empty((height, width, 4), np.uint8)
+    try:
+        for row in rgbe:  # run-length encoded or not
+            if data[position : position + 4] != marker or not 8 <= width < 32768:
+                row[:] = np.frombuffer(data, np.uint8, 4 * width, position).reshape(width, 4)
+                position += 4 * width
+                continue
+            position += 4
+            for channel in range(4):
+                values, position = _runs(data, position, width)
+                row[:, channel] = np.frombuffer(values, np.uint8)
+    except (IndexError, ValueError) as error:
+        raise InputError("truncated or broken", path, "pixels", "export it again") from error
+    return rgbe[..., :3] * SCALES[rgbe[..., 3:]]
 
 
 def _runs(data: bytes, position: int, width: int) -> tuple[bytes, int]:

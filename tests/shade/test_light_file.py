@@ -1,8 +1,7 @@
-"""Lat-long images of lights: every format in strips, averaged as a whole map is, in little memory."""
+"""Lat-long images of lights: every format, averaged to fewer rows."""
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 
@@ -11,14 +10,12 @@ import OpenEXR
 import pytest
 
 from mi_refgs.errors import InputError
-from mi_refgs.io import files
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import image_size, linear_from_srgb, read_png, write_png
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.shade.light import envmap, lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light_file import read_radiance
-from tests.helpers import run_python
 
 
 def write_hdr(path: Path, mantissa: np.ndarray) -> None:
@@ -55,11 +52,8 @@ def write_map(path: Path, kind: str, rng: np.random.Generator, height: int = 37)
 
 @pytest.mark.parametrize("kind", ["exr", "half", "tiled", "window", "grey", "hdr", "png"])
 @pytest.mark.parametrize("rows", [64, 12])
-def test_a_map_read_in_strips_is_the_map(
-    kind: str, rows: int, tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Strips of 5 rows; a map that is finer than wanted is averaged as `resample` does."""
-    monkeypatch.setattr(files, "STRIP_ROWS", 5)
+def test_every_format_is_read(kind: str, rows: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    """A map that is finer than wanted is averaged as `resample` does."""
     path = tmp_path / f"map.{kind if kind in ('hdr', 'png') else 'exr'}"
     values = write_map(path, kind, rng)
     expected = values if rows > len(values) else lobe_matrices.resample(values, rows)
@@ -79,34 +73,6 @@ def test_matrices_of_grids_are_hats(count: int, wanted: int) -> None:
     hat = np.maximum(0, 1 - apart * min(count, wanted) / (2 * np.pi))
     columns = lobe_matrices.resampling(count, wanted, periodic=True).toarray()
     np.testing.assert_allclose(columns, hat / hat.sum(1, keepdims=True), atol=1e-12)
-
-
-READ = """
-import json, resource, sys
-import mi_refgs, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-from pathlib import Path
-from mi_refgs.reconstruction import new_light as light
-from mi_refgs.shade.light.envmap import EnvironmentLight
-light.HEIGHT = 64  # what a light of many rows takes is no matter of its file
-peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-small, large = map(Path, sys.argv[1:])
-for path in (small, large):
-    heights = [light.NewLight(path).read().height, EnvironmentLight.from_file(path, 64).height]
-    print(json.dumps([heights, peak()]))
-"""
-
-
-def test_a_large_map_takes_little_memory(tmp_path: Path) -> None:
-    """26 Mpx in 0.1 MB, of which three float32 channels would take 300 MB."""
-    write_exr(tmp_path / "small.exr", np.full((64, 128), 0.5), half=True)
-    plane = np.full((3600, 7200), 0.5, np.float16)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {"Y": plane}).write(str(tmp_path / "large.exr"))
-    lines = run_python(READ, tmp_path / "small.exr", tmp_path / "large.exr", folder=tmp_path).splitlines()
-    (_, before), (heights, after) = map(json.loads, lines)
-    assert heights == [64, 64]
-    assert after - before < 250, f"{after - before:.0f} MB more"
 
 
 def test_more_pixels_than_the_bound_are_refused_by_the_header(tmp_path: Path) -> None:

@@ -158,7 +158,7 @@ def true_reflection(
 @pytest.mark.parametrize("roughness", [0.2, slow(0.45)])
 def test_traced_light_comes_closer_to_the_integral(roughness: float) -> None:
     """Two plates, brute force with one bounce: mirror ray alone, traced mirror ray, traced lobe."""
-    place, points = floor_points(roughness, count=10)
+    place, points = floor_points(roughness, count=6)
     truth = [
         true_reflection(p, unit(v), roughness, 0.35)
         for p, v in zip(place, points.view.numpy().T.astype(np.float64), strict=True)
@@ -386,9 +386,8 @@ def test_degenerate_pixels_stay_finite() -> None:
     empty.set_materials(surfels)
     for occluder in (with_materials(corner(), surfels), empty):
         for options in (
-            ShadingOptions(visibility_rays=7),
-            ShadingOptions(dominant=True, visibility_rays=7, traced_bounces=3),
-            ShadingOptions(dominant=True, traced_bounces=3),
+            ShadingOptions(dominant=True, visibility_rays=7, traced_bounces=2),
+            ShadingOptions(traced_bounces=2),
         ):
             raw = mi.TensorXf(light.raw)
             dr.enable_grad(raw)

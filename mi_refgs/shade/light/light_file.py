@@ -1,20 +1,15 @@
-"""Lat-long images of lights: read in strips of rows and averaged on the way, so that none is whole in memory.
-
-A map of 16,384 × 8,192 pixels is 1.6 GB of float32, and a light has a few hundred rows.
-"""
+"""Lat-long images of lights."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import EXR_MAGIC, exr_strips
-from mi_refgs.io.files import strip_rows
-from mi_refgs.io.hdr import hdr_strips
+from mi_refgs.io.exr import EXR_MAGIC, read_exr_image
+from mi_refgs.io.hdr import read_hdr
 from mi_refgs.io.images import linear_from_srgb, read_bytes
 from mi_refgs.shade.light.lobe_matrices import resampling
 
@@ -30,54 +25,34 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
     and for one of more than `files.MAX_PIXELS`, before any pixel is decoded.
     """
     path = Path(path)
-    (height, width), strips = _strips(path)
+    image = np.maximum(_read(path), 0)
+    height, width, _ = image.shape
     if min(height, width) < 2:
         size = f"{width} × {height} pixels"
         raise InputError(f"{size} are no lat-long image", path, "environment", "give 2 × 2 at least")
     h, w = min(height, rows), min(width, 2 * rows)
-    image = np.zeros((h, w, 3), np.float32)
-    down = None if h == height else resampling(height, h).astype(np.float32)
-    across = None if w == width else resampling(width, w, periodic=True).astype(np.float32)
-    top = 0
-    for strip in strips:
-        if not np.isfinite(strip).all():
-            row, column, _ = np.argwhere(~np.isfinite(strip))[0]
-            raise InputError(
-                f"NaN or infinite values, the first at row {top + row}, column {column}",
-                path,
-                "environment",
-                "replace those texels",
-            )
-        part, count = np.maximum(strip, 0), len(strip)
-        if across is not None:
-            columns = across @ part.transpose(1, 0, 2).reshape(width, -1)
-            part = columns.reshape(w, count, 3).transpose(1, 0, 2)
-        if down is None:
-            image[top : top + count] = part
-        else:
-            share = down[:, top : top + count]
-            touched = np.flatnonzero(np.diff(share.indptr))
-            image[touched] += (share[touched] @ part.reshape(count, -1)).reshape(-1, w, 3)
-        top += count
-    return image
+    if h < height:
+        down = resampling(height, h).astype(np.float32)
+        image = (down @ image.reshape(height, -1)).reshape(h, width, 3)
+    if w < width:
+        across = resampling(width, w, periodic=True).astype(np.float32)
+        columns = across @ image.swapaxes(0, 1).reshape(width, -1)
+        image = columns.reshape(w, h, 3).swapaxes(0, 1)
+    return np.ascontiguousarray(image)
 
 
-def _strips(path: Path) -> tuple[tuple[int, int], Iterator[np.ndarray]]:
-    """Height and width of an EXR, Radiance (.hdr), PNG or JPEG file, and its rows from the top.
-
-    They come as linear radiance in arrays (n, width, 3) float32. The first bytes say which format it is.
-    """
+def _read(path: Path) -> np.ndarray:
+    """Linear radiance (h, w, 3) float32 of a file, whose first bytes say which format it is."""
     try:
         with path.open("rb") as file:
             first = file.read(4)
     except OSError as error:
-        failed = f"cannot be read ({error.strerror})"
-        raise InputError(failed, path, "environment", "give an EXR or HDR file") from error
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(what, path, "environment", "give an EXR or HDR file") from error
     if first[:2] == b"#?":
-        return hdr_strips(path)
+        return read_hdr(path)
     if first == EXR_MAGIC:
-        return exr_strips(path)
-    pixels = read_bytes(path)[0][..., :3]
-    step = strip_rows(pixels.shape[1])
-    strips = (pixels[top : top + step].astype(np.float32) for top in range(0, len(pixels), step))
-    return pixels.shape[:2], (linear_from_srgb(strip / np.float32(255)) for strip in strips)
+        image = read_exr_image(path)
+        return image[..., :3] if image.shape[2] > 2 else np.repeat(image[..., :1], 3, axis=-1)
+    pixels = read_bytes(path)[0][..., :3].astype(np.float32)
+    return np.asarray(linear_from_srgb(pixels / np.float32(255)))
