@@ -89,35 +89,32 @@ def _read_mesh(path: Path) -> list[Any]:
     return [mesh.vertices, mesh.voxel]
 
 
-def _exr_files(folder: Path) -> None:
+def _images(folder: Path) -> None:
+    """Images and lights of every kind."""
     for kind in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "DWAA"):
         header = {"compression": getattr(OpenEXR, f"{kind}_COMPRESSION"), "type": OpenEXR.scanlineimage}
         planes = {name: RGBA[..., i].astype(np.float16) for i, name in enumerate("RGBA")}
         OpenEXR.File(header, planes).write(str(folder / f"{kind}.exr"))
     tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
     OpenEXR.File(tiles, {"Y": RGBA[..., 0].astype(np.float32)}).write(str(folder / "tiled.exr"))
-
-
-def _images(folder: Path) -> None:
+    mi.Bitmap(np.ones((8, 16, 3), np.float32)).write(str(folder / "a.hdr"))
     image = Image.fromarray((255 * RGBA).astype(np.uint8))
     for mode in ("RGBA", "RGB", "L", "LA", "P", "1"):
         image.convert(mode).save(folder / f"{mode}.png")
     image.convert("P").save(folder / "b.png", transparency=3)
     for mode in ("RGB", "L", "CMYK"):
         image.convert(mode).save(folder / f"{mode}.jpg", progressive=mode == "L")
-
-
-def _tiffs(folder: Path) -> None:
     for dtype in (np.float32, np.uint16):
         for kind in ("raw", "tiff_lzw", "tiff_adobe_deflate"):
             name = folder / f"{kind}_{np.dtype(dtype).name}.tiff"
             Image.fromarray(np.ones((6, 8), dtype)).save(name, compression=kind)
 
 
-def _lights(folder: Path) -> None:
-    bitmap = mi.Bitmap(np.random.default_rng(0).random((8, 16, 3)).astype(np.float32))
-    for ending in ("hdr", "exr"):
-        bitmap.write(str(folder / f"a.{ending}"))
+def _read_image(path: Path) -> list[Any]:
+    read = {".exr": read_exr_image, ".tiff": read_tiff, ".png": read_png, ".jpg": read_png}
+    if path.suffix in read:
+        return [read[path.suffix](path)]
+    return [EnvironmentLight.from_file(path).radiance().numpy()]
 
 
 def _methods(folder: Path) -> None:
@@ -143,7 +140,7 @@ def _run(folder: Path) -> None:
 
 def _scenes(folder: Path) -> None:
     _surfels(folder)
-    strings = {"filename": "a.ply", "shade_at": "pixel", "aovs": "n:normal,d:depth", "terms": "diffuse"}
+    strings = {"filename": "a.ply", "shade_at": "pixel", "aovs": "n:normal,d:depth"}
     strings |= {"reflectance": "split_sum", "diffuse": "sh"}
     inner = "".join(f'<string name="{name}" value="{value}"/>' for name, value in strings.items())
     inner += '<boolean name="dominant" value="true"/><rgb name="background" value="1, 0.5, 0"/>'
@@ -180,10 +177,9 @@ READERS = {
     "colmap-text": Reader(_colmap("txt"), "sparse/0/*", _data_set),
     "glossy": Reader(layouts.write_glossy, "1-camera.pkl", _data_set),
     "llff": Reader(layouts.write_llff, "*.npy", _data_set),
-    "exr": Reader(_exr_files, "*.exr", lambda path: [read_exr_image(path)]),
-    "image": Reader(_images, "*.*", lambda path: [read_png(path)]),
-    "disparity": Reader(_tiffs, "*.tiff", lambda path: [read_tiff(path)]),
-    "light": Reader(_lights, "*.*", lambda path: [EnvironmentLight.from_file(path).radiance().numpy()]),
+    "exr": Reader(_images, "*.exr", _read_image),
+    "image": Reader(_images, "*.[pj]*", _read_image),
+    "light, disparity": Reader(_images, "*.[ht]*", _read_image),
     "method": Reader(_methods, "*.toml", _read_method),
     "model": Reader(_run, "model.json", lambda path: [TrainedScene.read(path.parent).seconds]),
     "run-data": Reader(

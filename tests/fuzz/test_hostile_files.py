@@ -48,13 +48,6 @@ def test_ply_with_huge_counts_is_refused(read: Callable[[Path], Any], kind: str,
         refuse_file(read, tmp_path / "a.ply", ply(kind, body, TRIANGLE))
 
 
-def test_mesh_faces_out_of_range_are_refused(tmp_path: Path) -> None:
-    body = f"element vertex 3\n{XYZ}element face 1\n{LIST}"
-    for face in ("3 0 1 3", "3 0 1 1000000000", "3 0 1 -1"):
-        refuse_file(read_mesh, tmp_path / "a.ply", ply("ascii", body, f"{TRIANGLE}{face}\n"))
-    refuse_file(read_mesh, tmp_path / "a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
-
-
 def test_mesh_reader_opens_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither materials nor textures are opened."""
     (tmp_path / "in").mkdir()
