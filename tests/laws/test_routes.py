@@ -2,7 +2,7 @@
 
 Routes, states of a scene and features are lists that the test crosses: every shading of every method and of
 every registered reflectance model goes through every route, and every pair of the other features occurs;
-without `-m slow`, only enough of the cases to have each of them once.
+without `-m slow`, only enough of the cases to have each model and feature once.
 """
 
 from __future__ import annotations
@@ -356,10 +356,7 @@ def cases() -> Iterator[Any]:
     crossed = [(*SHADINGS[i % len(SHADINGS)], ROWS[i % len(ROWS)]) for i in range(count)]
     alone = {"samples": 4, "crop": True, "around": "nothing", "meshed": False, "state": through_a_ply}
     crossed += [(*one, alone) for one in LOSSLESS]
-    values = [
-        row | dict.fromkeys((*shading.chosen(), shading.at, shading.reflectance))
-        for shading, _, row in crossed
-    ]
+    values = [row | {"model": one.reflectance, "options": bool(one.chosen())} for one, _, row in crossed]
     for index, ((shading, primitive, row), marks) in enumerate(zip(crossed, marked(values), strict=True)):
         options = "-".join(shading.chosen())
         rays = "traced" if shading.occlusion else "open"
