@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import mi_refgs  # noqa: F401  (first: it chooses the libLLVM that Dr.Jit loads)
@@ -111,12 +111,17 @@ def rng() -> np.random.Generator:
 
 
 @pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Run Dr.Jit on one thread: floating-point sums by scatter are then bitwise the same in every run."""
-    dr.set_thread_count(1)
-    yield
+def set_threads() -> Iterator[Callable[[int], None]]:
+    """Set the number of Dr.Jit's threads, for this test."""
+    yield dr.set_thread_count
     dr.sync_thread()
     dr.set_thread_count(THREADS)
+
+
+@pytest.fixture
+def one_thread(set_threads: Callable[[int], None]) -> None:
+    """Run Dr.Jit on one thread: floating-point sums by scatter are then bitwise the same in every run."""
+    set_threads(1)
 
 
 @pytest.fixture

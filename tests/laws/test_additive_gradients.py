@@ -7,8 +7,7 @@ the same leaves as that of the image.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cached_property
 from itertools import permutations
 from pathlib import Path
@@ -287,21 +286,10 @@ def all_at_once(names: list[str]) -> list[tuple[str, ...]]:
     return [tuple(names), tuple(reversed(names))]
 
 
-@contextmanager
-def running_on(threads: int) -> Iterator[None]:
-    """Kernels run on so many threads meanwhile."""
-    before = dr.thread_count()
-    dr.set_thread_count(threads)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(before)
-
-
 @pytest.mark.parametrize("threads", [2, 1])
-def test_gradients_of_losses_add(losses: Losses, threads: int) -> None:
-    with running_on(threads):
-        check_additive(losses.gradient, losses.gradients, all_at_once([*losses.terms]))
+def test_gradients_of_losses_add(losses: Losses, threads: int, set_threads: Callable[[int], None]) -> None:
+    set_threads(threads)
+    check_additive(losses.gradient, losses.gradients, all_at_once([*losses.terms]))
 
 
 def test_tangents_of_losses_add(losses: Losses) -> None:
@@ -309,14 +297,14 @@ def test_tangents_of_losses_add(losses: Losses) -> None:
     check_additive(losses.tangent, alone, all_at_once([*losses.terms]))
 
 
-def test_gradients_of_every_pair_of_losses_add() -> None:
+def test_gradients_of_every_pair_of_losses_add(set_threads: Callable[[int], None]) -> None:
     """Two losses of one parameter at a time, so that nothing else evaluates what they write."""
     losses = Losses(model_scene("split_sum"))
-    with running_on(2):
-        for key in losses.base:
-            losses.keys = [key]
-            alone = {name: losses.gradient(name) for name in losses.terms}
-            check_additive(losses.gradient, alone, [*permutations(losses.terms, 2)])
+    set_threads(2)
+    for key in losses.base:
+        losses.keys = [key]
+        alone = {name: losses.gradient(name) for name in losses.terms}
+        check_additive(losses.gradient, alone, [*permutations(losses.terms, 2)])
 
 
 def test_every_parameter_has_a_gradient(losses: Losses) -> None:

@@ -8,7 +8,6 @@ thorough`, every three values of any three options.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -58,14 +57,6 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("case", params)
 
 
-@pytest.fixture
-def threads() -> Iterator[Any]:
-    before = dr.thread_count()
-    yield dr.set_thread_count
-    dr.sync_thread()
-    dr.set_thread_count(before)
-
-
 def group(name: str) -> str:
     """Values that are moved together."""
     if name.startswith(AROUND):
@@ -73,9 +64,9 @@ def group(name: str) -> str:
     return GROUPS.get(name, "materials")
 
 
-def test_images_and_derivatives_of_all_pairs_of_options(case: Case, tmp_path: Path, threads: Any) -> None:
+def test_images_and_derivatives_of_all_pairs_of_options(case: Case, tmp_path: Path, set_threads: Any) -> None:
     try:
-        threads(case["threads"])
+        set_threads(case["threads"])
         check(case, tmp_path)
     except Exception as error:
         error.add_note(f"case: {spec(case)}")
