@@ -105,7 +105,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film, "DERIVATIVE_SAMPLES", FEW)
 
 
-@pytest.mark.parametrize("kind", ["open", "surfel", "antialias"])
+@pytest.mark.parametrize(
+    "kind", ["open", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("surfel", "antialias"))]
+)
 def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
