@@ -128,8 +128,8 @@ SCENES: dict[str, Callable[[Path], Any]] = {
 }
 
 
-SAMPLE = {"surroundings at surfels", "traced bounces", "resampled envmap", "BSDF, prb"}
-"""Scenes that are tested without `-m slow`."""
+SAMPLE = {"traced bounces", "BSDF, prb"}
+"""Scenes that are tested without `-m slow`; cases of `test_option_pairs` with a prior test others."""
 
 
 # ---------------- losses ----------------
@@ -286,7 +286,7 @@ def all_at_once(names: list[str]) -> list[tuple[str, ...]]:
     return [tuple(names), tuple(reversed(names))]
 
 
-@pytest.mark.parametrize("threads", [2, 1])
+@pytest.mark.parametrize("threads", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_gradients_of_losses_add(losses: Losses, threads: int, set_threads: Callable[[int], None]) -> None:
     set_threads(threads)
     check_additive(losses.gradient, losses.gradients, all_at_once([*losses.terms]))
