@@ -26,9 +26,9 @@ def fast_camera(case: Case) -> Camera:
 
 
 @functools.lru_cache(maxsize=8)
-def filters(height: int, levels: lobe_matrices.Levels = lobe_matrices.LEVELS) -> list[Array]:
+def filters(height: int) -> list[Array]:
     """Dense matrices (2 h_out², 2 height²) of the product's prefilter, float64."""
-    return [dense_filter(level.weights) for level in lobe_matrices.build_levels(height, levels)]
+    return [dense_filter(level.weights) for level in lobe_matrices.build_levels(height)]
 
 
 def light_of(raw: Array) -> Light:

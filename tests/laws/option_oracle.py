@@ -190,11 +190,11 @@ def map_of(case: Case, values: Values) -> Array:
 
 
 def light_of(case: Case, values: Values) -> Light:
-    radiance, wanted = map_of(case, values), lobe_matrices.LEVELS
-    levels = filtered(radiance, filters(len(radiance), wanted))
+    radiance = map_of(case, values)
+    levels = filtered(radiance, filters(len(radiance)))
     if case["map"] == "constant" and case["emitter"] != "tensor":
         levels = [np.broadcast_to(radiance[0, 0], level.shape) for level in levels]
-    return Light(levels, wanted.roughness, brdf.table().astype(np.float64), rotation(case).T)
+    return Light(levels, lobe_matrices.LEVEL_ROUGHNESS, brdf.table().astype(np.float64), rotation(case).T)
 
 
 # ---------------- rays ----------------

@@ -29,7 +29,7 @@ from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.light_file import read_radiance
-from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels
+from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.light.prefilter import Operator, prefilter
 
 ATANH_TERMS = 7  # terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1
@@ -87,7 +87,7 @@ class PrefilteredLight:
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
         """∫ L cosθ dω / π over the hemisphere of unit world normals: the last level, whose D is constant."""
-        return self._bilinear(*azimuth_polar(normal), mi.UInt32(len(self.operator.roughness)))
+        return self._bilinear(*azimuth_polar(normal), mi.UInt32(len(LEVEL_ROUGHNESS)))
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Radiance averaged over the GGX lobe around unit world directions. [split sum, Karis 2013]
@@ -95,8 +95,8 @@ class PrefilteredLight:
         Linear between levels in 1/roughness, which keeps the lobe's energy (6 %) and its peak, and in
         roughness⁴ below the first. Derivative in light, direction and roughness.
         """
-        place = _level(roughness, self.operator.roughness)
-        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(self.operator.roughness) - 1)
+        place = _level(roughness)
+        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(LEVEL_ROUGHNESS) - 1)
         at = azimuth_polar(direction)
         return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
 
@@ -158,14 +158,14 @@ def azimuth_polar(direction: Any) -> tuple[Any, Any]:
     return u, dr.atan2(sin, dr.select(off_pole, y, dr.select(y < 0, -1, 1))) * (1 / dr.pi)
 
 
-def _level(roughness: Any, levels: tuple[float, ...]) -> Any:
-    """Fractional level 0 … L of a roughness, clamped to [0, 1], for the roughness of the L levels."""
-    first = levels[0]
+def _level(roughness: Any) -> Any:
+    """Fractional level 0 … L of a roughness, clamped to [0, 1]."""
+    first = LEVEL_ROUGHNESS[0]
     r = dr.clip(roughness, 0, 1)
     sharp = dr.minimum(r, first) * (1 / first)
     level = dr.square(dr.square(sharp))
     inverse = dr.rcp(dr.maximum(r, first))
-    for a, b in pairwise(levels):
+    for a, b in pairwise(LEVEL_ROUGHNESS):
         level += dr.clip((inverse - 1 / a) * (1 / (1 / b - 1 / a)), 0, 1)
     return level
 
@@ -231,9 +231,9 @@ class EnvironmentLight:
         return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
 
     @phase("prefilter forward", backward="prefilter backward")
-    def prefilter(self, levels: Levels = LEVELS) -> PrefilteredLight:
+    def prefilter(self) -> PrefilteredLight:
         """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""
-        return PrefilteredLight(*prefilter(self.radiance(), levels))
+        return PrefilteredLight(*prefilter(self.radiance()))
 
     def unfiltered(self) -> UnfilteredLight:
         """The map of this light, under AD, for models that look up `radiance` only."""

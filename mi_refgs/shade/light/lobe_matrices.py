@@ -28,16 +28,6 @@ LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)
 (L1) from the third level on; the first two are as fine as the finest map that is filtered. [measured]"""
 
 
-@dataclass(frozen=True)
-class Levels:
-    """The filtered levels of a light: roughness, rising to 1, and at most how many rows each has."""
-
-    roughness: tuple[float, ...] = LEVEL_ROUGHNESS
-    max_height: tuple[int, ...] = LEVEL_MAX_HEIGHT
-
-
-LEVELS = Levels()  # the levels of a light by default
-
 DROP_BELOW = 1e-5
 """Matrix entries below this fraction of their level's largest are dropped: 0.05 % of a lobe (L1), 1e-4 of its
 peak at the worst."""
@@ -159,14 +149,14 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     return out * scale
 
 
-def build_levels(h: int, levels: Levels = LEVELS) -> list[Level]:
+def build_levels(h: int) -> list[Level]:
     """The filtered levels of a map (h, 2h), coarser ones on coarser grids.
 
     Maps of more rows than the finest level are averaged down to it first, inside the same matrices.
     """
-    h_in = min(h, levels.max_height[0])
+    h_in = min(h, LEVEL_MAX_HEIGHT[0])
     built = []
-    for roughness, cap in zip(levels.roughness, levels.max_height, strict=True):
+    for roughness, cap in zip(LEVEL_ROUGHNESS, LEVEL_MAX_HEIGHT, strict=True):
         weights = fourier_rows(roughness, h_in, min(h_in, cap))
         if h_in < h:
             m = np.arange(h_in + 1)

@@ -21,7 +21,7 @@ from scipy import fft
 from scipy.sparse import csc_matrix
 
 from mi_refgs.kernels.device import upload
-from mi_refgs.shade.light.lobe_matrices import LEVELS, Levels, build_levels
+from mi_refgs.shade.light.lobe_matrices import build_levels
 from mi_refgs.types import Float, TensorXf, UInt32
 
 TEXEL = 4  # floats per texel
@@ -35,7 +35,6 @@ class Operator:
     matrix: csc_matrix  # float32, from coefficients of the map to those of all levels, one after the other
     info: UInt32  # 4 a level: first texel, h, w, 0; level 0 is the map itself
     shapes: tuple[tuple[int, int], ...]  # (first texel, h) of each level, the same on the host
-    roughness: tuple[float, ...]  # of each level but the map itself
 
     @property
     def texels(self) -> int:
@@ -92,9 +91,9 @@ def _product(matrix: csc_matrix, coefficients: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=4)
-def _matrix(height: int, levels: Levels) -> tuple[csc_matrix, list[int]]:
+def _matrix(height: int) -> tuple[csc_matrix, list[int]]:
     """The matrix of an operator, the same in every variant, and the rows of its levels."""
-    built, values, rows, columns, first = build_levels(height, levels), [], [], [], 0
+    built, values, rows, columns, first = build_levels(height), [], [], [], 0
     for level in built:
         i, k, m = np.nonzero(level.weights)
         values.append(level.weights[i, k, m].astype(np.float32))
@@ -107,17 +106,17 @@ def _matrix(height: int, levels: Levels) -> tuple[csc_matrix, list[int]]:
 
 
 @functools.lru_cache(maxsize=4)
-def _operator(variant: str, height: int, levels: Levels) -> Operator:
-    matrix, heights = _matrix(height, levels)
+def _operator(variant: str, height: int) -> Operator:
+    matrix, heights = _matrix(height)
     firsts = np.cumsum([0, *(2 * h * h for h in (height, *heights[:-1]))]).tolist()
     shapes = tuple(zip(firsts, (height, *heights), strict=True))
     info = upload(np.array([(first, h, 2 * h, 0) for first, h in shapes]), mi.UInt32)
-    return Operator(height, matrix, info, shapes, levels.roughness)
+    return Operator(height, matrix, info, shapes)
 
 
-def operator(height: int, levels: Levels = LEVELS) -> Operator:
-    """The prefilter for maps (height, 2·height), built once per height, levels and variant (64 rows: 1 s)."""
-    return _operator(mi.variant(), height, levels)
+def operator(height: int) -> Operator:
+    """The prefilter for maps (height, 2·height), built once per height and variant (64 rows: 1 s)."""
+    return _operator(mi.variant(), height)
 
 
 class _Prefilter(dr.CustomOp):
@@ -142,7 +141,7 @@ class _Prefilter(dr.CustomOp):
         return "prefilter"
 
 
-def prefilter(radiance: TensorXf, levels: Levels = LEVELS) -> tuple[Operator, Any]:
+def prefilter(radiance: TensorXf) -> tuple[Operator, Any]:
     """Operator and levels (flat RGBA, under AD) of a radiance tensor (h, 2h, 3), h a multiple of 4."""
-    found = operator(radiance.shape[0], levels)
+    found = operator(radiance.shape[0])
     return found, dr.custom(_Prefilter, found, radiance.array)
