@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.common.timing import milliseconds
 from benchmarks.splatting import measure
 from benchmarks.splatting.cases import Workload, sphere
 from benchmarks.splatting.renderers import Ours, Volprim
@@ -91,10 +90,3 @@ def test_linear_fit_recovers_coefficients(rng: np.random.Generator) -> None:
     expected = {"constant": 5e6, "a": 3, "b": 40}
     assert all(found[key] == pytest.approx(value, rel=1e-3) for key, value in expected.items())
     assert found["c"] < 1e-2 and found["r2"] > 0.9999
-
-
-def test_slow_calls_run_in_fewer_rounds() -> None:
-    met: list[str] = []
-    slow = {"slow": (lambda: met.append("s"), 2)}
-    found = milliseconds({"fast": lambda: met.append("f")}, 1e-9, 5, slow)
-    assert "".join(met) == "fs" + "fsfs" + "fff" and found.keys() == {"fast", "slow"}
