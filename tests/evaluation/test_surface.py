@@ -22,6 +22,11 @@ from tests.helpers import unit
 from tests.scenes.known import CENTRES, RADII, SIZE
 
 
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface, "QUERIES", 4_000)
+
+
 def mesh_of(shape: Any) -> Mesh:
     return Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32), 1e-3)
 

@@ -188,16 +188,12 @@ def test_saved_run_renders_bit_identically(balls: Reconstruction, tmp_path: Path
     assert again.provenance == balls.provenance
 
 
-def test_commands_accept_a_saved_run(
-    balls: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_accept_a_saved_run(balls: Reconstruction, tmp_path: Path) -> None:
     """A folder without checkpoints is a run."""
     run = tmp_path / "new"
     balls.save(run)
-    assert main(["eval", str(run)]) == 0
     assert main(["render", str(run), "-o", str(tmp_path / "view.png")]) == 0
     assert main(["export", str(run)]) == 0
-    assert "PSNR" in capsys.readouterr().out
     assert mi_refgs.load(run).evaluate()["psnr"] > 22
     refused(lambda: balls.save(run), "a run already")
 

@@ -230,5 +230,5 @@ def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
     changes: dict[str, Any] = {"light": None, "mesh": None, "shading": Shading("surfel", "radiance")}
     colour = replace(TrainedScene.read(run.path), **changes)
     export(colour, bare.path, read_dataset(known / "data", "test").views[0].camera())
-    words = "bare: light: the run has none; fit one", "--for relighting"
+    words = "bare: reflectance: radiance shows the light of the fit only; fit one", "--for relighting"
     refused(lambda: relight(bare, light, tmp_path / "out"), *words)
