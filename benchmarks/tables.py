@@ -140,8 +140,8 @@ def _flat(row: Row) -> Row:
     """Return the row with its minutes, relit scores and trials as entries."""
     found = row | {"train_minutes": row["train_seconds"] / 60}
     found |= {f"relit_{name}": score for name, score in row.get("relit", {}).items()}
-    for trial in (trial for trial in row["decisions"] if trial["with_it"]):
-        gain = trial["with_it"]["psnr"] - trial["without"]["psnr"]
+    for trial in (trial for trial in row["decisions"] if trial["psnr_with"] is not None):
+        gain = trial["psnr_with"] - trial["psnr_without"]
         found[trial["component"]] = f"{gain:+.1f} dB: {'chosen' if trial['stays'] else 'left out'}"
     return found
 
