@@ -292,6 +292,7 @@ def test_gradients_of_losses_add(losses: Losses, threads: int, set_threads: Call
     check_additive(losses.gradient, losses.gradients, all_at_once([*losses.terms]))
 
 
+@pytest.mark.slow
 def test_tangents_of_losses_add(losses: Losses) -> None:
     alone = {name: losses.tangent(name) for name in losses.terms}
     check_additive(losses.tangent, alone, all_at_once([*losses.terms]))
