@@ -12,7 +12,7 @@ from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.kernels import memory
-from tests.helpers import command_names, refused
+from tests.helpers import refused
 from tests.scenes.integrator import scene, sensor
 from tests.scenes.tiny import train_command
 
@@ -29,18 +29,6 @@ BOUNDED = {
     "dataset": ["dataset", "SCENE", "-o", "OUT"],
 }
 """Commands that need memory, and arguments with which each is refused where there is none."""
-UNBOUNDED = {
-    "demo": "dataset, train and render, one after the other",
-    "compare": "train and eval in processes of their own",
-    "capture": "COLMAP, which keeps to memory itself, and one photograph at a time",
-    "doctor": "reads headers",
-    "completion": "prints a script",
-}
-"""Commands that need none beyond that of others, or none that grows, and why."""
-
-
-def test_every_command_is_listed_with_its_bound() -> None:
-    assert {*command_names()} == BOUNDED.keys() | UNBOUNDED.keys() and not BOUNDED.keys() & UNBOUNDED.keys()
 
 
 @pytest.mark.parametrize("name", BOUNDED)

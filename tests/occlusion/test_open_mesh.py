@@ -153,17 +153,6 @@ def test_a_room_is_a_cavity_that_stays() -> None:
     assert np.quantile(inward[far], 0.05) > 0  # walls face the room
 
 
-def test_all_views_and_regions_share_one_kernel() -> None:
-    def run(region: Region, count: int) -> None:
-        poses = ring_of_views(8)[:count]
-        fuse([np.full((SIZE, SIZE), 2.0)] * count, poses, 16, region)
-
-    run(REGION, 2)
-    before = dr.detail.launch_stats()
-    run(Region((0.5, 0.0, 0.0), 0.7), 8)
-    assert dr.detail.launch_stats()[1:] == before[1:], "recompiled"
-
-
 def sheet(normal: np.ndarray, points: np.ndarray, size: float) -> Surfels:
     """Opaque round surfels of one normal."""
     normals, rng = np.tile(normal, (len(points), 1)), np.random.default_rng(0)

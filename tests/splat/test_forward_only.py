@@ -12,7 +12,6 @@ import pytest
 
 from mi_refgs import splat
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -143,22 +142,6 @@ def test_compacted_pixels_contain_each_pixel_of_chosen_patches_once() -> None:
     np.testing.assert_array_equal(back, np.flatnonzero(there))
     alpha = np.array(splat.splat(things(), [], view).alpha)
     assert not alpha[~there].any() and alpha[there].any()
-
-
-def test_second_view_reuses_kernels() -> None:
-    """The number of patches with surfels changes from view to view."""
-    shading = Shading(reflectance="radiance")
-
-    def frame(distance: float) -> None:
-        pose = look_at(np.array([1.0, 1.5, 3.0]) * distance, np.zeros(3), up=(0, 1, 0))
-        view = Camera.from_pose(45, 38, -30.0, -30.0, 20.0, 22.0, pose)
-        dr.eval(render(SurfelScene(things(), shading), view, Request(forward_only=True)).radiance)
-        dr.sync_thread()
-
-    frame(1.0)
-    misses = dr.detail.launch_stats()[1:]
-    frame(1.6)
-    assert dr.detail.launch_stats()[1:] == misses
 
 
 def test_the_plugin_filters_a_light_that_changes_again() -> None:
