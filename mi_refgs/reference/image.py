@@ -78,15 +78,15 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     weight, depth = blend.weight[:count], np.sum(blend.weight * blend.z, 0)
     sums = np.concatenate([weight.T @ features, depth[:, None], weight.sum(0)[:, None]], axis=1)
     resolve = Resolve(scene, features_of, x, y, sums)
-    if around:
-        resolve.depth = depth * inverse_alpha(blend.weight.sum(0))
+    mean_depth = depth * inverse_alpha(blend.weight.sum(0))
+    resolve.depth = mean_depth if around else None
     pixel_taps: list[tuple[Array, Array, Array]] = []
     maps = resolve.named(resolve(sums, pixel_taps).real)
     if around:
         colour = harmonics(around["radiance_sh"], unit(around["position"] - camera.to_world[:3, 3]))
         maps["radiance"] = maps["radiance"] + blend.weight[count:].T @ positive(colour + 0.5)
         maps |= {"object_alpha": maps["alpha"], "alpha": blend.weight.sum(0)[:, None]}
-        maps["depth"] = resolve.depth[:, None]
+        maps["depth"] = mean_depth[:, None]
     if scene.background is not None:
         texels = np.log1p(np.exp(np.asarray(scene.background, np.float64)))
         maps["background"] = radiance_of(texels, resolve.ray)

@@ -93,8 +93,9 @@ class Camera:
         turn = mi.Matrix3f([opaque(*row) for row in rotation.T])
         origin = matrix[:3, 3].astype(np.float32)
         place, rest = mi.Point3f(*opaque(*origin)), mi.Vector3f(*opaque(*(matrix[:3, 3] - origin)))
-        lens = opaque(fx, fy, cx, cy)
-        return Camera(width, height, *lens, turn, place, rest, *opaque(near), abs(float(fx)))
+        lens = dict(zip(("fx", "fy", "cx", "cy", "near"), opaque(fx, fy, cx, cy, near), strict=True))
+        focal = abs(float(fx))
+        return Camera(width, height, rotation=turn, origin=place, origin_rest=rest, focal=focal, **lens)
 
     @staticmethod
     def look_at(

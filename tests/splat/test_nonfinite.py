@@ -68,7 +68,8 @@ SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("pixel", "mesh")
 @pytest.mark.filterwarnings("ignore:refgs:RuntimeWarning")
 @pytest.mark.parametrize("kind", ["surfel", "bounces", *SLOW])
 def test_surfel_with_unusable_value_is_ignored(kind: str, tmp_path: Path) -> None:
-    raw, mesh = raw_channels(), {"mesh": plane_mesh(tmp_path)} if "traced_bounces" in KINDS[kind] else {}
+    raw = raw_channels()
+    mesh: Any = {"mesh": plane_mesh(tmp_path)} if "traced_bounces" in KINDS[kind] else {}
     made = scene(**KINDS[kind], **mesh)
     light = np.array(mi.traverse(made)["integrator.light"].numpy())
     others = np.setdiff1d(np.arange(COUNT), CULPRITS)

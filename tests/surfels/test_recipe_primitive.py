@@ -28,7 +28,7 @@ from mi_refgs.surfels import attributes, primitives
 from mi_refgs.surfels.attributes import Attribute
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
-from mi_refgs.surfels.primitives import Footprints, Primitive
+from mi_refgs.surfels.primitives import Footprints, FootprintSample, Primitive
 from mi_refgs.surfels.primitives.primitive import cutoff_radius_squared, rectangle
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.tiny import train_command, write_data
@@ -37,10 +37,7 @@ RADIUS = Attribute("radius", (1,), "exp", 5e-3, ("radius",), geometry=True)
 
 
 @dataclass(frozen=True)
-class BallSample:
-    alpha: Any
-    z: Any
-    valid: Any
+class BallSample(FootprintSample):
     gaussian: Any
     delta: Any
 
