@@ -75,11 +75,8 @@ def _creased(point: np.ndarray, normal: np.ndarray, hit: np.ndarray) -> np.ndarr
 class ErrorBudget:
     """Accumulates pixels, squared errors and normal errors per class over views."""
 
-    pixels: np.ndarray = field(default_factory=lambda: np.zeros(len(CLASSES), int))  # (classes,)
-    squared: np.ndarray = field(default_factory=lambda: np.zeros(len(CLASSES)))  # of displayed colours
-    angle: np.ndarray = field(default_factory=lambda: np.zeros(len(CLASSES)))  # degrees, sum over `known`
-    known: np.ndarray = field(default_factory=lambda: np.zeros(len(CLASSES), int))
-    """Foreground pixels with a true normal."""
+    sums: np.ndarray = field(default_factory=lambda: np.zeros((4, len(CLASSES))))
+    """Pixels; squared errors of displayed colours; angles of normals in degrees; pixels with an angle."""
 
     def add(self, rendered: RenderedView, view: View, classes: np.ndarray | None) -> None:
         """Add the pixels of a loaded view with the classes (H, W) that `classify` returned."""
@@ -88,10 +85,8 @@ class ErrorBudget:
         ours, true = (np.clip(image, 0, 1).astype(np.float64) for image in (rendered.image, view.displayed))
         known = foreground(view.normal, view.covered())
         angle = np.where(known, angle_deg(rendered.normal, view.normal), 0)
-        self.pixels += _sums(classes, np.ones(classes.shape)).astype(int)
-        self.squared += _sums(classes, np.sum((ours - true) ** 2, axis=-1))
-        self.angle += _sums(classes, angle)
-        self.known += _sums(classes, known).astype(int)
+        values = np.ones(classes.shape), np.sum((ours - true) ** 2, axis=-1), angle, known
+        self.sums += [np.bincount(classes.ravel(), x.ravel(), len(CLASSES)) for x in values]
 
     def result(self) -> dict[str, Any]:
         """Return `error_budget` of metrics.json, None with a reason if no view has ground truth.
@@ -99,20 +94,16 @@ class ErrorBudget:
         Each class that occurs has `pixels` (fraction of all), `squared_error` (fraction of the sum over all
         pixels; 0 if there is none) and `normal_mae_deg`, None where it has no true normal.
         """
-        if not self.pixels.any():
+        pixels, squared, angle, known = self.sums
+        if not pixels.any():
             return {"error_budget": None, "error_budget_reason": NO_BUDGET}
         budget = {
             name: {
-                "pixels": float(self.pixels[i] / self.pixels.sum()),
-                "squared_error": float(self.squared[i] / max(self.squared.sum(), 1e-30)),
-                "normal_mae_deg": float(self.angle[i] / self.known[i]) if self.known[i] else None,
+                "pixels": float(pixels[i] / pixels.sum()),
+                "squared_error": float(squared[i] / max(squared.sum(), 1e-30)),
+                "normal_mae_deg": float(angle[i] / known[i]) if known[i] else None,
             }
             for i, name in enumerate(CLASSES)
-            if self.pixels[i]
+            if pixels[i]
         }
         return {"error_budget": budget, "error_budget_reason": None}
-
-
-def _sums(classes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sum values (H, W) per class."""
-    return np.bincount(classes.ravel(), values.ravel(), len(CLASSES))
