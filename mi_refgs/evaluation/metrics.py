@@ -15,11 +15,11 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from scipy.ndimage import correlate1d
+from skimage.metrics import structural_similarity
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.ssim import C1, C2, WINDOW_RADIUS, window
+from mi_refgs.fitting.ssim import WINDOW_RADIUS, WINDOW_SIGMA
 from mi_refgs.io.images import psnr_of, srgb_from_linear
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
@@ -55,16 +55,11 @@ def ssim(
 
     Outside of the image the window reads zeros, as in 3DGS and Ref-Gaussian; means are over every pixel.
     """
-    weights = window(WINDOW_RADIUS)
-
-    def blur(values: np.ndarray) -> np.ndarray:
-        return correlate1d(correlate1d(values, weights, 0, mode="constant"), weights, 1, mode="constant")
-
-    x, y = _pair(image, truth)
-    μx, μy = blur(x), blur(y)
-    product, square = blur(x * y) - μx * μy, blur(x * x + y * y) - μx**2 - μy**2
-    similar = (2 * μx * μy + C1) * (2 * product + C2) / ((μx**2 + μy**2 + C1) * (square + C2))
-    return float(similar[where].mean())
+    r = WINDOW_RADIUS
+    x, y = (np.pad(array, ((r, r), (r, r), (0, 0))) for array in _pair(image, truth))
+    options = {"gaussian_weights": True, "sigma": WINDOW_SIGMA, "use_sample_covariance": False, "full": True}
+    _, similar = structural_similarity(x, y, data_range=1.0, channel_axis=-1, **options)
+    return float(similar[r:-r, r:-r][where].mean())
 
 
 def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
