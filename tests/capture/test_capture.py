@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import capture as capture_benchmark
-from benchmarks.capture import best_similarity, pose_errors
+from benchmarks.capture import best_similarity
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
 from mi_refgs.capture.frame import region_of_interest, up_direction
@@ -120,17 +120,6 @@ def test_captured_data_set_is_read(captured: Path, capsys: pytest.CaptureFixture
     assert all(view.alpha is not None and {0.0, 1.0} == {*np.unique(view.alpha)} for view in train.views)
     assert train.region is not None and replace(train.region, planes=()) == Region((0, 0, 0), 1)
     assert train.points is not None
-    shots = scene.around(COUNT)
-    truth = []
-    for i, view in [(int(view.name[:2]), view) for view in train.views]:
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = shots[i].rotation.T * [-1, -1, 1], shots[i].origin
-        truth.append(replace(view, to_world=pose, fx=scene.FOCAL))
-    errors = pose_errors(train.views, truth)
-    assert errors.count == COUNT - 2 and errors.rotation.max() < 0.5 and errors.position.max() < 0.01
-    assert abs(errors.focal).max() < 0.02
-    with pytest.raises(KeyError):
-        pose_errors(train.views, test.views)
     assert capture_benchmark.main([str(captured / "data")] * 2) == 0
     out = capsys.readouterr().out
     assert f"{COUNT} of {COUNT} images placed" in out and "| rotation, degrees | 0.000 | 0.000 |" in out
@@ -298,28 +287,24 @@ def test_disconnected_groups_are_counted(tmp_path: Path) -> None:
 def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     photographs = _made(tmp_path / "photographs")
+    command = ["capture", photographs, "-o", tmp_path / "data"]
     refused(["capture", tmp_path / "none", "-o", tmp_path / "data"], "no such folder")
     for name in ("a.HEIC", "b.HEIC", "c.heic"):
         (photographs / name).write_bytes(b"0")
-    refused(["capture", photographs, "-o", tmp_path / "data"], "convert its .HEIC files to JPEG")
+    refused(command, "convert its .HEIC files to JPEG")
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         (photographs / name).write_bytes(b"0")
-    refused(["capture", photographs, "-o", tmp_path / "data"], "a.jpg: pixels: not a readable image")
-    refused(["capture", photographs, "-o", tmp_path / "data", "--camera-model", "PIG"], "unknown lens model")
-    for numbers in ((0, 0, 0, -1), (0, 0, float("nan"), 1), (0, 1e30, 0, 1), (0, 0, 0, 0)):
-        said = refused(["capture", photographs, "-o", tmp_path, "--region", *numbers])
-        assert "--region: centre, radius: not three numbers and a positive one" in said
+    refused(command, "a.jpg: pixels: not a readable image")
+    refused([*command, "--camera-model", "PIG"], "unknown lens model")
+    refused([*command, "--region", 0, 0, "nan", 1], "--region: centre, radius: not three numbers")
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         scene.save(photographs / name, np.zeros((8, 8, 3), dtype=np.uint8))
     refused(["capture", photographs, "-o", photographs], "choose another")
+    refused([*command, "--masks", tmp_path / "no"], "no such folder")
+    assert not (tmp_path / "data").exists()
     for width in range(9, 13):
         scene.save(photographs / f"{width}.jpg", np.zeros((8, width, 3), dtype=np.uint8))
-    refused(["capture", photographs, "-o", tmp_path], "5 different sizes, such as 10 × 8 ('10.jpg')")
-    for width in range(9, 13):
-        (photographs / f"{width}.jpg").unlink()
-    (_made(tmp_path / "other") / "file").touch()
-    refused(["capture", photographs, "-o", tmp_path / "other"], "not empty")
-    refused(["capture", photographs, "-o", tmp_path / "data", "--masks", tmp_path / "no"], "no such folder")
+    refused(command, "5 different sizes, such as 10 × 8 ('10.jpg')")
 
 
 def test_missing_pycolmap_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -276,12 +276,6 @@ def test_bad_input_names_file_field_and_remedy(
     assert message.startswith(str(folder)) and "\n" not in message.partition(" ← ")[0]
 
 
-def test_single_image_leaves_zero_training_views(folder: Path) -> None:
-    edit(lambda c: c.update(frames=c["frames"][:1]))(folder)
-    (folder / "transforms_test.json").unlink()
-    refused(lambda: read_loaded(folder, "train"), "zero train views")
-
-
 def test_averaged_view_shows_the_same_points(folder: Path) -> None:
     """Pixels are means of blocks, and a point lands in the block of its pixel."""
     view = read_loaded(folder, "train").views[0]

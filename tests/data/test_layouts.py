@@ -62,14 +62,6 @@ def test_ply_file_path_gives_points(kind: str, tmp_path: Path) -> None:
     check(found.views[0], SHOTS[1])
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [("../a.ply", "ply_file_path: '../a.ply' names no file"), ("no.ply", "missing"), (3, "names no file")],
-)
-def test_missing_ply_file_is_refused(name: Any, said: str, tmp_path: Path) -> None:
-    refused(lambda: read_dataset(write_nerfstudio(tmp_path, ply_file_path=name), "train"), said)
-
-
 def test_filenames_define_splits(tmp_path: Path) -> None:
     data = write_nerfstudio(tmp_path, test_filenames=["images/c.png"], val_filenames=["images/d.png"])
     names = {split: [v.name for v in read_dataset(data, split).views] for split in ("train", "test")}
@@ -320,10 +312,3 @@ def test_cameras_that_make_no_sense(pose: Any, matrix: Any, said: str, tmp_path:
     data = write_glossy(tmp_path)
     (data / "1-camera.pkl").write_bytes(pickle.dumps([pose, matrix]))
     refused(lambda: read_dataset(data, "train"), "1-camera.pkl:", said)
-
-
-def test_glossy_without_training_views_is_refused(tmp_path: Path) -> None:
-    data = write_glossy(tmp_path)
-    for i in range(1, 9):
-        (data / f"{i}-camera.pkl").unlink()
-    refused(lambda: read_dataset(data, "train"), "zero train views")

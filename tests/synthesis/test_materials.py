@@ -183,15 +183,6 @@ def test_material_maps_are_those_of_the_scene(made: Path) -> None:
     assert min(seen.values()) > 50
 
 
-def test_downscaled_maps_are_means_of_defined_pixels(made: Path) -> None:
-    whole, half = (read_loaded(made, "train", downscale=d).views[0] for d in (1, 2))
-    for name, values in whole.materials.items():
-        blocks = values.reshape(16, 2, 16, 2, -1)
-        share = blocks[..., -1:].mean((1, 3))
-        mean = (blocks[..., :-1] * blocks[..., -1:]).mean((1, 3)) / np.maximum(share, 1e-12)
-        np.testing.assert_allclose(half.materials[name], np.concatenate([mean, share], -1), atol=1e-6)
-
-
 def test_map_of_other_size_is_refused(made: Path, tmp_path: Path) -> None:
     shutil.copytree(made, tmp_path / "data")
     path = tmp_path / "data" / "test" / "r_000_albedo.exr"
