@@ -38,6 +38,8 @@ WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12
 LENS_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV")  # that are tried, from few to many parameters
 LENS_GAIN = 0.01  # by which more parameters must reduce the mean reprojection error; noise gives 1e-4
 
+Reconstruction = Any  # pycolmap.Reconstruction
+Token = Any  # pycolmap.CancellationToken
 Result = TypeVar("Result")
 Item = TypeVar("Item")
 
@@ -118,7 +120,7 @@ def extract(database: Path, folder: Path, names: Sequence[str]) -> None:
     options.sift.max_num_features = MOST_FEATURES
     settings = (pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions(), options, pycolmap.Device.cpu)
 
-    def work(part: Sequence[str], token: Any) -> None:
+    def work(part: Sequence[str], token: Token) -> None:
         pycolmap.extract_features(database, folder, list(part), *settings, cancellation_token=token)
 
     _in_parts(names, IMAGES_AT_ONCE, "features", work)
@@ -135,7 +137,7 @@ def match(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
     verification.ransac.random_seed = SEED
     settings = (matching, pairing, verification, pycolmap.Device.cpu)
 
-    def work(part: Sequence[tuple[str, str]], token: Any) -> None:
+    def work(part: Sequence[tuple[str, str]], token: Token) -> None:
         listed.write_text("".join(f"{first} {second}\n" for first, second in part))
         pycolmap.match_image_pairs(database, *settings, cancellation_token=token)
 
@@ -171,7 +173,7 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
         def one_more() -> None:
             shown.update(next(placed) <= count)
 
-        def call(token: Any) -> Any:
+        def call(token: Token) -> Any:
             calls = {"initial_image_pair_callback": one_more, "next_image_callback": one_more}
             arguments = (database, folder, output, options)
             return pycolmap.incremental_mapping(*arguments, **calls, cancellation_token=token)
@@ -236,7 +238,7 @@ class Solved:
         return self.rotation[:, 2]
 
     @classmethod
-    def of(cls, model: Any) -> Solved:
+    def of(cls, model: Reconstruction) -> Solved:
         """Convert a pycolmap.Reconstruction; images are sorted by name."""
         images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
         poses = [image.cam_from_world() for image in images]
@@ -253,7 +255,7 @@ class Solved:
         )
 
 
-def with_lens(model: Any, kind: str) -> tuple[Any, float]:
+def with_lens(model: Reconstruction, kind: str) -> tuple[Any, float]:
     """Bundle-adjusted copy of a reconstruction with another lens model; mean reprojection error, pixels."""
     pycolmap = load()
     copy = pycolmap.Reconstruction(model)
@@ -268,7 +270,7 @@ def with_lens(model: Any, kind: str) -> tuple[Any, float]:
     return copy, float(copy.compute_mean_reprojection_error())
 
 
-def adjust(model: Any) -> None:
+def adjust(model: Reconstruction) -> None:
     """Bundle adjustment of everything but the principal points."""
     pycolmap = load()
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
@@ -281,7 +283,7 @@ def adjust(model: Any) -> None:
     model.update_point_3d_errors()
 
 
-def best_lens(model: Any) -> Any:
+def best_lens(model: Reconstruction) -> Reconstruction:
     """The reconstruction with the simplest lens model that fits the observations."""
     best, error = with_lens(model, LENS_MODELS[0])
     for kind in LENS_MODELS[1:]:

@@ -72,7 +72,7 @@ class Straight:
         return result
 
 
-def straighten(model: Any, photographs: dict[str, Photograph]) -> dict[str, Straight]:
+def straighten(model: colmap.Reconstruction, photographs: dict[str, Photograph]) -> dict[str, Straight]:
     """The undistortion of each registered image by the name of its working copy."""
     images = [model.images[i] for i in model.reg_image_ids()]
     sizes = {image.camera_id: photographs[image.name].kept_size for image in images}
@@ -135,7 +135,7 @@ def write_images(
 
 
 def write_model(
-    model: Any,
+    model: colmap.Reconstruction,
     photographs: dict[str, Photograph],
     straight: dict[str, Straight],
     similarity: Similarity,

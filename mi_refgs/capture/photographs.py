@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
+from mi_refgs.data.images import mask_in
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
 from mi_refgs.io.images import ENDINGS, exif_tags, image_size, open_image, read_mask, to_8_bits
@@ -150,10 +151,10 @@ def _photograph(path: Path) -> Photograph:
     return Photograph(path, digest, size, focal, device, plain, orientation)
 
 
-def _positive(value: Any) -> float | None:
+def _positive(value: object) -> float | None:
     """A positive number in EXIF data, else None; it may be a fraction with denominator 0, or anything."""
     try:
-        number = float(value)
+        number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if 0 < number < np.inf else None
@@ -172,23 +173,17 @@ def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int) 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
     """The mask of each photograph by the photograph's name; empty without a folder.
 
-    The mask of PHOTO.jpg is PHOTO.png, PHOTO.jpg.png or PHOTO.jpg, of its stored or displayed size.
-    Raises InputError for a photograph without a mask and for a mask of another size.
+    Masks are named as in `data.images.mask_in`, and have the stored or displayed size. Raises InputError for
+    a photograph without a mask and for a mask of another size.
     """
+    masks: dict[str, Path] = {}
     if folder is None:
-        return {}
+        return masks
     if not folder.is_dir():
         raise InputError("no such folder", folder, "--masks", "give one with a PNG file per photograph")
-    there = {path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()}
-    masks: dict[str, Path] = {}
     for photograph in photographs:
-        name, stem = photograph.name.lower(), photograph.path.stem.lower()
-        candidates = [name + ".png", *(stem + ending for ending in ENDINGS)]
-        path = next((there[candidate] for candidate in candidates if candidate in there), None)
-        if path is None:
-            remedy = f"add {photograph.path.stem}.png, white where the object is"
-            raise InputError(f"none for {photograph.name}", folder, "--masks", remedy)
-        (width, height), wanted = image_size(path), photograph.size
+        path, wanted = mask_in(folder, photograph.name).path, photograph.size
+        width, height = image_size(path)
         if (width, height) not in (wanted, photograph.stored_size):
             what = f"{width} × {height} pixels, but {photograph.name} has {wanted[0]} × {wanted[1]}"
             raise InputError(what, path, "--masks", "make masks of the photographs' size")

@@ -41,18 +41,18 @@ class Region:
     estimated: bool = field(default=False, compare=False)  # from cameras and points, not given by a user
 
     @staticmethod
-    def of(content: Any, source: Path | str) -> Region:
+    def of(content: object, source: Path | str) -> Region:
         """The region {"centre": [x, y, z], "radius": r, "planes": [[a, b, c, d], …]} of a JSON file or an
         option, `source`; planes are optional.
 
         Raises InputError for anything else, and for numbers that no scene has.
         """
-        content = content if isinstance(content, dict) else {}
-        centre, remedy = _numbers(content.get("centre"), 3), "correct or remove them"
-        radius = _numbers([content.get("radius")], 1)
+        given: dict[str, Any] = content if isinstance(content, dict) else {}
+        centre, remedy = _numbers(given.get("centre"), 3), "correct or remove them"
+        radius = _numbers([given.get("radius")], 1)
         if centre is None or radius is None or not radius[0] >= 1 / MAX_NUMBER:
             raise InputError("not three numbers and a positive one", source, "centre, radius", remedy)
-        planes, rows = list[Plane](), content.get("planes", [])
+        planes, rows = list[Plane](), given.get("planes", [])
         for row in rows if isinstance(rows, list) else [rows]:
             plane = _numbers(row, 4)
             length = 0.0 if plane is None else float(np.linalg.norm(plane[:3]))
@@ -62,7 +62,7 @@ class Region:
             a, b, c, d = (number / length for number in plane)
             planes.append((a, b, c, d))
         x, y, z = centre
-        return Region((x, y, z), radius[0], tuple(planes), content.get("estimated") is True)
+        return Region((x, y, z), radius[0], tuple(planes), given.get("estimated") is True)
 
     @property
     def content(self) -> dict[str, Any]:
@@ -112,7 +112,7 @@ class Region:
         return np.array(self.centre) + self.radius * offset
 
 
-def _numbers(value: Any, count: int) -> list[float] | None:
+def _numbers(value: object, count: int) -> list[float] | None:
     """A list of so many numbers that a scene may have; None for anything else."""
     if not isinstance(value, list) or len(value) != count:
         return None

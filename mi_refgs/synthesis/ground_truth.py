@@ -18,7 +18,7 @@ import trimesh
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError
-from mi_refgs.types import Bool, Color3f, Float
+from mi_refgs.types import Bool, Color3f, Float, Scene
 
 OPAQUE = 1e-3  # fraction of transmitted light, or weight of the other BSDF of a blend, that is neglected
 SPHERE_SUBDIVISIONS = 5  # of an icosahedron: the centres of 20,480 triangles are 1.5e-4 radii inside
@@ -63,7 +63,7 @@ class Materials(NamedTuple):
         return Materials(*(clean(*pair) for pair in self))
 
 
-def materials_at(scene: Any, si: Any) -> Materials:
+def materials_at(scene: Scene, si: Any) -> Materials:
     """Materials of the scene's shapes at their surface interactions `si`.
 
     Instances of shape groups are unknown: their BSDFs are not listed in the scene.

@@ -55,6 +55,7 @@ from mi_refgs.synthesis.settings import (
     under_light,
     without,
 )
+from mi_refgs.types import Scene
 
 SURFACE_VOXELS = 2048  # along the diameter of surface.ply: rays start 2 off, ten times a sphere's error
 REGION_MARGIN = 1.2  # radius of the region over that of the object's bounding sphere: adjacent surfaces
@@ -132,7 +133,7 @@ def make_dataset(
     return out
 
 
-def named_shapes(scene: Any, ids: Sequence[str], file: Path) -> list[Any]:
+def named_shapes(scene: Scene, ids: Sequence[str], file: Path) -> list[Any]:
     """The shapes of a scene with these ids; raises InputError for an id that none has."""
     found = {shape.id(): shape for shape in scene.shapes()}
     missing = [name for name in ids if not name or name not in found]

@@ -15,7 +15,7 @@ from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis.ground_truth import materials_at
 from mi_refgs.synthesis.options import DatasetOptions
-from mi_refgs.types import Color3f, Vector3f
+from mi_refgs.types import Color3f, Scene, Vector3f
 
 SAMPLES_PER_LAUNCH = 1 << 24  # most paths per launch; the path tracer keeps about 100 bytes for each
 SURFACE_SAMPLES = 4096  # points per shape that measure the scene's size; the farthest is found to about 1 %
@@ -76,7 +76,7 @@ def camera_poses(
     return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
 
 
-def environment_image(scene: Any, height: int) -> np.ndarray:
+def environment_image(scene: Scene, height: int) -> np.ndarray:
     """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`.
 
     An `envmap` with an identity `to_world` shows the same radiance: first row at +y, last at -y; column 0
@@ -101,7 +101,7 @@ def environment_image(scene: Any, height: int) -> np.ndarray:
     return _panorama(radiance, height)
 
 
-def incident_image(scene: Any, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
+def incident_image(scene: Scene, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
     """Path-traced radiance (h, 2 h, 3) that arrives at a point (3,), h = `environment_height`.
 
     Emitters are visible; the grid is that of `environment_image`.
@@ -175,7 +175,7 @@ class Tracer:
     images show everything, and maps are of those shapes only.
     """
 
-    def __init__(self, scene: Any, cameras: Cameras) -> None:
+    def __init__(self, scene: Scene, cameras: Cameras) -> None:
         import mitsuba as mi
 
         options, (low, high) = cameras.options, cameras.distance

@@ -15,6 +15,7 @@ from mi_refgs.io.exr import mitsuba_exr
 from mi_refgs.io.files import make_folder, read_json, write_json
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.options import LightFile
+from mi_refgs.types import Scene
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
 RELIGHT = "relight"  # folder of the test views under other environment maps
@@ -49,7 +50,7 @@ def load_scene(scene: Path, whole: bool = False) -> Any:
     return loaded
 
 
-def under_light(scene: Any, light: Path, objects: Sequence[Any] = ()) -> Any:
+def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
     """The scene with a lat-long map (EXR, HDR) in place of its environment; its other emitters are kept.
 
     `objects`: shapes that are lit alone, without the other shapes and emitters.
@@ -69,13 +70,13 @@ def under_light(scene: Any, light: Path, objects: Sequence[Any] = ()) -> Any:
     return _scene_of([*(objects or _all_but(scene, ())), mi.load_dict(environment)])
 
 
-def without(scene: Any, objects: Sequence[Any]) -> Any:
+def without(scene: Scene, objects: Sequence[Any]) -> Any:
     """The scene without some of its shapes."""
     environment = scene.environment()
     return _scene_of([*_all_but(scene, objects), *([] if environment is None else [environment])])
 
 
-def _all_but(scene: Any, objects: Sequence[Any]) -> list[Any]:
+def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
     """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
     import mitsuba as mi
 

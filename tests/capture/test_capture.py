@@ -356,15 +356,15 @@ def test_masks_match_photographs_by_name_and_size(tmp_path: Path) -> None:
     masks = _made(tmp_path / "m")
     Image.fromarray(mask).save(masks / "a.png")
     Image.fromarray(mask.astype(np.uint16) * 100).save(masks / "b.jpg.png")  # 16 bits, not used in full
-    refused(lambda: find_masks(masks, photographs), "none for c.jpg; add c.png")
+    refused(lambda: find_masks(masks, photographs), "c.jpg.png: mask: missing; add it")
     cut = np.dstack([np.full((4, 6, 3), 9, dtype=np.uint8), mask])
-    Image.fromarray(cut).save(masks / "c.PNG")
+    Image.fromarray(cut).save(masks / "c.png")
     found = find_masks(masks, photographs)
     for photograph in photographs:  # white where the object is; where an image is cut out, its alpha
         grey = round(25500 / 257) if photograph.name == "b.jpg" else 255
         pixels = mask_pixels(found[photograph.name], photograph)
         np.testing.assert_array_equal(pixels[..., 0], np.where(mask > 0, grey, 0))
-    Image.fromarray(mask[:2]).save(masks / "c.PNG")
+    Image.fromarray(mask[:2]).save(masks / "c.png")
     refused(lambda: find_masks(masks, photographs), "6 × 2 pixels, but c.jpg has 6 × 4")
 
 
