@@ -23,6 +23,7 @@ from mi_refgs.capture.output import prepare
 from mi_refgs.capture.photographs import find_masks, find_photographs, mask_pixels
 from mi_refgs.capture.pipeline import require_placed
 from mi_refgs.cli import main
+from mi_refgs.data.lens import Lens, undistortion
 from mi_refgs.data.region import Region
 from mi_refgs.io.images import read_png
 from tests.helpers import read_loaded, refused
@@ -190,6 +191,14 @@ def test_distorted_lens_is_estimated_and_undone(tmp_path: Path, monkeypatch: pyt
     model = colmap.load().Reconstruction(tmp_path / "data" / "sparse" / "0")
     model.update_point_3d_errors()
     assert model.compute_mean_reprojection_error() < 0.6
+
+
+def test_images_of_a_lens_are_straightened(rng: np.random.Generator) -> None:
+    pixels = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    undo = undistortion(Lens(False, (0.1,)), 32, 24, 30.0, 30.0, 16.0, 12.0)
+    found = output.Straight((32, 24), (30.0, 30.0), (16.0, 12.0), undo).resample(pixels)
+    np.testing.assert_array_equal(found, np.rint(undo.resample(pixels.astype(np.float32))))
+    assert np.abs(found.astype(int) - pixels).max() > 10
 
 
 @needs_colmap
