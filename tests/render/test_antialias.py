@@ -1,4 +1,4 @@
-"""Reflections averaged over a pixel: the float64 reference, the quadrature, derivatives, and many samples."""
+"""Reflections averaged over a pixel: the float64 reference, and the quadrature."""
 
 from __future__ import annotations
 
@@ -13,14 +13,9 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.image import bilinear_map
 from mi_refgs.render.antialias import averaged
-from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
-from mi_refgs.surfels.init import from_points
-from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 
 WIDTH, HEIGHT = 9, 7
@@ -100,37 +95,6 @@ def test_points_integrate_cubic_radiance_exactly() -> None:
     y, x = np.mgrid[-2:3, -2:3].reshape(2, -1)
     exact = [x**2 + 1 / 12, x**3 + x / 4, x * (y**2 + 1 / 12)]
     np.testing.assert_allclose(mean, exact, atol=2e-5)
-
-
-def mirror_ball() -> tuple[Surfels, EnvironmentLight]:
-    """A ball of polished metal, and a light of stripes narrower than what a pixel reflects."""
-    rng = np.random.default_rng(4)
-    direction = rng.normal(size=(4000, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    names = ("albedo", "metallic", "roughness", "radiance_sh")
-    raw = from_points(direction, direction, rng=rng, attributes=names).to_numpy()
-    raw["opacity"][:] = 3.0
-    raw["albedo"][:], raw["metallic"][:], raw["roughness"][:] = 3.0, 6.0, -2.5
-    stripes = np.tile(np.where(np.arange(128) % 8 < 4, 2.0, 0.1)[None, :, None], (64, 1, 3))
-    return Surfels.from_numpy(raw), EnvironmentLight.from_radiance(stripes)
-
-
-def image(made: TrainedScene, samples: int, size: int = 24) -> np.ndarray:
-    frame: Frame = made.renderer(aovs=False, samples=samples)(camera(size, 1.2 * size))
-    return np.array([*frame.radiance], np.float64)
-
-
-def test_one_sample_comes_closer_to_many() -> None:
-    """A ball that reflects stripes: less error than with pixel centres, and hardly any with many samples."""
-    surfels, light = mirror_ball()
-    plain = TrainedScene(surfels, light, None, Shading(), 1, 0.0)
-    filtered = replace(plain, shading=Shading(antialias=True))
-    truth = image(plain, 144)
-    errors = [np.sqrt(np.mean((image(made, 1) - truth) ** 2)) for made in (plain, filtered)]
-    assert errors[1] < 0.6 * errors[0]
-    assert np.sqrt(np.mean((image(filtered, 144) - truth) ** 2)) < 0.1 * errors[0]
-    own, other = (made.renderer()(camera(24, 29.0)).maps["roughness"] for made in (plain, filtered))
-    np.testing.assert_array_equal(own, other)
 
 
 def test_antialias_requires_deferred_shading() -> None:
