@@ -38,7 +38,9 @@ class Registry(Mapping[str, T], Generic[T]):
         """
         name = getattr(item, "name", "")
         if not name or name in self._items:
-            raise InputError(f"{self.kind}: '{name}': the name is empty or in use; choose another name")
+            raise InputError(
+                f"'{name}': the name is empty or in use", self.kind, remedy="choose another name"
+            )
         self._check(item)
         self._items = {name: item} | self._items if first else self._items | {name: item}
         return item
@@ -50,7 +52,9 @@ class Registry(Mapping[str, T], Generic[T]):
     def find(self, name: str, field: str) -> T:
         """Return an item by name; raises UnknownNameError that starts with `field` and lists the names."""
         if name not in self._items:
-            raise UnknownNameError(f"{field}: {abbreviated(name)} is unknown; use {' or '.join(self._items)}")
+            raise UnknownNameError(
+                f"{abbreviated(name)} is unknown", field, remedy=f"use {' or '.join(self._items)}"
+            )
         return self._items[name]
 
     def __getitem__(self, name: str) -> T:

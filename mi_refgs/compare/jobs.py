@@ -78,7 +78,7 @@ class Job:
             content["settings"] = tuple(content["settings"])
             return Job(**content)
         except (KeyError, TypeError) as error:
-            raise InputError(f"{folder / JOB}: not a job ({error}); remove the file") from error
+            raise InputError(f"not a job ({error})", folder / JOB, remedy="remove the file") from error
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,11 @@ def plan(
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
-            raise InputError(f"--seeds: {seed} is out of range; give whole numbers from 0 to {MAX_SEED}")
+            raise InputError(
+                f"{seed} is out of range", "--seeds", remedy=f"give whole numbers from 0 to {MAX_SEED}"
+            )
     if any(setting.partition("=")[0].strip() == "seed" for setting in shared.settings):
-        raise InputError("--set: seed: a comparison takes its seeds from --seeds; drop it here")
+        raise InputError("a comparison takes its seeds from --seeds", "--set", "seed", "drop it here")
     jobs = [
         Job(
             folder=str(folder.resolve() / RUNS / absolute(path).name / Path(variant).stem / f"seed{seed}"),
@@ -237,5 +239,5 @@ def _unique(names: Iterable[str], option: str, remedy: str) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise InputError(f"{option}: '{name}' is given twice; {remedy}")
+            raise InputError(f"'{name}' is given twice", option, remedy=remedy)
         seen.add(name)

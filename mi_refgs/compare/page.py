@@ -49,7 +49,9 @@ def write(folder: Path) -> Table:
     """
     table, output = table_of(folder), output_folder(folder)
     if not table.scenes:
-        raise InputError("DATA: none given, and the folder has no comparison; name data sets to fit")
+        raise InputError(
+            "none given, and the folder has no comparison", "DATA", remedy="name data sets to fit"
+        )
     output.require_free()
     content = json.dumps(asdict(table), indent=1, ensure_ascii=False)
     write_bytes(output.own(TABLE), f"{content}\n".encode())

@@ -99,7 +99,7 @@ def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
 def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if np.shape(image) != np.shape(truth):
         sizes = f"{np.shape(image)} and {np.shape(truth)}"
-        raise InputError(f"metrics: image: shapes {sizes} differ; render at the size of the data set")
+        raise InputError(f"shapes {sizes} differ", "metrics", "image", "render at the size of the data set")
     return np.clip(np.asarray(image, np.float64), 0, 1), np.clip(np.asarray(truth, np.float64), 0, 1)
 
 
@@ -116,7 +116,9 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
     """
     if normal.shape != truth.shape or normal.shape[:2] != np.shape(alpha):
         sizes = f"{normal.shape}, {truth.shape}, {np.shape(alpha)}"
-        raise InputError(f"metrics: normal: shapes {sizes} do not fit; render at the size of the data set")
+        raise InputError(
+            f"shapes {sizes} do not fit", "metrics", "normal", "render at the size of the data set"
+        )
     scored = foreground(truth, alpha)
     total = float(np.sum(angle_deg(normal, truth)[scored]))
     return {
@@ -154,7 +156,7 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     for name, array in (("fitted", light), ("ground-truth", truth)):
         if array.ndim != 3 or array.shape[2] != 3 or array.shape[0] < 2 or not np.all(np.isfinite(array)):
             need = "need finite (h, w, 3) values, h ≥ 2; write the map again"
-            raise InputError(f"metrics: {name} environment: {need}")
+            raise InputError(f"{name} environment: {need}", "metrics")
     rows = lobe_matrices.resampling(len(truth), len(light)).toarray()
     columns = lobe_matrices.resampling(truth.shape[1], light.shape[1], periodic=True).toarray()
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)

@@ -71,19 +71,23 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
     and missing packages.
     """
     if faces < 100:
-        raise InputError(f"--faces: {faces} is out of range; give a number from 100")
+        raise InputError(f"{faces} is out of range", "--faces", remedy="give a number from 100")
     if not 16 <= texture <= 8192:
-        raise InputError(f"--texture: {texture} is out of range; give 16 to 8192")
+        raise InputError(f"{texture} is out of range", "--texture", remedy="give 16 to 8192")
     memory = BASE + PER_TEXEL * texture**2 + PER_SHOWN_SURFEL * trained.count
     require(memory, f"--texture: {texture} × {texture} texels", "bake a smaller texture")
     for package in PACKAGES:
         import_extra(package)
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
-        raise SceneError("mesh: the run has none; fit one with occlusion, as `--for relighting` does")
+        raise SceneError(
+            "the run has none", "mesh", remedy="fit one with occlusion, as `--for relighting` does"
+        )
     model = scene.shading.model
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
-        raise SceneError(f"reflectance: {model.name} has no textures; export `scene.xml`, or another model")
+        raise SceneError(
+            f"{model.name} has no textures", "reflectance", remedy="export `scene.xml`, or another model"
+        )
 
     # Views that show the object's materials.
     plain = replace(scene, shading=scene.shading.untraced())
@@ -125,7 +129,9 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     Raises InputError for a mesh without faces.
     """
     if not len(mesh.faces):
-        raise SceneError("mesh: the run has none that textures could be baked to; train it for longer")
+        raise SceneError(
+            "the run has none that textures could be baked to", "mesh", remedy="train it for longer"
+        )
     low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0).max()
     made = trimesh.Trimesh((mesh.vertices - low) / size, mesh.faces, process=False)
     trimesh.smoothing.filter_taubin(made, iterations=SMOOTHING)

@@ -94,7 +94,7 @@ def read_cameras(path: Path) -> list[Camera]:
     """
     frames = Frame.all_of(path)
     if not frames:
-        raise InputError(f"{path}: frames: empty; add one entry for each camera")
+        raise InputError("empty", path, "frames", "add one entry for each camera")
     return [_camera(frame) for frame in frames]
 
 

@@ -28,7 +28,9 @@ def write(
     """
     if not 0 <= view < len(shots):
         count = len(shots)
-        raise InputError(f"--view: {view} is out of range; there are {count}, give 0 to {count - 1}")
+        raise InputError(
+            f"{view} is out of range", "--view", remedy=f"there are {count}, give 0 to {count - 1}"
+        )
     camera = shots[view].camera
     shown = replace(trained, surroundings=None) if object else trained
     frame = shown.renderer(samples=samples)(camera)

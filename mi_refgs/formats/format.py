@@ -93,7 +93,9 @@ def import_extra(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise InputError(f'--to: {name} is not installed; pip install "mi_refgs[export]"') from None
+        raise InputError(
+            f"{name} is not installed", "--to", remedy='pip install "mi_refgs[export]"'
+        ) from None
 
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -133,11 +135,11 @@ def write(
     """
     chosen, given = [FORMATS.find(name, "--to") for name in names], dict(options or {})
     if not chosen:
-        raise InputError(f"--to: no format; use one of {', '.join(FORMATS)}")
+        raise InputError("no format", "--to", remedy=f"use one of {', '.join(FORMATS)}")
     for name in given.keys() - options_of(names):
         able = ", ".join(made.name for made in FORMATS.values() if name in [o.name for o in made.options])
         remedy = f"leave it out, or choose a format that has it ({able or 'none'})"
-        raise InputError(f"--{name.replace('_', '-')}: no option of {', '.join(names)}; {remedy}")
+        raise InputError(f"no option of {', '.join(names)}", f"--{name.replace('_', '-')}", remedy=remedy)
     remedy = "choose another output, or replace it with --overwrite (overwrite=True in Python)"
     found, shots = {}, tuple(shots)
     for made in chosen:
@@ -164,7 +166,7 @@ def _target(made: Format, output: Path, several: bool) -> Path:
     if several or output.is_dir() or (made.suffix and not output.suffix):
         output = output / f"{made.name}{made.suffix}"
     elif made.suffix and output.suffix.lower() != made.suffix:
-        raise InputError(f"{output}: suffix: {made.name} writes {made.suffix}; name the file so")
+        raise InputError(f"{made.name} writes {made.suffix}", output, "suffix", "name the file so")
     make_folder(output.parent if made.suffix else output)
     return output
 

@@ -48,11 +48,11 @@ def read_splats(path: Path, linear: bool = False) -> TrainedScene:
     _require_splat_file(path)
     surfels = read_ply(path)
     if not surfels.count:
-        raise InputError(f"{path}: vertex: there are none; export the file again")
+        raise InputError("there are none", path, "vertex", "export the file again")
     needed = {*surfels.primitive.widths, "radiance_sh"}
     if others := [ATTRIBUTES[name].properties[0] for name in surfels.raw if name not in needed]:
         what = "materials of a run, which require its light and shading"
-        raise InputError(f"{path}: {others[0]}: {what}; give the run folder to the command that needs it")
+        raise InputError(what, path, others[0], "give the run folder to the command that needs it")
     shading = Shading("surfel", "radiance") if linear else Shading("pixel", "displayed")
     return TrainedScene(Surfels(surfels.raw), None, None, shading, iteration=0, seconds=0.0)
 
@@ -71,14 +71,14 @@ def _require_splat_file(path: Path) -> None:
         with path.open("rb") as file:
             header = read_header(path, file, EXPECTED)
     except OSError as error:
-        raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
+        raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
     tables = {element.name: {name for name, _ in element.fields} for element in header.elements}
     names = tables.get("vertex", set())
     if "packed_position" in names:
         remedy = f"write it as a plain one, as `splat-transform {path.name} plain.ply` does"
-        raise InputError(f"{path}: packed_position: a compressed PLY; {remedy}")
+        raise InputError("a compressed PLY", path, "packed_position", remedy)
     if not {"opacity", "scale_0", "rot_0"} & names:
         what = "a mesh" if tables.get("face") is not None else "points without size or opacity"
-        raise InputError(f"{path}: vertex: {what}, no Gaussians; give {EXPECTED}")
+        raise InputError(f"{what}, no Gaussians", path, "vertex", f"give {EXPECTED}")
     if not any(name.startswith("f_dc_") for name in names):
-        raise InputError(f"{path}: f_dc_0: the property is missing; export the file again with its colours")
+        raise InputError("the property is missing", path, "f_dc_0", "export the file again with its colours")

@@ -56,7 +56,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     a degree out of range, and for a scene without surfels.
     """
     if not 0 <= degree <= MAX_SH_DEGREE:
-        raise InputError(f"--degree: {degree} is out of range; give 0 to {MAX_SH_DEGREE}")
+        raise InputError(f"{degree} is out of range", "--degree", remedy=f"give 0 to {MAX_SH_DEGREE}")
     if object_only:
         trained = replace(trained, surroundings=None)
     around, tables = trained.surroundings, [trained.surfels.detach()]
@@ -64,7 +64,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
         tables.append(around.surfels.detach())
     tables = [table for table in tables if table.count]
     if not tables:
-        raise InputError("surfels: there are none; nothing can be exported")
+        raise InputError("there are none", "surfels", remedy="nothing can be exported")
 
     # Training cameras, spread evenly over all of them, of at most PIXELS.
     chosen = [shot.camera for shot in shots if shot.split == "train"] or [shot.camera for shot in shots]

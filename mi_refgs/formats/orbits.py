@@ -89,5 +89,5 @@ def _weighted(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (N, 3) and opacities (N,), float64; raises InputError where there are none."""
     raw = surfels.to_numpy()
     if not len(raw["position"]):
-        raise InputError("surfels: there are none; cameras have nothing to look at")
+        raise InputError("there are none", "surfels", remedy="cameras have nothing to look at")
     return raw["position"].astype(np.float64), 1 / (1 + np.exp(-raw["opacity"][:, 0].astype(np.float64)))

@@ -62,13 +62,17 @@ class OutputFolder:
                 continue
             if owner == RUN:
                 raise InputError(
-                    f"{self.path / name}: output: belongs to a run, which is never overwritten; "
-                    "choose another output"
+                    "belongs to a run, which is never overwritten",
+                    self.path / name,
+                    "output",
+                    "choose another output",
                 )
             if not self.overwrite:
                 raise InputError(
-                    f"{self.path / name}: output: exists, and was not written by this command for the same "
-                    f"input; {self.remedy}"
+                    "exists, and was not written by this command for the same input",
+                    self.path / name,
+                    "output",
+                    self.remedy,
                 )
 
     def claim(self, *names: str) -> None:

@@ -56,14 +56,14 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
     """
     # Lines up to end_header.
     if file.readline(MAX_LINE).strip() != b"ply":
-        raise InputError(f"{path}: header: not a PLY file; give {wanted}")
+        raise InputError("not a PLY file", path, "header", f"give {wanted}")
     order, comments = "", []
     found: list[tuple[str, int, list[tuple[str, str]], list[tuple[str, str]]]] = []
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(MAX_LINE)
         words = line.decode("ascii", errors="replace").split()
         if not line.endswith(b"\n") and words != ["end_header"]:
-            raise InputError(f"{path}: header: no end_header; the file is truncated, export it again")
+            raise InputError("no end_header", path, "header", "the file is truncated, export it again")
         match words:
             case ["format", name, *_]:
                 order = ORDERS.get(name, "")
@@ -79,25 +79,27 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
                 break
             case _:
                 text = " ".join(words)[:40]
-                raise InputError(f"{path}: header: '{text}' is no line of a PLY header; export it again")
+                raise InputError(f"'{text}' is no line of a PLY header", path, "header", "export it again")
     else:
-        raise InputError(f"{path}: header: no end_header in {MAX_HEADER_LINES} lines; export it again")
+        raise InputError(f"no end_header in {MAX_HEADER_LINES} lines", path, "header", "export it again")
     elements = tuple(Element(name, count, (*fields,), (*lists,)) for name, count, fields, lists in found)
     if not order or not elements:
-        raise InputError(f"{path}: header: no format or no element; export it again")
+        raise InputError("no format or no element", path, "header", "export it again")
     # Properties, and the number of rows against the size of the file.
     left = os.fstat(file.fileno()).st_size - file.tell()
     for element in elements:
         names = [name for name, _ in (*element.fields, *element.lists)]
         if not names:
-            raise InputError(f"{path}: header: {element.name} has no property; export it again")
+            raise InputError(f"{element.name} has no property", path, "header", "export it again")
         if len({*names}) < len(names):
-            raise InputError(f"{path}: header: a property of {element.name} occurs twice; export it again")
+            raise InputError(f"a property of {element.name} occurs twice", path, "header", "export it again")
         left -= element.count * element.row_bytes(order == "a")
         if left < (-1 if order == "a" else 0):  # text may end without a line break
             raise InputError(
-                f"{path}: {element.name}: {element.count} rows are more than the file contains; the file is "
-                "truncated, copy or export it again"
+                f"{element.count} rows are more than the file contains",
+                path,
+                element.name,
+                "the file is truncated, copy or export it again",
             )
     return Header(order, elements, (*comments,))
 
@@ -110,10 +112,10 @@ def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
     header = read_header(path, file)
     vertex, text = header.elements[0], header.order == "a"
     if vertex.name != "vertex":
-        raise InputError(f"{path}: {vertex.name}: the vertices must come first; export it as a surfel PLY")
+        raise InputError("the vertices must come first", path, vertex.name, "export it as a surfel PLY")
     if vertex.lists:
         raise InputError(
-            f"{path}: {vertex.lists[0][0]}: not a number property; export the vertices without lists"
+            "not a number property", path, vertex.lists[0][0], "export the vertices without lists"
         )
     size = vertex.count * (8 if text else 1) * max(vertex.row_bytes(False), 1)
     require(PER_PLY_BYTE * size, f"{path}: vertex: {vertex.count:,} rows", "keep fewer of them")
@@ -126,7 +128,7 @@ def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
             values[row] = [float(word) for word in file.readline().split()]
         except ValueError as error:
             raise InputError(
-                f"{path}: vertex: row {row} is broken or missing; copy or export the file again"
+                f"row {row} is broken or missing", path, "vertex", "copy or export the file again"
             ) from error
     dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
     return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)

@@ -19,6 +19,4 @@ def resource_dir(name: str) -> Path:
     for parent in (_PACKAGE, *checkout):
         if (parent / name).is_dir():
             return parent / name
-    raise InputError(
-        f"{_PACKAGE}: {name}: the folder is missing from this installation; install mi_refgs again"
-    )
+    raise InputError("the folder is missing from this installation", _PACKAGE, name, "install mi_refgs again")

@@ -58,8 +58,10 @@ def require_supported_variant(what: str) -> None:
     variant = mi.variant()
     if not is_supported(variant):
         raise InputError(
-            f"{what}: variant: '{variant}' is not supported; "
-            "call mi.set_variant('llvm_ad_rgb') or mi.set_variant('cuda_ad_rgb') first"
+            f"'{variant}' is not supported",
+            what,
+            "variant",
+            "call mi.set_variant('llvm_ad_rgb') or mi.set_variant('cuda_ad_rgb') first",
         )
 
 

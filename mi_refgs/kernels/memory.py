@@ -61,7 +61,9 @@ def require(needed: float, what: str, remedy: str) -> None:
     there = available() + resident()
     if needed > there:
         raise InputError(
-            f"{what}: needs {needed / 1e9:.2g} GB of memory, {there / 1e9:.2g} GB are available; {remedy}"
+            f"needs {needed / 1e9:.2g} GB of memory, {there / 1e9:.2g} GB are available",
+            what,
+            remedy=remedy,
         )
 
 

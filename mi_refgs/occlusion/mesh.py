@@ -120,10 +120,10 @@ def read_mesh(path: Path | str) -> Mesh:
     """
     path = Path(path)
     if not is_file(path):
-        raise InputError(f"{path}: mesh: no such file; give the mesh.ply of a run")
+        raise InputError("no such file", path, "mesh", "give the mesh.ply of a run")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
-        raise InputError(f"{path}: mesh: not one of {', '.join(FORMATS)}; write it again as PLY or OBJ")
+        raise InputError(f"not one of {', '.join(FORMATS)}", path, "mesh", "write it again as PLY or OBJ")
     try:
         with path.open("rb") as file:
             header = read_header(path, file) if kind == "ply" else Header("", (), ())
@@ -138,12 +138,12 @@ def read_mesh(path: Path | str) -> Mesh:
     except InputError:
         raise
     except Exception as error:  # trimesh raises whatever its parsers meet
-        raise InputError(f"{path}: mesh: not a readable triangle mesh; write it as PLY or OBJ") from error
+        raise InputError("not a readable triangle mesh", path, "mesh", "write it as PLY or OBJ") from error
     with np.errstate(over="ignore"):
         vertices = np.asarray(mesh.vertices, np.float32)
     if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(vertices).all()):
         wrong = f"vertices not finite, or {VOXEL_COMMENT} not above 0"
-        raise InputError(f"{path}: mesh: {wrong}; extract the mesh again")
+        raise InputError(wrong, path, "mesh", "extract the mesh again")
     return Mesh(vertices, np.asarray(mesh.faces, np.uint32), voxel)
 
 
@@ -167,5 +167,5 @@ def _load(path: Path, kind: str, data: bytes) -> Any:
     mesh: Any = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, **options)
     faces = np.asarray(mesh.faces)
     if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
-        raise InputError(f"{path}: mesh: a face names a vertex that is not there; write the file again")
+        raise InputError("a face names a vertex that is not there", path, "mesh", "write the file again")
     return mesh

@@ -60,10 +60,12 @@ class VertexSurfels:
         InputError if there are no surfels.
         """
         if not surfels.count:
-            raise InputError("occluder: surfels: there are none to take materials from")
+            raise InputError("there are none to take materials from", "occluder", "surfels")
         usable, surfels = np.flatnonzero(surfels.usable().numpy()), surfels.detach().cleaned()
         if not len(usable):
-            raise InputError("occluder: surfels: none has finite values; correct them, or trace nothing")
+            raise InputError(
+                "none has finite values", "occluder", "surfels", "correct them, or trace nothing"
+            )
 
         # Ellipsoids of the surfels: axes and standard deviations, along the normal at least a voxel.
         position, opacity = surfels.position().numpy().T, surfels.opacity().numpy()
@@ -112,11 +114,11 @@ class VertexSurfels:
         for name in names:
             if not surfels.has(name):
                 raise InputError(
-                    f"occluder: {name}: surfels have no such attribute; add it, or trace nothing"
+                    "surfels have no such attribute", "occluder", name, "add it, or trace nothing"
                 )
         if surfels.count != self.count:
             numbers = f"there are {surfels.count}, but the mesh was given {self.count}"
-            raise InputError(f"occluder: surfels: {numbers}; call Occluder.set_materials after each change")
+            raise InputError(numbers, "occluder", "surfels", "call Occluder.set_materials after each change")
         found = {}
         for name in names:
             value = surfels.value(name)

@@ -82,7 +82,7 @@ def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         lost = "the fit has diverged or pruned every surfel"
-        raise InputError(f"surfels: position: no finite point to bound; {lost}")
+        raise InputError("no finite point to bound", "surfels", "position", lost)
     lo, hi = np.quantile(points, (BOX_QUANTILE, 1 - BOX_QUANTILE), axis=0)
     reach = BOX_REACH * (hi - lo)
     lo, hi = np.maximum(lo - reach, points.min(axis=0)), np.minimum(hi + reach, points.max(axis=0))
@@ -113,10 +113,12 @@ def fuse(
     lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
     extent = hi - lo
     if not (np.all(np.isfinite(extent)) and np.all(extent > 0)):
-        raise InputError(f"tsdf: bounds: box from {lo} to {hi} has no volume; give lo < hi on every axis")
+        raise InputError(
+            f"box from {lo} to {hi} has no volume", "tsdf", "bounds", "give lo < hi on every axis"
+        )
     most = RESOLUTION_MAX if region is None else RESOLUTION_MAX // 2  # all of space is twice as wide
     if not 2 <= resolution <= most:
-        raise InputError(f"tsdf: resolution: {resolution} is outside 2..{most}; choose 64 to 256")
+        raise InputError(f"{resolution} is outside 2..{most}", "tsdf", "resolution", "choose 64 to 256")
     voxel = (float(extent.max()) if region is None else 2.0) / resolution
     shape = np.ceil(extent / voxel - 1e-6).astype(int) + 1
     empty = TSDF(np.ones(0, np.float32), lo, voxel, region)

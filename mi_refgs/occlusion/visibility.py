@@ -89,7 +89,9 @@ class Occluder:
         attribute that is absent.
         """
         if self.vertex_surfels is None:
-            raise InputError("occluder: materials: none are set; call Occluder.set_materials after update")
+            raise InputError(
+                "none are set", "occluder", "materials", "call Occluder.set_materials after update"
+            )
         return self.vertex_surfels.surface(surfels, names)
 
     def visible(

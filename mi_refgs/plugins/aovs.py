@@ -52,11 +52,13 @@ def parse_aovs(text: str) -> list[AOV]:
     for pair in filter(None, (part.strip() for part in text.split(","))):
         name, colon, kind = (part.strip() for part in pair.partition(":"))
         if not colon or not name:
-            raise InputError(f"refgs: aovs: '{pair}' is not a <name>:<type> pair; write such as 'nn:normal'")
+            raise InputError(
+                f"'{pair}' is not a <name>:<type> pair", "refgs", "aovs", "write such as 'nn:normal'"
+            )
         if kind not in suffixes():
-            raise InputError(f"refgs: aovs: unknown type '{kind}'; use one of {', '.join(suffixes())}")
+            raise InputError(f"unknown type '{kind}'", "refgs", "aovs", f"use one of {', '.join(suffixes())}")
         if any(name == other.name for other in aovs):
-            raise InputError(f"refgs: aovs: the name '{name}' occurs twice; rename one of them")
+            raise InputError(f"the name '{name}' occurs twice", "refgs", "aovs", "rename one of them")
         aovs.append(AOV(name, kind))
     return aovs
 

@@ -215,12 +215,12 @@ def _texture(props: Any, name: str, default: float) -> Any:
     value = props.get(name, default)
     colour = isinstance(value, mi.ScalarColor3d)
     if colour and name != "albedo":
-        raise InputError(f"refgs_bsdf: {name}: {value} is a colour; give a number or a texture")
+        raise InputError(f"{value} is a colour", "refgs_bsdf", name, "give a number or a texture")
     numbers = value if colour else [value] if isinstance(value, int | float) else []
     positive = name == "roughness"
     if not all(0 <= x <= 1 and (x > 0 or not positive) for x in numbers):
         bounds = "(0, 1]" if positive else "[0, 1]"
-        raise InputError(f"refgs_bsdf: {name}: {value} is outside {bounds}; give a value inside")
+        raise InputError(f"{value} is outside {bounds}", "refgs_bsdf", name, "give a value inside")
     return props.get_texture(name, default)
 
 

@@ -43,7 +43,7 @@ class FilmImage:
 
     def __post_init__(self) -> None:
         if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
-            raise InputError("refgs: film: refgs renders RGB radiance only; use an `hdrfilm`")
+            raise InputError("refgs renders RGB radiance only", "refgs", "film", "use an `hdrfilm`")
 
     @property
     def film(self) -> Any:

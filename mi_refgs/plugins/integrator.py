@@ -200,7 +200,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.shading.require_inputs(self.surfels.raw, mesh=self.occluder is not None)
         for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
             if not self.surfels.has(name):
-                raise InputError(f"refgs: {name}: the surfels have no such attribute; add it, or do without")
+                raise InputError("the surfels have no such attribute", "refgs", name, "add it, or do without")
         self.background.require_fit(self.surfels)
         for name, light in self._maps.items():
             try:
@@ -281,13 +281,13 @@ class RefGSIntegrator(mi.SamplingIntegrator):
                 del image, δ  # or the memory of a pass would be held through the next
 
     def sample(self, *args: Any, **kwargs: Any) -> Any:
-        raise InputError("refgs: sample: renders whole images only; do not nest it, use its own `aovs`")
+        raise InputError("renders whole images only", "refgs", "sample", "do not nest it, use its own `aovs`")
 
     def _image(self, scene: Any, sensor: Any, spp: int, forward_only: bool = False) -> FilmImage:
         """The image through the sensor's film."""
         if mi.variant() != self.variant:
             made = f"made under {self.variant}, not {mi.variant()}"
-            raise InputError(f"refgs: variant: {made}; load the scene again")
+            raise InputError(made, "refgs", "variant", "load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         request = Request({aov.type for aov in self.aovs}, forward_only)
         view = partial(self.frame, scene, request, self.background)

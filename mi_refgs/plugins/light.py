@@ -59,8 +59,8 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
     radiance, resampled = _map_radiance(params, emitter)
     if resampled and dr.grad_enabled(params["data"]):
         raise InputError(
-            f"emitter '{emitter.id()}': data: a map of {resampled} has no derivative; "
-            f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
+            f"emitter '{emitter.id()}': data: a map of {resampled} has no derivative",
+            remedy=f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}",
         )
     light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
     if filtered:
@@ -81,7 +81,9 @@ def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scen
         return rotated(light, rotation)
     emitter = scene.environment()
     if emitter is None:
-        raise InputError("refgs: light: there is none; nest an `envmap` in the integrator, or in the scene")
+        raise InputError(
+            "there is none", "refgs", "light", "nest an `envmap` in the integrator, or in the scene"
+        )
     return emitter_light(emitter, wanted == "filtered")
 
 
@@ -111,8 +113,11 @@ def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
 def _constant_radiance(params: Any, emitter: Any) -> Any:
     if emitter.class_name() != "ConstantBackgroundEmitter" or "radiance.value" not in params:
         raise InputError(
-            f"emitter '{emitter.id()}': type: refgs takes an `envmap` or a `constant` environment, not a "
-            f"{emitter.class_name()}; use one of these"
+            (
+                f"emitter '{emitter.id()}': type: refgs takes an `envmap` or a `constant` environment, "
+                f"not a {emitter.class_name()}"
+            ),
+            remedy="use one of these",
         )
     colour = mi.Color3f(params["radiance.value"])
     return bounded(colour, colour)
@@ -127,5 +132,7 @@ def _light_from_world(params: Any) -> Any:
     if np.abs(matrix - np.eye(3)).max() < 1e-7:
         return None
     if not np.abs(matrix.T @ matrix - np.eye(3)).max() < 1e-4:
-        raise InputError("emitter: to_world: must be a rotation or a mirror image; remove scale and shear")
+        raise InputError(
+            "must be a rotation or a mirror image", "emitter", "to_world", "remove scale and shear"
+        )
     return mi.Matrix3f(np.linalg.inv(matrix).astype(np.float32))

@@ -38,7 +38,7 @@ def _get(props: Any, name: str, default: Any) -> Any:
     try:
         return props.get(name, default)
     except UnicodeError as error:
-        raise InputError(f"refgs: {name}: not UTF-8; save the scene as UTF-8") from error
+        raise InputError("not UTF-8", "refgs", name, "save the scene as UTF-8") from error
 
 
 def read_aovs(props: Any) -> list[AOV]:
@@ -55,7 +55,7 @@ def _path(props: Any, name: str) -> str | None:
 def _choice(props: Any, name: str, default: str, options: tuple[str, ...]) -> Any:
     value = str(_get(props, name, default))
     if value not in options:
-        raise InputError(f"refgs: {name}: '{value}' is unknown; use {' or '.join(options)}")
+        raise InputError(f"'{value}' is unknown", "refgs", name, f"use {' or '.join(options)}")
     return value
 
 
@@ -73,7 +73,7 @@ def _tensor(props: Any, name: str) -> Any:
         return tensor
     except Exception as error:  # what Dr.Jit raises depends on the type
         found = f"{abbreviated(value)} is not a tensor"
-        raise InputError(f"refgs: {name}: {found}; give a number array") from error
+        raise InputError(found, "refgs", name, "give a number array") from error
 
 
 def read_surfels(props: Any) -> Surfels:
@@ -81,7 +81,7 @@ def read_surfels(props: Any) -> Surfels:
     raw = _attributes(props, "filename", "")
     if not raw:
         raise InputError(
-            "refgs: filename: there are no surfels; name a PLY file, or give attributes as tensors"
+            "there are no surfels", "refgs", "filename", "name a PLY file, or give attributes as tensors"
         )
     return Surfels(raw)
 
@@ -154,14 +154,14 @@ def read_background(props: Any) -> Any:
         raise
     except Exception as error:
         found = f"{abbreviated(value)} is no colour"
-        raise InputError(f"refgs: background: {found}; give an rgb value or a map") from error
+        raise InputError(found, "refgs", "background", "give an rgb value or a map") from error
 
 
 def read_light(props: Any) -> tuple[Any, Any]:
     """Read the integrator's own EnvironmentLight and its rotation (see `own_light`), or None twice."""
     emitters = [child for _, child in props.objects() if isinstance(child, mi.Emitter)]
     if len(emitters) > 1:
-        raise InputError("refgs: light: two emitters are nested in the integrator; keep one")
+        raise InputError("two emitters are nested in the integrator", "refgs", "light", "keep one")
     if emitters:
         return own_light(emitters[0])
     raw = _tensor(props, "light")

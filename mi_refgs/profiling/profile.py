@@ -185,7 +185,9 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
     surfels.
     """
     if trainer.surfels.count == 0:
-        raise InputError(f"{trainer.data.path}: surfels: none are left; profile an earlier run or a data set")
+        raise InputError(
+            "none are left", trainer.data.path, "surfels", "profile an earlier run or a data set"
+        )
     dr.sync_thread()
     dr.detail.malloc_clear_statistics()
     found = []

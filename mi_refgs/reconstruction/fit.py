@@ -54,7 +54,7 @@ def fit(
     temporary = None
     if output is None:
         if resume:
-            raise InputError("resume: there is no run to continue; give its folder as `output`")
+            raise InputError("there is no run to continue", "resume", remedy="give its folder as `output`")
         temporary = _TemporaryFolder()
         output = temporary.path
         listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")

@@ -78,7 +78,9 @@ def world_light(
     _require_range(rotate, exposure)
     radiance = np.ascontiguousarray(radiance, dtype=np.float32)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
-        raise InputError(f"light: {radiance.shape} is no lat-long map; give linear radiance (h, w, 3)")
+        raise InputError(
+            f"{radiance.shape} is no lat-long map", "light", remedy="give linear radiance (h, w, 3)"
+        )
     turned: Any = mi.ScalarTransform4f()
     if rotate % 360:
         turned = turned.rotate([0, 0, 1], rotate)

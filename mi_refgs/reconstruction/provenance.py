@@ -57,7 +57,7 @@ class Provenance:
         if folder is None:
             return self
         if not folder.is_dir():
-            raise InputError(f"{folder}: --data: no such folder; give the folder of a data set")
+            raise InputError("no such folder", folder, "--data", "give the folder of a data set")
         return replace(self, data=folder)
 
     @property
@@ -69,7 +69,7 @@ class Provenance:
         """Read a split of the data set; raises InputError for one that is unknown, missing or unreadable."""
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
-            raise InputError(f"views: {split}: {gone}; use cameras(), or restore the data set")
+            raise InputError(gone, "views", split, "use cameras(), or restore the data set")
         views = with_region(read_views(self.method, self.data, split), self.region)
         return with_poses(views, self.records.get(CAMERAS, {}))
 
@@ -108,7 +108,9 @@ class Provenance:
         Raises InputError as `shots` does, and for a number below 1.
         """
         if count < 1:
-            raise InputError(f"turntable: {count} is out of range; give a number of cameras from 1")
+            raise InputError(
+                f"{count} is out of range", "turntable", remedy="give a number of cameras from 1"
+            )
         cameras = [shot.camera for shot in self.shots(trained, "test")]
         if trained.surroundings is None:
             return turntable_cameras(trained, cameras, count)

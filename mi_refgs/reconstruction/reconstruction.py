@@ -103,7 +103,9 @@ class Reconstruction:
         if isinstance(camera, int | np.integer):
             known = self.cameras(split)
             if not -len(known) <= camera < len(known):
-                raise InputError(f"camera: {camera}: {split} has {len(known)}; give 0 to {len(known) - 1}")
+                raise InputError(
+                    f"{split} has {len(known)}", "camera", f"{camera}", f"give 0 to {len(known) - 1}"
+                )
             found = known[camera]
         elif isinstance(camera, View):
             found = camera.camera()
@@ -113,7 +115,7 @@ class Reconstruction:
             found = camera
         else:
             remedy = "give a Camera, a View, a Mitsuba sensor or an index"
-            raise InputError(f"camera: {type(camera).__name__}: no camera; {remedy}")
+            raise InputError("no camera", "camera", type(camera).__name__, remedy)
         return found if size is None else found.resized(size)
 
     # ---------------- images ----------------
@@ -156,7 +158,7 @@ class Reconstruction:
         kinds = suffixes()
         for name in names:
             if name not in kinds:
-                raise InputError(f"aovs: {name}: unknown; use some of {', '.join(kinds)}")
+                raise InputError("unknown", "aovs", name, f"use some of {', '.join(kinds)}")
         seen = self.camera(camera, size)
         frame = self._frame(seen, samples, object_only, aovs=True)
         found = {}
@@ -164,7 +166,7 @@ class Reconstruction:
             try:
                 values = aov_values(name, frame, seen)
             except KeyError:
-                raise InputError(f"aovs: {name}: the surfels have no such attribute; leave it out") from None
+                raise InputError("the surfels have no such attribute", "aovs", name, "leave it out") from None
             found[name] = image_array(values, seen.height, seen.width)
         return found
 
@@ -260,7 +262,7 @@ class Reconstruction:
         Raises InputError for a reconstruction in memory, and as `evaluation.evaluate.evaluate` does.
         """
         if self.folder is None:
-            raise InputError("evaluate: folder: only in memory; measure what save(folder) returns")
+            raise InputError("only in memory", "evaluate", "folder", "measure what save(folder) returns")
         data = None if data is None else Path(data)
         return evaluation.evaluate(Run(self.folder), data, progress, samples)
 

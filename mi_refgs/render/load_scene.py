@@ -31,7 +31,7 @@ def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) 
             integrators = [node.props for node in state.nodes if node.props.plugin_name() == "refgs"]
             if not integrators:
                 option = "--aov" if aovs else "--object"
-                raise InputError(f"{path}: {option}: the scene has no `refgs` integrator; drop {option}")
+                raise InputError("the scene has no `refgs` integrator", path, option, f"drop {option}")
             if aovs:
                 own = str(integrators[0].get("aovs", "")).split(",")
                 integrators[0]["aovs"] = ",".join(_pairs([*filter(str.strip, own), *aovs]))
@@ -41,7 +41,7 @@ def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) 
         with mitsuba_exr():
             loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
-        raise InputError(f"{path}: scene: {reason(error)}") from error
+        raise InputError(reason(error), path, "scene") from error
     finally:
         mi.set_file_resolver(before)
     return loaded[0] if isinstance(loaded, list) else loaded

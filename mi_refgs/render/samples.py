@@ -24,7 +24,7 @@ def samples_per_axis(samples: int) -> int:
     Raises InputError for less than 1.
     """
     if samples < 1:
-        raise InputError(f"samples: {samples} is out of range; give a number from 1")
+        raise InputError(f"{samples} is out of range", "samples", remedy="give a number from 1")
     return math.ceil(math.sqrt(samples))
 
 

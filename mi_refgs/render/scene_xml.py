@@ -49,7 +49,7 @@ def write_scene_xml(path: str | Path, files: SceneFiles, shading: Shading, camer
     be written.
     """
     if shading.occlusion and files.mesh is None:
-        raise InputError(f"{path}: mesh: there is none to trace; give one, or shade without occlusion")
+        raise InputError("there is none to trace", path, "mesh", "give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
     ElementTree.SubElement(scene, "default", name="spp", value="1")
@@ -103,8 +103,9 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
     if not fx * fy > 0:
         raise InputError(
-            f"camera: fx, fy: {fx:g} and {fy:g} pixels mirror the image, as no Mitsuba sensor does; choose "
-            "another view"
+            f"fx, fy: {fx:g} and {fy:g} pixels mirror the image, as no Mitsuba sensor does",
+            "camera",
+            remedy="choose another view",
         )
     to_world = camera.pose()
     if fx > 0:  # both axes point the other way: the camera is upside down

@@ -36,7 +36,7 @@ class Surroundings:
     def check(self, surfels: Surfels) -> None:
         """Raise InputError unless these fit an object's surfels."""
         if not self.surfels.has("radiance_sh"):
-            raise InputError("surroundings: radiance_sh: the surfels have no such attribute; add it")
+            raise InputError("the surfels have no such attribute", "surroundings", "radiance_sh", "add it")
         evaluating_both(surfels.primitive, self.surfels.primitive)
 
     def behind(self, camera: Camera) -> Color3f:

@@ -122,7 +122,7 @@ def newest(run: Run, method: Method) -> TrainedScene:
 
 def _no_artefacts(run: Run) -> InputError:
     return InputError(
-        f"{run.path}: checkpoints: none yet; train it with `refgs train DATA -o {run.path} --resume`"
+        "none yet", run.path, "checkpoints", f"train it with `refgs train DATA -o {run.path} --resume`"
     )
 
 
@@ -164,7 +164,7 @@ def save(
     run = Run(folder)
     if run.exists():
         raise InputError(
-            f"{folder}: contains a run already, which nothing is written into; choose another folder"
+            "contains a run already, which nothing is written into", folder, remedy="choose another folder"
         )
     make_folder(folder)
     with run.alone():

@@ -59,7 +59,7 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     Raises InputError for a scene without light, or whose model has no such attributes.
     """
     if why := lacking(scene):
-        raise SceneError(f"{why}; fit one with materials and a light, as `--for relighting` does")
+        raise SceneError(why, remedy="fit one with materials and a light, as `--for relighting` does")
     shading = scene.shading.relit(scene.mesh is not None)
     assert scene.light is not None and shading is not None  # by `lacking`
     surfels, mesh = scene.surfels.detach(), scene.mesh

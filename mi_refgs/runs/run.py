@@ -62,7 +62,9 @@ class Run:
         """Raise InputError if the folder contains a run, or a foreign file of the same name as one of its."""
         if (self.path / CONFIG).exists():
             raise InputError(
-                f"{self.path}: contains a run already; add --resume to go on with it, or choose another -o"
+                "contains a run already",
+                self.path,
+                remedy="add --resume to go on with it, or choose another -o",
             )
         self.output.require_free()
 
@@ -101,7 +103,7 @@ class Run:
         """The resolved method; raises InputError if this is no run folder."""
         if not self.exists():
             raise InputError(
-                f"{self.path}: config.toml: missing; give the folder that `refgs train -o` wrote"
+                "missing", self.path, "config.toml", "give the folder that `refgs train -o` wrote"
             )
         return load_resolved(self.path / CONFIG)
 
@@ -119,7 +121,7 @@ class Run:
             return Path(path)
         except (OSError, TypeError, ValueError) as error:
             raise InputError(
-                f"{record}: path: cannot be used ({error}); write the folder of the data set there"
+                f"cannot be used ({error})", record, "path", "write the folder of the data set there"
             ) from error
 
     def region(self) -> Region | None:
@@ -140,7 +142,7 @@ class Run:
                 rigid(np.array(pose, dtype=np.float64).reshape(4, 4), f"{record}: to_world: {name}")
         except (AttributeError, TypeError, ValueError) as error:
             raise InputError(
-                f"{record}: to_world: cannot be read ({error}); restore or remove the file"
+                f"cannot be read ({error})", record, "to_world", "restore or remove the file"
             ) from error
         return found
 
@@ -168,14 +170,14 @@ class Run:
             try:
                 return checkpoint.read(path)
             except checkpoint.UnregisteredError as error:
-                raise InputError(f"{path}: {error}") from error
+                raise InputError(f"{error}", path) from error
             except checkpoint.DamagedError as error:
                 damaged.append(f"{path}: damaged ({error})")
                 print(f"refgs: warning: {damaged[-1]}; trying the one before", file=sys.stderr)
         if damaged:
             raise InputError(
-                f"{damaged[0]}, and no checkpoint before it is whole; put a copy back, or remove "
-                f"{self.path / 'checkpoints'} to begin anew"
+                f"{damaged[0]}, and no checkpoint before it is whole",
+                remedy=f"put a copy back, or remove {self.path / 'checkpoints'} to begin anew",
             )
         return None
 

@@ -91,16 +91,16 @@ class TrainedScene:
             if iteration < 0 or not 0 <= seconds < math.inf:
                 raise ValueError("iteration or seconds out of range")
         except UnknownNameError as error:
-            raise InputError(f"{note}: {error}; or register it, as when the run was fitted") from error
+            raise InputError(f"{error}", note, remedy="or register it, as when the run was fitted") from error
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
-            raise InputError(f"{note}: cannot be read ({reason}); {_remedy(folder)}") from error
+            raise InputError(f"cannot be read ({reason})", note, remedy=_remedy(folder)) from error
         light, mesh, near = folder / LIGHT_MAP, folder / MESH, folder / NEAR_FIELD
         around, behind = folder / AROUND_FILE, folder / BACKGROUND_MAP
         needed = {LIGHT_MAP} if shading.model.light != "none" else set()
         for name in sorted((needed | files) & {LIGHT_MAP, NEAR_FIELD, AROUND_FILE, BACKGROUND_MAP}):
             if not (folder / name).is_file():
-                raise InputError(f"{folder / name}: file: missing; {_remedy(folder)}")
+                raise InputError("missing", folder / name, "file", _remedy(folder))
         fitted = TrainedScene(
             read_ply(folder / SURFELS),
             EnvironmentLight.from_file(light) if light.is_file() else None,
@@ -116,7 +116,7 @@ class TrainedScene:
             if fitted.surroundings is not None:
                 fitted.surroundings.check(fitted.surfels)
         except InputError as error:
-            raise InputError(f"{folder}: {error}; or {_remedy(folder)}") from error
+            raise InputError(f"{error}", folder, remedy=f"or {_remedy(folder)}") from error
         return fitted
 
     def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:

@@ -61,9 +61,9 @@ def views_of_run(run: Run, method: Method, split: str, path: Path | None = None)
     if path is None:
         record, path = run.path / DATASET, run.dataset()
         if path is None:
-            raise InputError(f"{record}: path: the run records no data set; name one with --data")
+            raise InputError("the run records no data set", record, "path", "name one with --data")
         if not os.path.isdir(path):  # False for impossible names too
-            raise InputError(f"{record}: path: {path} is gone; name the data set's folder with --data")
+            raise InputError(f"{path} is gone", record, "path", "name the data set's folder with --data")
     return with_region(read_views(method, path, split), run.region())
 
 

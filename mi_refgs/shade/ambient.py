@@ -109,7 +109,9 @@ def ambient_of_pixels(context: TraceContext) -> Color3f:
     if occluder.empty:
         return mi.Color3f(1)
     if occluder.ambient is None:
-        raise InputError("occluder: ambient: none for this mesh; call update_occluder_caches after update")
+        raise InputError(
+            "none for this mesh", "occluder", "ambient", "call update_occluder_caches after update"
+        )
     with dr.suspend_grad():
         hit = occluder.closest(context.origin, context.ray, None, context.covered)
         ratio = dr.select(hit.valid, occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid), 1)

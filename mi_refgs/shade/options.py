@@ -66,7 +66,9 @@ class ShadingOptions:
             else:
                 fits, wanted = type(value) is kind, "True or False" if kind is bool else "a name"
             if not fits:
-                raise InputError(f"shading: {option.name}: {abbreviated(value)} is not allowed; use {wanted}")
+                raise InputError(
+                    f"{abbreviated(value)} is not allowed", "shading", option.name, f"use {wanted}"
+                )
 
     def chosen(self) -> list[str]:
         """Names of the QUALITY options that differ from their defaults."""

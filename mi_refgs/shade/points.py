@@ -41,7 +41,7 @@ class ShadingPoints:
         if name.startswith("_") or name == "attributes":
             raise AttributeError(name)
         if name not in self.attributes:
-            raise InputError(f"shade: {name}: missing; the reflectance model needs it, so add it")
+            raise InputError("missing", "shade", name, "the reflectance model needs it, so add it")
         return self.attributes[name]
 
     def get(self, name: str) -> Any:

@@ -23,7 +23,9 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
     Differentiable. Raises InputError unless 0 ≤ degree ≤ 3.
     """
     if not 0 <= degree <= MAX_SH_DEGREE:
-        raise InputError(f"sh_basis: degree: {degree} is not in 0 … {MAX_SH_DEGREE}; choose one of those")
+        raise InputError(
+            f"{degree} is not in 0 … {MAX_SH_DEGREE}", "sh_basis", "degree", "choose one of those"
+        )
     x, y, z = direction.x, direction.y, direction.z
     basis: list[Any] = [dr.full(mi.Float, 0.5 * math.sqrt(1 / math.pi), dr.width(x))]
     if degree >= 1:
@@ -61,7 +63,7 @@ def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
     """
     degree = math.isqrt(len(coefs)) - 1
     if (degree + 1) ** 2 != len(coefs) or not 0 <= degree <= MAX_SH_DEGREE:
-        raise InputError(f"eval_sh: coefs: {len(coefs)} colours; give 1, 4, 9 or 16, for degree 0 … 3")
+        raise InputError(f"{len(coefs)} colours", "eval_sh", "coefs", "give 1, 4, 9 or 16, for degree 0 … 3")
     colour = mi.Color3f(0)
     for coef, basis in zip(coefs, sh_basis(direction, degree), strict=True):
         colour = dr.fma(coef, basis, colour)

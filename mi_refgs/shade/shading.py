@@ -151,13 +151,15 @@ class Shading(ShadingOptions):
         """Raise InputError if an attribute, the light or the mesh that the model needs is missing."""
         for name in self.required_attributes:
             if name not in attributes:
-                raise InputError(f"shading: {name}: the surfels have no such attribute; add it, or drop it")
+                raise InputError("the surfels have no such attribute", "shading", name, "add it, or drop it")
         if self.model.light != "none" and not light:
             unlit = " or ".join(name for name, model in MODELS.items() if model.light == "none")
             needs = f"reflectance = {self.reflectance} needs one"
-            raise InputError(f"shading: light: {needs}; add it, or set reflectance = {unlit}")
+            raise InputError(needs, "shading", "light", f"add it, or set reflectance = {unlit}")
         if self.occlusion and not mesh:
-            raise InputError("shading: occlusion: there is no mesh to trace; give one, or trace nothing")
+            raise InputError(
+                "there is no mesh to trace", "shading", "occlusion", "give one, or trace nothing"
+            )
 
 
 def trace(points: ShadingPoints, context: TraceContext, shading: Shading) -> ShadingPoints:

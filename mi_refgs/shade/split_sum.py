@@ -90,7 +90,9 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
             incident *= ambient
         diffuse = transmitted * (1 - points.metallic) * points.albedo * incident
     elif points.get("radiance") is None:
-        raise InputError('shade: radiance: missing; diffuse="sh" needs it, diffuse="irradiance" does not')
+        raise InputError(
+            "missing", "shade", "radiance", 'diffuse="sh" needs it, diffuse="irradiance" does not'
+        )
     else:
         diffuse = (1 - points.metallic) * points.radiance
     return RadianceTerms(diffuse, specular, indirect)

@@ -85,7 +85,9 @@ class Camera:
         rotation = matrix[:3, :3]
         finite = np.isfinite(matrix).all()
         if not finite or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
-            raise InputError("camera: to_world: must be a rotation and a translation; remove scale and shear")
+            raise InputError(
+                "must be a rotation and a translation", "camera", "to_world", "remove scale and shear"
+            )
 
         def opaque(*numbers: float) -> list[Float]:
             return [dr.opaque(mi.Float, float(x)) for x in numbers]
@@ -119,11 +121,14 @@ class Camera:
         distance, left = float(np.linalg.norm(forward)), np.cross(top, forward)
         if not (0 < fov < 180 and width > 0 and height > 0):
             raise InputError(
-                f"camera: fov, size: {fov:g} degrees on {width} × {height} pixels; give an angle below 180, "
-                "and pixels"
+                f"fov, size: {fov:g} degrees on {width} × {height} pixels",
+                "camera",
+                remedy="give an angle below 180, and pixels",
             )
         if not (distance > 0 and np.linalg.norm(left) > 1e-9 * distance * np.linalg.norm(top)):
-            raise InputError("camera: up: no direction besides that of the view; move `origin`, or turn `up`")
+            raise InputError(
+                "no direction besides that of the view", "camera", "up", "move `origin`, or turn `up`"
+            )
         left, forward = left / np.linalg.norm(left), forward / distance
         pose = np.eye(4)
         pose[:3] = np.stack([left, np.cross(forward, left), forward, eye], axis=1)
@@ -140,7 +145,8 @@ class Camera:
         params = mi.traverse(sensor)
         if "x_fov" not in params or "aperture_radius" in params:
             raise InputError(
-                f"sensor '{sensor.id()}': type: refgs has pinhole cameras only; use a `perspective` sensor"
+                f"sensor '{sensor.id()}': type: refgs has pinhole cameras only",
+                remedy="use a `perspective` sensor",
             )
         width, height = (int(x) for x in sensor.film().crop_size())
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
@@ -257,7 +263,7 @@ class Camera:
             ratio, least = size / max(self.width, self.height), min(size, 1)
             size = max(least, round(self.width * ratio)), max(least, round(self.height * ratio))
         if min(size) < 1:
-            raise InputError(f"camera: size: {size[0]} × {size[1]} pixels; give whole numbers from 1")
+            raise InputError(f"{size[0]} × {size[1]} pixels", "camera", "size", "give whole numbers from 1")
         x, y = size[0] / self.width, size[1] / self.height
         scaled = {
             name: dr.opaque(mi.Float, float(getattr(self, name)[0]) * ratio)

@@ -72,8 +72,13 @@ def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Floa
         count += dr.width(kept)
         if count > 1 << MAX_PAIR_BITS:
             raise InputError(
-                f"splat: surfels: more than {1 << MAX_PAIR_BITS:,} surfels on the {tiles:,} tiles of "
-                f"{camera.width} × {camera.height} pixels; render fewer pixels, or remove the largest surfels"
+                (
+                    f"more than {1 << MAX_PAIR_BITS:,} surfels on the {tiles:,} tiles of {camera.width} × "
+                    f"{camera.height} pixels"
+                ),
+                "splat",
+                "surfels",
+                "render fewer pixels, or remove the largest surfels",
             )
         if dr.width(kept):
             pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))

@@ -82,14 +82,14 @@ class Attribute:
         value = self.initial if value is None else value
         if self.activation == "sigmoid":
             if not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= 1)):
-                raise InputError(f"surfels: {self.name}: {value} is out of range; start it between 0 and 1")
+                raise InputError(f"{value} is out of range", "surfels", self.name, "start it between 0 and 1")
             if self.jitter:
                 noise = rng.uniform(-self.jitter, self.jitter, (count, width))
                 return logit(np.clip(value + noise, *JITTER_RANGE))
             return np.broadcast_to(logit(value), (count, width)).copy()
         if self.activation == "exp":
             if not 0 < value < np.inf:
-                raise InputError(f"surfels: {self.name}: {value} is out of range; start it above 0")
+                raise InputError(f"{value} is out of range", "surfels", self.name, "start it above 0")
             value = np.log(value)
         if self.harmonics:
             return np.tile(np.where(np.arange(width) < 3, value / SH_DC, 0.0), (count, 1))
@@ -100,12 +100,14 @@ def _check(attribute: Attribute) -> None:
     if attribute.aov not in ("", "Y", "RGB", "XYZ") or len(attribute.aov) not in (0, *attribute.widths):
         widths = " or ".join(map(str, attribute.widths))
         raise InputError(
-            f"attribute '{attribute.name}': aov: {attribute.aov!r} does not fit {widths} columns; use "
-            'Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""'
+            f"attribute '{attribute.name}': aov: {attribute.aov!r} does not fit {widths} columns",
+            remedy='use Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""',
         )
     for other in ATTRIBUTES.values():
         if {*other.properties} & {*attribute.properties}:
-            raise InputError(f"attribute '{attribute.name}': '{other.name}' has its PLY property; rename it")
+            raise InputError(
+                f"attribute '{attribute.name}': '{other.name}' has its PLY property", remedy="rename it"
+            )
 
 
 ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check)

@@ -50,7 +50,9 @@ def from_points(
         attribute(name)
     for name, wanted in (degree or {}).items():
         if not 0 <= wanted <= MAX_SH_DEGREE:
-            raise InputError(f"surfels: degree of {name}: {wanted} is not in 0 … {MAX_SH_DEGREE}; choose one")
+            raise InputError(
+                f"degree of {name}: {wanted} is not in 0 … {MAX_SH_DEGREE}", "surfels", remedy="choose one"
+            )
     if normals is not None:
         normals = _check("normals", normals, (count,))
     kind = PRIMITIVES.find(primitive, "primitive")
@@ -65,7 +67,7 @@ def from_points(
             width = declared.width((degree or {}).get(name, 0))
             raw[name] = declared.start(count, width, rng, initial.pop(name, None))
     for name in initial:
-        raise InputError(f"surfels: {name}: follows from the points or is not in `attributes`; leave it out")
+        raise InputError("follows from the points or is not in `attributes`", "surfels", name, "leave it out")
     if colours is not None and "radiance_sh" in raw:
         raw["radiance_sh"][:, :3] = (_check("colours", colours, (count,)) - 0.5) / SH_DC
     return Surfels.from_numpy({name: raw[name] for name in ATTRIBUTES if name in raw})
@@ -129,8 +131,8 @@ def _check(name: str, values: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (*rows, 3):
         expected = f"expected {(*rows, 3)}; give one row of three per point"
-        raise InputError(f"surfels: {name}: shape {array.shape}, {expected}")
+        raise InputError(f"shape {array.shape}, {expected}", "surfels", name)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
-        raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those points")
+        raise InputError(f"{bad} values are NaN or infinite", "surfels", name, "remove those points")
     return array

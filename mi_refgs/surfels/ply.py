@@ -38,7 +38,7 @@ def read_ply(path: str | Path) -> Surfels:
         with path.open("rb") as file:
             vertices = read_vertices(path, file)
     except OSError as error:
-        raise InputError(f"{path}: file: cannot be read ({error.strerror}); check the path") from error
+        raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
 
     names = vertices.dtype.names or ()
     arrays = {}
@@ -62,15 +62,16 @@ def _columns(path: Path, vertices: np.ndarray, properties: tuple[str, ...]) -> n
     table = np.empty((len(vertices), len(properties)), dtype=np.float32)
     for column, name in enumerate(properties):
         if name not in (vertices.dtype.names or ()):
-            raise InputError(f"{path}: {name}: the property is missing; export the file again with all of "
-                             f"{', '.join(sorted(properties))}")  # fmt: skip
+            needed = ", ".join(sorted(properties))
+            remedy = f"export the file again with all of {needed}"
+            raise InputError("the property is missing", path, name, remedy)
         # A double beyond float32 becomes infinite here and is reported below.
         with np.errstate(over="ignore"):
             table[:, column] = vertices[name]
         bad = int(np.count_nonzero(~np.isfinite(table[:, column])))
         if bad:
             raise InputError(
-                f"{path}: {name}: {bad} values are NaN or infinite; remove those surfels or export it again"
+                f"{bad} values are NaN or infinite", path, name, "remove those surfels or export it again"
             )
     return table
 
@@ -80,7 +81,7 @@ def _sh_degree(path: Path, names: tuple[str, ...], prefix: str) -> int:
     degrees = {sh_columns(degree) - 3: degree for degree in range(MAX_SH_DEGREE + 1)}
     if rest not in degrees:
         use = f"use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})"
-        raise InputError(f"{path}: {prefix}_rest_*: {rest} properties; {use}")
+        raise InputError(f"{rest} properties", path, f"{prefix}_rest_*", use)
     return degrees[rest]
 
 

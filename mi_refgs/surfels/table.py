@@ -105,11 +105,13 @@ class Surfels:
         for name, tensor in self.raw.items():
             shape = tuple(tensor.shape)
             if len(shape) != 2 or shape[0] != rows:
-                raise InputError(f"surfels: {name}: shape {shape}, expected ({rows}, D); one row per surfel")
+                raise InputError(
+                    f"shape {shape}, expected ({rows}, D)", "surfels", name, "one row per surfel"
+                )
             if shape[1] not in attribute(name).widths:
                 choices = " or ".join(str(columns) for columns in attribute(name).widths)
                 found = f"{shape[1]} columns, expected {choices}"
-                raise InputError(f"surfels: {name}: {found}; fix the array's shape")
+                raise InputError(found, "surfels", name, "fix the array's shape")
 
     @property
     def primitive(self) -> Primitive:
@@ -123,7 +125,7 @@ class Surfels:
         for name, tensor in self.raw.items():
             bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
             if bad:
-                raise InputError(f"surfels: {name}: {bad} values are NaN or infinite; remove those surfels")
+                raise InputError(f"{bad} values are NaN or infinite", "surfels", name, "remove those surfels")
 
     def usable(self) -> Bool:  # (N,)
         """Whether each surfel has finite raw values, below RAW_LIMIT where the activation is unbounded.

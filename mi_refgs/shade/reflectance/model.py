@@ -124,13 +124,13 @@ def require_complete(model: Reflectance) -> None:
     """Raise InputError for a model that cannot render: a method is missing, or a value does not exist."""
     if not isinstance(model, Reflectance):
         raise InputError(
-            f"reflectance model: {abbreviated(model)}: give an object of a subclass of Reflectance"
+            "give an object of a subclass of Reflectance", "reflectance model", abbreviated(model)
         )
     traced = ("trace",) if model.visibility == "own" else ()
     sampled = ("lobe",) if "visibility_rays" in model.honoured else ()
     for name in ("required_attributes", "values", "shade", *traced, *sampled):
         if getattr(type(model), name) is getattr(Reflectance, name):
-            raise InputError(f"reflectance model: {model.name}: {name} is missing; write that method")
+            raise InputError(f"{name} is missing", "reflectance model", model.name, "write that method")
     for name, values, allowed in (
         ("shaded_at", model.shaded_at or (None,), get_args(ShadedAt)),
         ("light", (model.light,), get_args(Lookup)),
@@ -139,8 +139,10 @@ def require_complete(model: Reflectance) -> None:
     ):
         if not {*values} <= {*allowed}:
             raise InputError(
-                f"reflectance model: {model.name}: {name}: {abbreviated(getattr(model, name))} is not "
-                f"allowed; use {' or '.join(allowed)}"
+                f"{name}: {abbreviated(getattr(model, name))} is not allowed",
+                "reflectance model",
+                model.name,
+                f"use {' or '.join(allowed)}",
             )
 
 

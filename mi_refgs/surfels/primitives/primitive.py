@@ -183,8 +183,8 @@ def _check(primitive: Primitive) -> None:
         others = {*other.widths.items()}
         if mine <= others or others <= mine:
             raise InputError(
-                f"primitive '{primitive.name}': '{other.name}' has its attributes; give it an "
-                "attribute, or a number of columns, of its own"
+                f"primitive '{primitive.name}': '{other.name}' has its attributes",
+                remedy="give it an attribute, or a number of columns, of its own",
             )
 
 
@@ -218,10 +218,12 @@ def primitive_of(raw: Mapping[str, Any]) -> Primitive:
     name = missing[0]
     if name in raw:
         raise InputError(
-            f"surfels: {name}: {raw[name].shape[1]} columns, a {nearest.name} has {nearest.widths[name]}; "
-            "fix the array's shape"
+            f"{raw[name].shape[1]} columns, a {nearest.name} has {nearest.widths[name]}",
+            "surfels",
+            name,
+            "fix the array's shape",
         )
-    raise InputError(f"surfels: {name}: the attribute is missing; add it, every {nearest.name} needs it")
+    raise InputError("the attribute is missing", "surfels", name, f"add it, every {nearest.name} needs it")
 
 
 def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
@@ -230,8 +232,10 @@ def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
         if one is other or one.name in other.rows_as:
             return one
     raise InputError(
-        f"surroundings: scale: '{second.name}' is not splatted together with '{first.name}'; "
-        "give both the same primitive, or surfel and gaussian (surroundings.primitive of a method)"
+        f"'{second.name}' is not splatted together with '{first.name}'",
+        "surroundings",
+        "scale",
+        "give both the same primitive, or surfel and gaussian (surroundings.primitive of a method)",
     )
 
 
