@@ -98,8 +98,7 @@ class RefGSBSDF(mi.BSDF):
 
     with GGX's D, and the height-correlated G of Smith [Heitz 2014, "Understanding the Masking-Shadowing
     Function", eqs. 72, 99]. E, per channel, is the specular reflectance under constant light, from the
-    split-sum table: the diffuse base receives what the specular layer transmits (albedo scaling of layered
-    models). No material reflects more than it receives, but for the table's error (1e-3; up to 0.11
+    split-sum table. No material reflects more than it receives, but for the table's error (1e-3; up to 0.11
     at n · v below 0.005 and roughness below 0.15); rough metals lose light between the microfacets. The
     diffuse term is not reciprocal, as E depends on the view v alone: on wi, or on wo for paths that start at
     a light (``TransportMode.Importance``).
@@ -108,9 +107,8 @@ class RefGSBSDF(mi.BSDF):
     for open ones. Component 0 is the specular reflection, 1 the diffuse one. Maps of metallic and roughness
     should be loaded with ``raw = true``, as numbers and not as sRGB.
 
-    Samples are drawn from the visible normals [Heitz 2018] or from the cosine, chosen in proportion to what
-    the two terms reflect of a constant light at wi. `eval`, and the weight that `sample` returns, have
-    derivatives with respect to the parameters and the directions; samples and densities have none.
+    `eval`, and the weight that `sample` returns, have derivatives with respect to the parameters and the
+    directions; samples, of the visible normals [Heitz 2018] or the cosine, and densities have none.
 
     .. tabs::
         .. code-tab:: xml
