@@ -146,8 +146,8 @@ def test_levels_against_brute_force(rng: np.random.Generator) -> None:
     for roughness, level in zip(lobe_matrices.LEVEL_ROUGHNESS, level_maps(light)[1:], strict=True):
         rows = len(level)
         i, j = round((h // 3) * (rows - 1) / (h - 1)), int((h // 4 + 0.5) * rows / h)
-        texels = [(i, j), (i, j + 1), (i + 1, j), (i - 2, j - 2), (0, 0), (1, rows), (3, rows), (rows - 1, 5)]
-        texels += [(int(a), int(b)) for a, b in rng.integers(0, rows, (2, 2))]
+        texels = [(i, j), (i + 1, j), (0, 0), (3, rows), (rows - 1, 5)]
+        texels += [(int(a), int(b)) for a, b in rng.integers(0, rows, (1, 2))]
         directions = [texel_direction(rows, *texel) for texel in texels]
         expected = np.array([reference.lobe_average(radiance, d, roughness) for d in directions])
         error = np.abs(level[*zip(*texels, strict=True)] - expected).max()

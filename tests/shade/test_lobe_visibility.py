@@ -107,7 +107,7 @@ def true_fraction(place: np.ndarray, points: ShadingPoints, roughness: float, f0
         def free(d: np.ndarray) -> np.ndarray:
             return (~wall_blocks(p, d)[0])[:, None].astype(float)
 
-        return exact.traced_fraction(free, np.array([0, 1.0, 0]), unit(v), roughness, f0, 300)
+        return exact.traced_fraction(free, np.array([0, 1.0, 0]), unit(v), roughness, f0, 160)
 
     return np.array([*map(fraction, place, points.view.numpy().T.astype(np.float64))])
 
