@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Callable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
@@ -23,13 +25,25 @@ class Registry(Mapping[str, T], Generic[T]):
     """Objects of one kind by name, in the order of registration.
 
     `check(item)` raises InputError for an item that cannot be used, so that it is refused at once
-    and not at its first use.
+    and not at its first use. With a `package`, the first look-up imports its modules, which register theirs:
+    a module may so read a registry whose items are on a floor above it.
     """
 
-    def __init__(self, kind: str, check: Callable[[T], None] = lambda item: None) -> None:
+    def __init__(
+        self, kind: str, check: Callable[[T], None] = lambda item: None, package: str | None = None
+    ) -> None:
         self.kind = kind  # such as "reflectance model", for messages
         self._check = check
-        self._items: dict[str, T] = {}
+        self._package = package
+        self._registered: dict[str, T] = {}
+
+    @property
+    def _items(self) -> dict[str, T]:
+        if (package := self._package) is not None:
+            self._package = None
+            for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
+                importlib.import_module(f"{package}.{module.name}")
+        return self._registered
 
     def register(self, item: T, first: bool = False) -> T:
         """Add an item, which is returned; `first`: before the others.
@@ -37,12 +51,13 @@ class Registry(Mapping[str, T], Generic[T]):
         Raises InputError for an item without a name, with the name of another one, or that `check` refuses.
         """
         name = getattr(item, "name", "")
-        if not name or name in self._items:
+        if not name or name in self._registered:
             raise InputError(
                 f"'{name}': the name is empty or in use", self.kind, remedy="choose another name"
             )
         self._check(item)
-        self._items = {name: item} | self._items if first else self._items | {name: item}
+        added = {name: item}
+        self._registered = added | self._registered if first else self._registered | added
         return item
 
     def unregister(self, name: str) -> None:

@@ -46,5 +46,11 @@ def sphere_data(size: int, views: int, rng: np.random.Generator) -> Dataset:
 
 def make_trainer(surfels: int, data: Dataset) -> Trainer:
     """A trainer at the preset `standard` that keeps its number of surfels."""
-    settings = [f"surfels.count={surfels}", f"surfels.max_count={surfels}", "surfels.inside=0", "refine={}"]
+    settings = [
+        f"surfels.count={surfels}",
+        f"surfels.max_count={surfels}",
+        "surfels.inside=0",
+        "event.densify=false",
+        "event.reset_opacity=false",
+    ]
     return Trainer(methods.load(METHOD, "standard", settings), data)

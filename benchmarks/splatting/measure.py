@@ -27,7 +27,7 @@ from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.measure import measure as measure_case
 from mi_refgs.constants import tile_size
 from mi_refgs.profiling.phases import phase_times
-from mi_refgs.profiling.profile import Counts, profile_stage
+from mi_refgs.profiling.profile import Counts, profile_stage, stepper
 from mi_refgs.splat import list_by_tile, project
 
 FLOPS = {"forward": 60, "both": 260}
@@ -151,12 +151,11 @@ def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
     trainer = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)))
     result = {}
     for name, stage in trainer.method.stages():
-        if stage.shading.at == "pixel" and trainer.method.mesh is not None:
-            trainer.extract_mesh()
+        if stage.shading.at == "pixel" and "mesh" in trainer.method.event:
+            trainer.method.event["mesh"].apply(trainer)
         found = profile_stage(trainer, name, steps)
-        with trainer.held_in_stage(name) as prepare:
-            prepare()
-            splat_ms = timing.milliseconds({name: Ours.of_step(trainer).both}, STEP_SECONDS, steps)[name]
+        splat = Ours.of_step(stepper(trainer, name)).both
+        splat_ms = timing.milliseconds({name: splat}, STEP_SECONDS, steps)[name]
         result[name] = {
             "step_ms": round(found.step_ms, 2),
             "splat_ms": round(splat_ms, 2),

@@ -20,7 +20,7 @@ STEPS = 3
 def step(count: int, size: int) -> dict[str, Any]:
     """Return milliseconds per step of the full method's last stage, and the largest resident memory."""
     trainer = make_trainer(count, sphere_data(size, 2, np.random.default_rng(0)))
-    trainer.extract_mesh()
+    trainer.method.event["mesh"].apply(trainer)
     trainer.fit.iteration = trainer.method.stages()[-1][1].until - STEPS - 1
     times = [1e3 * once(trainer.step) for _ in range(STEPS + 1)]
     found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}

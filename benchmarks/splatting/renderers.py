@@ -11,7 +11,6 @@ import numpy as np
 
 from benchmarks.common.view import perspective
 from benchmarks.splatting.cases import COLOUR, Workload
-from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import listening, phase
 from mi_refgs.profiling.profile import Counts, count
@@ -34,11 +33,11 @@ class Ours:
         return Ours(workload.surfels(), columns, workload.camera(), weights)
 
     @staticmethod
-    def of_step(trainer: Trainer) -> Ours:
-        """The call that a trainer's next step makes, which it takes."""
+    def of_step(step: Callable[[], None]) -> Ours:
+        """The call that a step of a fit makes."""
         heard = _Arguments()
         with listening(heard):
-            trainer.step()
+            step()
         (surfels,), camera = heard.arguments["project"]
         columns = dr.detach(heard.arguments["splat forward"][1])
         shape = (len(columns) + 2, camera.width * camera.height)

@@ -26,7 +26,6 @@ from benchmarks.stability.cases import catalogue
 from benchmarks.stability.measure import IMAGE_LIMIT
 from benchmarks.stability.measure import measure as measure_case
 from mi_refgs.data.images import Pixels
-from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import LIGHT
 
@@ -65,7 +64,7 @@ def fit(name: str) -> dict[str, Any]:
     if "view" in case:
         views = tuple(replace(view, **case["view"](view)) for view in trainer.data.views)
         data = replace(trainer.data, views=views, is_linear_radiance=views[0].is_linear_radiance)
-        trainer.adopt(FitSetup(trainer.method, data), trainer.state())
+        trainer.use(data)
     if "light" in case:
         raw = trainer.fit.params[LIGHT].numpy()
         trainer.fit.params[LIGHT] = upload_tensor(case["light"](raw.ravel()).reshape(raw.shape))
@@ -73,7 +72,7 @@ def fit(name: str) -> dict[str, Any]:
     losses = []
     for _, stage in trainer.method.stages():
         if stage.shading.at == "pixel":
-            trainer.extract_mesh()
+            trainer.method.event["mesh"].apply(trainer)
         for _ in range(STEPS):
             trainer.step()
             losses.append(float(trainer.loss[0]))

@@ -15,7 +15,7 @@ from mi_refgs.methods.window import Window
 from mi_refgs.shade.options import NOT_A_SETTING
 from site_pages import table
 
-FILLED_IN = ("name", "file", "preset", "assignments", "components")
+FILLED_IN = ("name", "file", "preset", "assignments")
 """Fields of `Method` that no file gives: `load` fills them in."""
 
 
@@ -53,10 +53,11 @@ def tables() -> dict[str, type]:
     while waiting:
         prefix, kind = waiting.pop(0)
         hints = typing.get_type_hints(kind)
-        for name in (field.name for field in dataclasses.fields(kind) if field.metadata != FLAT):
-            hint = hints[name]
-            for inner, suffix in _classes(hint):
-                if inner is not Window:
+        for field in (one for one in dataclasses.fields(kind) if one.metadata != FLAT):
+            name, registry = field.name, field.metadata.get("by_name", {})
+            by_name = [(inner, f".{key}") for key, inner in registry.items()]
+            for inner, suffix in by_name or _classes(hints[name]):
+                if inner is not Window and dataclasses.fields(inner):
                     found[f"{prefix}{name}{suffix}"] = inner
                     waiting.append((f"{prefix}{name}{suffix}.", inner))
     return found

@@ -50,8 +50,8 @@ class Train:
 
     def run(self) -> Result:
         """Fit, from the start or from the newest checkpoint."""
+        from mi_refgs.fitting.decide import table
         from mi_refgs.fitting.runner import method_for
-        from mi_refgs.fitting.select import table
         from mi_refgs.reconstruction.fit import ProgressBar, fit
 
         if self.purpose is not None and self.method is not None:
@@ -94,8 +94,7 @@ class Train:
             f"({taken:.0f} s in all), {trainer.surfels.count} surfels{beside}; next: refgs eval {self.output}"
         )
         if trainer.fit.decisions:
-            data["components"] = list(trainer.method.components)
             data["decisions"] = trainer.fit.decisions
-            if any(row["with_it"] for row in trainer.fit.decisions):  # a trial that measured a gain
+            if any(row["psnr_with"] for row in trainer.fit.decisions):  # a trial that measured a gain
                 text = f"{table(trainer.fit.decisions)}\n{text}"
         return Result(data, text)

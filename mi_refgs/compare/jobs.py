@@ -17,11 +17,11 @@ from typing import Any
 from mi_refgs import __version__
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
-from mi_refgs.fitting.select import as_decided
+from mi_refgs.fitting.decide import differences
 from mi_refgs.io.files import read_json, write_json
 from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import DataOptions, Method
-from mi_refgs.methods.read import differences, load
+from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.views import read_views, sized
 
@@ -201,8 +201,8 @@ def require_same(job: Job) -> None:
         job.method()
         job.run.output.require_free()
         return
-    made, remedy = job.run.method(), "choose another -o, or remove that run"
-    for key, (before, now) in differences(made, as_decided(job.method(), made)).items():
+    remedy = "choose another -o, or remove that run"
+    for key, (before, now) in differences(job.run, job.method()).items():
         what = f"the run was made with {before}, and --methods, --preset or --set would make it {now}"
         raise InputError(what, f"{job.folder}/config.toml", key, remedy)
     data = job.run.dataset()

@@ -21,14 +21,15 @@ from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, on_white, panels
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
-from mi_refgs.fitting.exposure import EXPOSURE_FILE, displayed_of, image_of, with_gain
+from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
+from mi_refgs.fitting.image_error import displayed_of, image_of, with_gain
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
 from mi_refgs.kernels.device import machine
 from mi_refgs.progress import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import CAMERAS, Run
+from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.light_file import read_radiance
@@ -47,8 +48,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
     Every key of the upper level is always present. Where a score does not apply it is null, and `NAME_reason`
-    says why; `exposure` and `cameras` are null if nothing was decided. An entry of `views` has only the
-    scores of that view.
+    says why. An entry of `views` has only the scores of that view.
 
     `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
     `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
@@ -59,7 +59,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
                                    compares methods on images of different exposure
     `psnr_registered`              with the pose at which a render fits the view best (`data.registration`),
                                    if the fit corrected its cameras: all may have moved with the scene
-    `exposure`, `cameras`          what the fit decided about its own exposure compensation and corrections
+    `exposure`, `cameras`          whether the fit had gains of its training views, and corrected cameras
     `image_size`                   of the test views as they are read, each pixel the mean of `downscale`²
                                    pixels of the file; scores of different sizes are not comparable
     `ms_per_frame`                 median over single synchronised frames of the displayed image without AOVs,
@@ -86,8 +86,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     files = [run.path / name for name in renders]
     errors, budget = Decomposition(), ErrorBudget()
     scores, shown = _measure(fitted, views, surface, samples, files, progress, errors, budget)
-    cameras_decided = _decision(run, CAMERAS, "to_world")
-    if cameras_decided is not None and cameras_decided.get("corrected"):
+    if corrected := bool(run.cameras()):
         _register(scores, fitted, views, samples, progress)
 
     # The numbers.
@@ -103,8 +102,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     )
     result |= {
         "caption": caption(size),
-        "exposure": _decision(run, EXPOSURE_FILE, "gain"),
-        "cameras": cameras_decided,
+        "exposure": (run.path / EXPOSURE_FILE).is_file(),
+        "cameras": corrected,
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
         "surfels": fitted.surfels.count,
@@ -223,13 +222,6 @@ def _scores(rendered: RenderedView, view: View, data: Dataset, first: dict[str, 
     if view.normal is not None:
         scores |= metrics.normal_mae_deg(rendered.normal, view.normal, view.covered())
     return scores
-
-
-def _decision(run: Run, file: str, per_view: str) -> dict[str, Any] | None:
-    """Return a decision of the fit without its numbers `per_view`; None if it decided nothing."""
-    if not (run.path / file).is_file():
-        return None
-    return {name: value for name, value in read_json(run.path / file).items() if name != per_view}
 
 
 def render_names(views: Sequence[View]) -> list[str]:

@@ -173,13 +173,18 @@ class Adam:
         self.stage: Mapping[str, float] = {}  # factors of the present stage of a fit
         self._first: dict[str, Float] = {}
         self._second: dict[str, Float] = {}
-        self._steps = dict.fromkeys(groups, 0)
+        self._steps: dict[str, int] = {}
         self._usual: dict[str, float] = {}  # median √(v / (1 - β₂ᵗ)); 0: not known yet
         self._least: dict[str, Float] = {}  # the same on the device; infinity: not known yet
         self._skips = Skips(params, self.groups)
-        for name in groups:
-            self._set_usual(name, 0.0)
-            self.reset(name)
+        for name, group in groups.items():
+            self.add(name, group)
+
+    def add(self, name: str, group: Group) -> None:
+        """Let a parameter learn, without history."""
+        self.groups[name], self._steps[name] = group, 0
+        self._set_usual(name, 0.0)
+        self.reset(name)
 
     def set_factor(self, name: str, factor: float) -> None:
         """Set the factor of one tensor's learning rate; 0 freezes it."""

@@ -26,14 +26,14 @@ from mi_refgs.data.region import REGION_FILE, region_pixels
 from mi_refgs.data.stereo import stereo
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import exposure, poses
-from mi_refgs.fitting.metal_trial import install_metal_trial
+from mi_refgs.fitting.decide import DECISIONS, HOLDOUT, as_decided, differences, waiting
+from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
 from mi_refgs.fitting.objective import require_losses
-from mi_refgs.fitting.select import DECISIONS, as_decided, install_trials, with_components
+from mi_refgs.fitting.per_view import camera_of, gains_of
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
-from mi_refgs.methods.method import Method
+from mi_refgs.methods.method import POSE, Method
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import MODEL
@@ -169,10 +169,9 @@ def begin(
     anew.
 
     A new fit of photographs starts from the points of the data set and those of stereo. `tell` is called with
-    what is found and decided, `warn` with steps that failed. From now on the trainer tries the optional
-    components of its method. A resumed run keeps its region of interest. Raises InputError for cameras
-    that are all in one place, checkpoints that are all damaged, a scene without a checkpoint, and a folder
-    that cannot be written.
+    what is found and decided, `warn` with steps that failed. A resumed run keeps its region of interest.
+    Raises InputError for cameras that are all in one place, checkpoints that are all damaged, a scene without
+    a checkpoint, and a folder that cannot be written.
     """
     resumed = run.exists()
     views = with_region(views, run.region(), tell)
@@ -183,16 +182,11 @@ def begin(
             "would replace; choose another -o"
         )
     if state is not None:
-        method = with_components(method, decisions_of(state))
+        method = as_decided(method, decisions_of(state))
     else:
         require_several_sides(views)
         for note in views.notes:
             tell(f"{views.path}: {note}")
-        if method.select is not None and len(views.views) < method.select.holdout:
-            tell(
-                f"{views.path}: {len(views.views)} views: too few to hold some out, so no component is tried"
-            )
-            method = replace(method, select=None)
         views, surfaces = _with_stereo(views, tell)
         if not resumed:
             views = _around_object(views, surfaces, tell, warn)
@@ -201,8 +195,9 @@ def begin(
         run.rewind(trainer.iteration)
     else:
         run.create(method, str(views.path.resolve()), views.region)
-    install_trials(trainer, tell)
-    install_metal_trial(trainer, tell)
+        if len(views.views) < HOLDOUT and (names := waiting(trainer)):
+            few = f"{len(views.views)} views: too few to hold some out"
+            tell(f"{views.path}: {few}, so {' and '.join(names)} are not decided")
     return trainer
 
 
@@ -253,7 +248,7 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     """Save the state if no checkpoint contains it, and write the artefacts; returns a warning if there is
     one.
 
-    config.toml is updated with the components that were chosen. The camera of scene.xml is that of the first
+    config.toml is updated with what was decided. The camera of scene.xml is that of the first
     test view, or of the first training view if there are no test views.
     """
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
@@ -261,10 +256,13 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     if trainer.fit.decisions:
         run.write_method(trainer.method)
         run.write_json(DECISIONS, trainer.fit.decisions)
-    if (gains := exposure.record(trainer.setup, trainer.fit)) is not None:
-        run.write_json(exposure.EXPOSURE_FILE, gains)
-    if (cameras := poses.record(trainer.setup, trainer.fit)) is not None:
-        run.write_json(CAMERAS, cameras)
+    setup, params = trainer.setup, trainer.fit.params
+    names = [view.name for view in setup.data.views]
+    if (gains := gains_of(params)) is not None:
+        run.write_json(EXPOSURE_FILE, {"gain": dict(zip(names, gains.round(5).tolist(), strict=True))})
+    if POSE in params:
+        poses = [camera_of(setup, params, i).pose().tolist() for i in range(len(names))]
+        run.write_json(CAMERAS, {"to_world": dict(zip(names, poses, strict=True))})
     if trainer.fit.region is not None:
         run.write_dataset(str(trainer.data.path.resolve()), trainer.fit.region)
     warning, camera = None, trainer.camera(0)
@@ -312,24 +310,23 @@ def _require_same(run: Run, made: Method, choice: Choice) -> None:
     wanted, preset, file = choice.method, choice.preset, made.file
     changes = methods.assignments(choice.settings)
     if isinstance(wanted, Method):
-        _require(run, "method", made, wanted)
+        _require(run, "method", wanted)
     elif wanted is not None:
         file = wanted
         now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments)
-        _require(run, "--method (--for)", made, now)
+        _require(run, "--method (--for)", now)
     if preset is not None and preset != made.preset:
         raise InputError(
             f"{run.path / 'config.toml'}: --preset: the run was started with '{made.preset}', not "
             f"'{preset}'; drop --preset or choose another -o"
         )
     if changes and tuple(changes) != made.assignments:
-        _require(run, "--set", made, methods.load(file, made.preset, changes))
+        _require(run, "--set", methods.load(file, made.preset, changes))
 
 
-def _require(run: Run, option: str, made: Method, now: Method) -> None:
+def _require(run: Run, option: str, now: Method) -> None:
     """Raise InputError if the method of a run is not that of an option."""
-    changes = methods.differences(made, as_decided(now, made))
-    for key, (before, after) in sorted(changes.items(), key=lambda item: item[0] != "name"):
+    for key, (before, after) in sorted(differences(run, now).items(), key=lambda item: item[0] != "name"):
         raise InputError(
             f"{run.path / 'config.toml'}: {option}: {key}: the run was started with {before}, and "
             f"would now have {after}; drop {option} or choose another -o"

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -15,19 +16,11 @@ from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.hull import view_focus
 from mi_refgs.errors import InputError
+from mi_refgs.fitting.events import place
 from mi_refgs.fitting.optim import Group
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import (
-    AROUND,
-    BACKGROUND,
-    GAIN,
-    LIGHT,
-    PER_VIEW,
-    POSE,
-    CameraOptions,
-    ExposureOptions,
-    Method,
-)
+from mi_refgs.methods.event import EVENTS, Event
+from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, POSE, Method
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.light.light import Light
@@ -35,6 +28,8 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.types import Float, TensorXf
 
+GAIN_RATES, POSE_RATES = (1e-3, 1e-4), (1e-3, 1e-4)
+"""Learning rates of log gains and of corrections, radians or half widths, at the start and at the end."""
 POSITION_STEPS = 0.6
 """Fraction of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the
 released Ref-Gaussian code."""
@@ -53,17 +48,11 @@ class FitSetup:
         known = self.method.surroundings is not None and self.data.region is not None
         return known and not self.data.has_alpha
 
-    @property
-    def exposure(self) -> ExposureOptions | None:
-        """Options of the per-image exposure compensation, unless the method switches it off."""
-        options = self.method.exposure
-        return None if options is None or options.gains == "off" else options
-
-    @property
-    def cameras(self) -> CameraOptions | None:
-        """Options of the camera corrections, unless the method switches them off."""
-        options = self.method.cameras
-        return None if options is None or options.corrections == "off" else options
+    @cached_property
+    def events(self) -> list[Event[Any]]:
+        """The events of the method, and those of every method, in their order."""
+        always = {name: kind() for name, kind in EVENTS.items() if kind.always}
+        return sorted((always | self.method.event).values(), key=lambda event: place(event.name))
 
     @cached_property
     def focus(self) -> np.ndarray:
@@ -137,10 +126,9 @@ class FitSetup:
         if self.method.light is not None:
             texels = rates.light, rates.light * rates.decay, iterations
             groups[LIGHT] = Group(*texels, relative=rates.light_relative)
-        if self.exposure is not None and GAIN in params:
-            groups[GAIN] = Group(self.exposure.rate, 0.1 * self.exposure.rate, iterations)
-        if self.cameras is not None and POSE in params:
-            groups[POSE] = Group(self.cameras.rate, 0.03 * self.cameras.rate, iterations)
+        for name, (rate, final) in {GAIN: GAIN_RATES, POSE: POSE_RATES}.items():
+            if name in params:
+                groups[name] = Group(rate, final, iterations)
         return groups
 
     def _of_table(self, names: tuple[str, ...], extent: float) -> dict[str, Group]:

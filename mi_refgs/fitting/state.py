@@ -6,7 +6,7 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
     error_sum                              per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
     photographed/PART                      the background as the object's light, if it was rendered
-    iteration  seconds  held_until  decisions  exposure  cameras  region  light_gradient
+    iteration  seconds  held_until  decisions  region  light_gradient
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.photographed_light import PhotographedLight
-from mi_refgs.fitting.refine import TableEdit
 from mi_refgs.fitting.schedule import FitSetup, SharedPrefilter
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import AROUND, GAIN, Stage
+from mi_refgs.methods.method import AROUND, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexColours, VertexSurfels
 from mi_refgs.occlusion.visibility import Occluder
@@ -48,8 +47,18 @@ from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Bool, Float, TensorXf, UInt32
+
+
+@dataclass(frozen=True)
+class TableEdit:
+    """New surfels; row i descends from row parent[i] of the old ones, and is `fresh` if it has no history."""
+
+    surfels: Surfels
+    parent: np.ndarray  # (M,) uint32
+    fresh: np.ndarray  # (M,) bool
 
 
 @dataclass(eq=False)
@@ -81,8 +90,9 @@ class ParameterTable:
 
     def apply(self, edit: TableEdit) -> None:
         """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows."""
-        edit = edit.ordered()
-        self._move(edit.surfels, upload(edit.parent, mi.UInt32), upload(edit.fresh, mi.Bool))
+        order = morton_order(edit.surfels.raw["position"].numpy())
+        parent, fresh = upload(edit.parent[order], mi.UInt32), upload(edit.fresh[order], mi.Bool)
+        self._move(edit.surfels.gather(upload(order, mi.UInt32)), parent, fresh)
 
     def remove(self, rows: np.ndarray) -> None:
         """Remove surfels; raises InputError if none would be left."""
@@ -125,18 +135,15 @@ class FitState:
     seconds: float = 0.0  # spent in steps
     held_until: int = 0  # iteration before which opacities do not learn
     decisions: list[dict[str, Any]] = field(default_factory=list)  # about components of the method
-    exposure: dict[str, Any] | None = None  # decision about the exposure compensation
-    cameras: dict[str, Any] | None = None  # decision about camera corrections
     region: Region | None = None  # of interest, once it has followed the object
     photographed: PhotographedLight | None = None  # the background as the object's light
 
     @staticmethod
-    def start(setup: FitSetup, gains: Mapping[str, TensorXf]) -> FitState:
-        """The state before the first step; `gains`, if there are any, do not learn until they are decided."""
+    def start(setup: FitSetup) -> FitState:
+        """The state before the first step."""
         draws = setup.rng(0, "start")
         params = initial_parameters(setup.method, setup.data, draws, setup.open_scene)
-        made = FitState._assembled(setup, params | dict(gains))
-        made.optimiser.set_factor(GAIN, 0.0)
+        made = FitState._assembled(setup, params)
         for table in made.tables:
             table.clear()
         return made
@@ -149,6 +156,25 @@ class FitState:
             limits[""], limits[AROUND] = method.surroundings.limits(limits[""])
         tables = [ParameterTable(params, optimiser, prefix, most) for prefix, most in limits.items()]
         return FitState(params, optimiser, tables)
+
+    def add(self, setup: FitSetup, name: str, tensor: TensorXf) -> None:
+        """Add a parameter without history, or replace the one of this name."""
+        self.params[name] = tensor
+        self.optimiser.add(name, setup.groups(self.params)[name])
+
+    def observe(
+        self,
+        error: Float,  # squared error of a step by responsible surfel, the object's first
+    ) -> None:
+        """Add to the statistics of all tables."""
+        if len(self.tables) == 1:
+            self.tables[0].observe(error)
+            return
+        begin = mi.UInt32(0)
+        for table in self.tables:
+            count = dr.width(table.error_sum)
+            table.observe(dr.gather(mi.Float, error, dr.arange(mi.UInt32, count) + begin))
+            begin = dr.opaque(mi.UInt32, count)
 
     @property
     def surfels(self) -> Surfels:
@@ -197,8 +223,7 @@ class FitState:
         state |= {name: np.array(getattr(self, name)) for name in ("iteration", "seconds", "held_until")}
         state |= self.prefilter.state()
         region = None if self.region is None else self.region.content
-        records = {"exposure": self.exposure, "cameras": self.cameras, "decisions": self.decisions}
-        for name, value in (records | {"region": region}).items():
+        for name, value in {"decisions": self.decisions, "region": region}.items():
             if value:
                 state[name] = np.frombuffer(json.dumps(value).encode(), np.uint8)
         if self.photographed is not None:
@@ -222,8 +247,6 @@ class FitState:
         made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
         made.held_until = int(state["held_until"])
         made.decisions = decisions_of(state)
-        for name in {"exposure", "cameras"} & state.keys():
-            setattr(made, name, json.loads(state[name].tobytes()))
         if "region" in state:
             made.region = Region.of(json.loads(state["region"].tobytes()), "checkpoint")
         if f"{PHOTOGRAPHED}weight" in state:

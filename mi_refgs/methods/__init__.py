@@ -1,6 +1,7 @@
 """Methods as data: the TOML files of `variants/`, read strictly and scaled to a preset."""
 
-from mi_refgs.methods.method import LightOptions, LossWeight, Method, Refine, Stage, SurfelOptions
+from mi_refgs.methods.build import plain
+from mi_refgs.methods.method import LightOptions, LossWeight, Method, Stage, SurfelOptions
 from mi_refgs.methods.read import (
     PRESETS,
     assignments,
@@ -11,7 +12,6 @@ from mi_refgs.methods.read import (
     load_resolved,
     names,
     preset_of,
-    with_components,
 )
 from mi_refgs.methods.window import Window
 
@@ -20,7 +20,6 @@ __all__ = [
     "LightOptions",
     "LossWeight",
     "Method",
-    "Refine",
     "Stage",
     "SurfelOptions",
     "Window",
@@ -31,6 +30,6 @@ __all__ = [
     "load",
     "load_resolved",
     "names",
+    "plain",
     "preset_of",
-    "with_components",
 ]

@@ -13,7 +13,9 @@ from typing import Any, ClassVar, Literal
 
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.errors import InputError
-from mi_refgs.methods.build import FLAT
+from mi_refgs.methods.build import FLAT, by_name
+from mi_refgs.methods.event import EVENTS, Event
+from mi_refgs.methods.initialiser import INITIALISERS
 from mi_refgs.methods.ranges import allowed, at_least, between, more_than
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
@@ -31,7 +33,6 @@ AROUND = "surroundings/"  # prefix of the background Gaussians' attributes
 APART = (LIGHT, BACKGROUND, *PER_VIEW)  # parameters that are not attributes of surfels
 AT_ONCE = Window(0, 3, 1)  # one SH degree more in each of the first three iterations
 LEAST_CROP = 64 * 64  # pixels; SSIM compares windows of 11 × 11
-MESH_WINDOW = Window(20_000, 50_000, 2_000)  # that of the released Ref-Gaussian code on synthetic scenes
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,12 @@ class SurfelOptions:
     count: int = field(default=20_000, metadata=at_least(1))  # initial surfels
     # Densification stops at this number, times `capacity`.
     max_count: int = field(default=40_000, metadata=at_least(1))
-    # Factor of `max_count`; a component that raises it fills the room at once.
+    # Factor of `max_count`; a decision that raises it fills the room at once.
     capacity: float = field(default=1.0, metadata=more_than(0))
+    # Largest number that a preset may set `max_count` to; absent: any.
+    preset_limit: int | None = field(default=None, metadata=at_least(1))
+    # Initialisers (`fitting.initialisers`), of which the first that fits the data says where surfels start.
+    start: tuple[str, ...] = ("hull", "points", "random")
     # Fraction of the initial surfels in the visual hull's volume; the others are on its surface.
     inside: float = field(default=0.0, metadata=between(0, 1))
     # SH degree by attribute; else 3.
@@ -85,7 +90,7 @@ class SurfelOptions:
         widths = PRIMITIVES.find(self.primitive, "primitive").widths
         return widths[name] if name in widths else attribute(name).width(self.degree_of(name))
 
-    def start(self, name: str) -> float:
+    def first(self, name: str) -> float:
         """Initial value of an attribute, activated."""
         return self.initial.get(name, attribute(name).initial)
 
@@ -131,8 +136,6 @@ class LightOptions:
     radiance: float = 0.5  # initial, everywhere
     # Iterations that share one prefiltered light, which then receives all their gradients.
     every: int = field(default=1, metadata=at_least(1))
-    # Iterations at which the background is rendered for the loss `photographed`; absent: never.
-    photographed: Window | None = None
 
 
 @dataclass(frozen=True)
@@ -145,48 +148,6 @@ class Stage:
     restart: tuple[str, ...] = ()  # attributes, and `light`, reset to initial values when the stage begins
     # Factors of rates, by attribute or `light`.
     rates: dict[str, float] = field(default_factory=dict, metadata=at_least(0))
-
-
-@dataclass(frozen=True)
-class Propagation:
-    """Normal propagation: surfels become opaque, and reflective ones grow over their neighbours.
-
-    [3DGS-DR, Ye et al. 2024, §3.3; material-aware: Ref-Gaussian §3.4]
-    """
-
-    when: Window  # iterations of its events
-    opacity: float = 0.9  # all surfels become at least this opaque
-    scale: float = 1.5  # factor of the scales of reflective surfels
-    metallic: float = 0.02  # reflective: at least this metallic …
-    roughness: float | None = None  # … and at most this rough; absent: any roughness
-    noise: float = 0.0  # half the width of the noise on the constant colour of the others, in coefficients
-    noise_metallic: float = 0.05  # which are at most this metallic
-    hold: int = field(default=200, metadata=ITERATIONS)  # iterations without opacity learning afterwards
-
-
-@dataclass(frozen=True)
-class Refine:
-    """Adaptive density control [3DGS §5.2; Ref-Gaussian §3.4], by error [Rota Bulò et al. 2024]."""
-
-    densify: Window | None = None  # splits surfels; absent: never
-    # Fraction of the surfels, those with the largest error, that an event splits at most.
-    grow: float = field(default=0.25, metadata=at_least(0))
-    prune_opacity: float = 0.05  # surfels of less opacity are removed
-    prune_extent: float = 0.1  # scene extents; larger surfels are removed
-    prune_weight: float = 0.01  # share of all blending weight; the surfels of the least per tile are removed
-    reset: Window | None = None  # opacity to at most reset_opacity
-    reset_opacity: float = 0.01  # after a reset, at most
-    reset_raise: tuple[str, ...] = ()  # attributes that a reset raises to at least their initial value
-    propagate: Propagation | None = None  # normal propagation; absent: none
-
-
-@dataclass(frozen=True)
-class MeshOptions:
-    """When and how the occluding mesh is extracted."""
-
-    extract: Window = MESH_WINDOW  # iterations at which the mesh is made anew
-    resolution: int = 128  # voxels along the longest side; unbounded: along the region's diameter
-    unbounded: bool = False  # for images without alpha: include the background, in contracted space
 
 
 @dataclass(frozen=True)
@@ -245,28 +206,6 @@ LOSS_WEIGHTS = dict.fromkeys(
 
 
 @dataclass(frozen=True)
-class ExposureOptions:
-    """Per-image exposure compensation: a gain per channel on linear radiance (`fitting.exposure`)."""
-
-    gains: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
-    after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
-    worth: float = 1.0  # dB gained on pixels of the training views that the gains were not fitted to
-    # Learning rate of log gains, per step; a tenth of it at the end.
-    rate: float = field(default=3e-3, metadata=at_least(0))
-
-
-@dataclass(frozen=True)
-class CameraOptions:
-    """Rigid corrections of the training cameras (`fitting.poses`)."""
-
-    corrections: Literal["judged", "on", "off"] = "judged"  # judged: kept if they improve PSNR by `worth`
-    after: int = field(default=1_200, metadata=ITERATIONS)  # iterations before that decision
-    worth: float = 0.6  # dB gained on pixels of the training views that the poses were not registered with
-    # Learning rate, radians per step; 3 % of it at the end.
-    rate: float = field(default=3e-3, metadata=at_least(0))
-
-
-@dataclass(frozen=True)
 class CoarseImages:
     """Downscaled images for the iterations up to `until`; the table that ends first applies."""
 
@@ -312,48 +251,6 @@ class DataOptions:
 
 
 @dataclass(frozen=True)
-class MethodComponent:
-    """An optional component of a method, as changes of its file, and when a fit tries it."""
-
-    after: int = field(metadata=ITERATIONS)  # iterations before it is tried
-    trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations with and without it that are compared
-    change: dict[str, Any] = field(default_factory=dict)  # tables merged over the method's
-    drop: tuple[str, ...] = ()  # keys removed before that, where they exist
-    needs: tuple[str, ...] = ()  # components that must be in use
-    unless: tuple[str, ...] = ()  # components that must not be in use
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Optional components that a fit tries on validation views, and the gain that keeps them.
-
-    A component stays if the PSNR of these views rises by the price of the step time and memory that it costs,
-    and by `gain` if it costs anything; one that saves time and memory may lose as much. The price of time is
-    relative, so that slow and fast machines decide alike.
-    """
-
-    component: dict[str, MethodComponent]  # by name
-    # Largest number of surfels before any trial, of a preset that allows more.
-    surfels: int | None = field(default=None, metadata=at_least(1))
-    holdout: int = field(default=8, metadata=at_least(2))  # every so many training views validate
-    gain: float = 0.02  # dB
-    gain_per_doubling: float = 0.25  # dB per doubling of the time per step: at the end the gain is larger
-    gain_per_mb: float = 0.001  # dB per MB of parameters and their moments
-
-    @property
-    def order(self) -> list[str]:
-        """The components in the order of their trials: by `after`, then as in the file."""
-        return sorted(self.component, key=lambda name: self.component[name].after)
-
-
-@dataclass(frozen=True)
-class MetalTrial:
-    """Choice between metal and dielectric at the start, by a trial of both (`fitting.metal_trial`)."""
-
-    until: int = field(metadata=ITERATIONS | at_least(1))  # last iteration with every surfel metal, or none
-
-
-@dataclass(frozen=True)
 class Method:
     """All settings of a fit; the resolved copy is saved with the run."""
 
@@ -364,20 +261,15 @@ class Method:
     surfels: SurfelOptions = SurfelOptions()
     light: LightOptions | None = None  # absent: no environment map
     surroundings: SurroundingsOptions | None = None  # absent: the object is everything
-    refine: Refine = Refine()
-    mesh: MeshOptions | None = None  # absent: no occlusion
+    # What happens beside gradient steps (`fitting.events`), by name.
+    event: dict[str, Event[Any]] = field(default_factory=dict, metadata=by_name(EVENTS))
     loss: dict[str, LossWeight] = field(default_factory=LOSS_WEIGHTS.copy)  # by name
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
-    exposure: ExposureOptions | None = None  # absent: no gains
-    cameras: CameraOptions | None = None  # absent: no corrections
     seed: int = 0  # of initial surfels, order of views and random draws
     checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
     preview_every: int = 1_000  # iterations; the last one has a preview, too
     log_every: int = 50  # iterations
-    metal_trial: MetalTrial | None = None  # absent: metallic learns from its initial value
-    select: Selection | None = None  # absent: no trials
-    components: tuple[str, ...] = ()  # of `select`, in use
     name: str = ""  # filled in by `load`, as the others below: the file's stem
     file: str = ""
     preset: str = ""
@@ -401,7 +293,6 @@ class Method:
         attributes = {*surfels.names}
         others = {LIGHT} if self.light is not None else set()
         harmonics = {name for name, one in ATTRIBUTES.items() if one.harmonics}
-        bounded = {name for name in attributes & {*ATTRIBUTES} if ATTRIBUTES[name].activation == "sigmoid"}
         no_geometry = {name for name, one in ATTRIBUTES.items() if not one.geometry}
         _require_known("surfels.attributes", surfels.attributes, no_geometry)
         _require_known("surfels.initial", surfels.initial, attributes)
@@ -409,19 +300,26 @@ class Method:
         _require_known("surfels.from_images", surfels.from_images, {*surfels.attributes})
         _require_known("rates.attribute", self.rates.attribute, {*ATTRIBUTES})
         _require_known("rates.rest", self.rates.rest, harmonics)
-        _require_known("refine.reset_raise", self.refine.reset_raise, bounded)
         for name, stage in stages:
             _require_known(f"stage.{name}.restart", stage.restart, {*surfels.attributes} | others)
             _require_known(f"stage.{name}.rates", stage.rates, attributes | others)
             try:
-                shading = Shading.resolve(stage.shading, self.mesh is not None)
+                shading = Shading.resolve(stage.shading, self.has_mesh)
                 shading.require_inputs(attributes, self.light is not None)
             except InputError as error:
                 raise error.at(field=f"stage.{name}") from error
-        for key, used in (("refine.propagate", self.refine.propagate), ("metal_trial", self.metal_trial)):
-            if used is not None and "metallic" not in attributes:
-                what = "there is no attribute 'metallic'"
-                raise InputError(what, field=key, remedy="add it, or drop this")
+        for name in surfels.start:
+            INITIALISERS.find(name, "surfels.start")
+        for name, event in self.event.items():
+            try:
+                event.require(attributes)
+            except InputError as error:
+                raise error.at(field=f"event.{name}") from error
+
+    @property
+    def has_mesh(self) -> bool:
+        """Whether fits extract a mesh, which occludes."""
+        return "mesh" in self.event
 
     def downscaled(self, factor: int | None) -> Method:
         """The method with this `data.downscale`."""

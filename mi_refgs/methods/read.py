@@ -5,14 +5,13 @@ No other module opens a TOML file, and none contains a method's name.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import sys
 import tomllib
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.build import build, plain, scaled
-from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method, MethodComponent, Selection
+from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method
 
 DEFAULT_LOSSES = plain(LOSS_WEIGHTS)
 MAX_TEXT, MAX_LINE = 2**16, 2000
@@ -66,71 +65,29 @@ def preset_of(text: str) -> Preset:
     return Preset(iterations, max(round(START_FRACTION * surfels), 1), surfels, sys.maxsize)
 
 
-def load(
-    name: str,
-    preset: str = DEFAULT_PRESET,
-    assignments: Sequence[str] | None = None,
-    components: Sequence[str] = (),
-) -> Method:
-    """Read a method by name or TOML path, with some of its components, scaled to a preset (see `preset_of`).
+def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | None = None) -> Method:
+    """Read a method by name or TOML path, scaled to a preset (see `preset_of`).
 
-    `assignments` are `key=value`, applied last and not scaled, except that the changes of a component are in
-    the iterations of the file, and that nothing is assigned to what a component drops or changes. Raises
-    InputError that names the file and the key for anything unknown or of the wrong type.
+    `assignments` are `key=value`, applied last and not scaled. Raises InputError that names the file and the
+    key for anything unknown or of the wrong type.
     """
     path, chosen = _find(name, "--method", Path()), preset_of(preset)
-    table = _extended(path, [])
-    of_select = [text for text in assignments or () if _keys(text)[0] == "select"]
-    for assignment in of_select if components else ():
-        _assign(table, assignment)
-    decided: list[list[str]] = []
-    for name_of_component in components:
-        component = _component(table, name_of_component, path)
-        table = _with_component(table, component, path)
-        decided += map(_keys, (*component.drop, *_flat(component.change)))
-    method = _built(table, path)
+    method = _built(_extended(path, []), path)
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
-    if (
-        method.select is not None
-        and (most := method.select.surfels) is not None
-        and most < chosen.max_surfels
-    ):
+    if (most := method.surfels.preset_limit or chosen.max_surfels) < chosen.max_surfels:
         table["surfels"] |= {"count": round(START_FRACTION * most), "max_count": most}
     for assignment in assignments or []:
-        keys = _keys(assignment)
-        if not any(keys[: len(other)] == other for other in decided):
-            _assign(table, assignment)
+        _assign(table, assignment)
     file = str(path.resolve()) if name.endswith(".toml") else name
-    table |= {"name": path.stem, "file": file, "preset": preset}
-    table |= {"components": [*components], "assignments": [*(assignments or [])]}
+    table |= {"name": path.stem, "file": file, "preset": preset, "assignments": [*(assignments or [])]}
     method = _built(table, "--set" if assignments else path)
     try:
         method.check()
-        if method.select is not None and not components:
-            _require_selectable(method, method.select)
     except InputError as error:
         raise error.at(path) from error
     return method
-
-
-def with_components(method: Method, components: Sequence[str]) -> Method:
-    """A method with these of its components in place of those that it has, read from its file again.
-
-    The image size stays, and what else differs from the file, unless a component changes its table: the
-    components that may be tried, and changes of the `Method` in Python.
-    """
-    if method.select is None or (*components,) == method.components:
-        return method
-    then, made = (
-        load(method.file, method.preset, method.assignments, names)
-        for names in (method.components, components)
-    )
-    names = {field.name for field in fields(Method)}
-    own = {name for name in names if getattr(method, name) != getattr(then, name) == getattr(made, name)}
-    made = replace(made, **{name: getattr(method, name) for name in own})
-    return made.downscaled(method.data.downscale)
 
 
 def load_resolved(path: Path) -> Method:
@@ -252,25 +209,6 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
     return _merge(parent, table)
 
 
-def _component(table: dict[str, Any], name: str, path: Path) -> MethodComponent:
-    """A component of a file's table."""
-    key = f"select.component.{name}"
-    try:
-        return typing.cast(MethodComponent, build(MethodComponent, table["select"]["component"][name], key))
-    except (KeyError, TypeError) as error:
-        raise InputError("there is no such component", path, key, "use one of its components") from error
-    except InputError as error:
-        raise error.at(path) from error
-
-
-def _with_component(table: dict[str, Any], component: MethodComponent, path: Path) -> dict[str, Any]:
-    """The table of a file with the changes of one of its components."""
-    for key in component.drop:
-        with contextlib.suppress(InputError):  # another component or a base file may have dropped it
-            _drop(table, key, path)
-    return _merge(table, _with_tables_of_losses(component.change))
-
-
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():
@@ -320,6 +258,7 @@ def _inline(value: object) -> str:
 
 
 def _assign(table: dict[str, Any], assignment: str) -> None:
+    """Apply `key=value`; `event.NAME=false` removes an event."""
     key, separator, text = assignment.partition("=")
     if not separator:
         raise InputError(f"--set: {assignment}: expected key=value, such as loss.ssim=0.1")
@@ -335,27 +274,7 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
         if not isinstance(inner, dict):
             raise InputError(f"'{parent}' is not a table", "--set", key.strip(), "check the key")
         table = inner
-    table[last] = _with_tables_of_losses({last: value})[last]
-
-
-# ---------------- components ----------------
-
-
-def _require_selectable(method: Method, select: Selection) -> None:
-    """Raise InputError for a selection that cannot be made; each component is loaded with those it needs."""
-    for name, component in select.component.items():
-        if unknown := [one for one in (*component.needs, *component.unless) if one not in select.component]:
-            key = f"select.component.{name}.needs"
-            raise InputError(f"there is no '{unknown[0]}'", field=key, remedy="name a component")
-        load(method.file, method.preset, method.assignments, [*_needed(select, name), name])
-
-
-def _needed(select: Selection, name: str) -> list[str]:
-    """The components that one needs, and those that they need, in the order of their trials."""
-    found: list[str] = []
-    for needed in select.component[name].needs:
-        if needed not in select.order[: select.order.index(name)]:
-            key = f"select.component.{name}.needs"
-            raise InputError(f"'{needed}' is tried later", field=key, remedy="try it before")
-        found += [other for other in (*_needed(select, needed), needed) if other not in found]
-    return found
+    if parents == ["event"] and value is False:
+        table.pop(last, None)
+    else:
+        table[last] = _with_tables_of_losses({last: value})[last]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import cycle
 from typing import Any
 
 import drjit as dr
@@ -14,6 +15,7 @@ import numpy as np
 
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
+from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.profiling.phases import phase_times
 from mi_refgs.render.pipeline import Frame
@@ -129,6 +131,7 @@ def _seconds(draw: Draw, camera: Camera, names: Collection[str]) -> float:
 
 WARM_UP = 4  # steps before the first measured one: they compile kernels
 VIEWS = 8  # most training views whose work is counted
+NEAR_END = 100  # steps before the end of a stage, where every SH degree is in use
 FAINT = 0.1
 """Opacity below which a surfel counts as faint: more than twenty such are required for an opaque pixel."""
 
@@ -193,8 +196,8 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
     found = []
     for name in names:
         traced = Shading.resolve(trainer.method.stage[name].shading, mesh=True).occlusion
-        if traced and trainer.method.mesh is not None and trainer.fit.occluder.mesh() is None:
-            trainer.extract_mesh()
+        if traced and (mesh := trainer.method.event.get("mesh")) is not None and trainer.fit.occluder.empty:
+            mesh.apply(trainer)
         found.append(profile_stage(trainer, name, steps))
     allocated = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
     physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -203,28 +206,40 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
 
 def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
     """Measure times, launches and cache misses of steps in one stage of the schedule."""
-    with trainer.held_in_stage(name) as prepare:
-        for _ in range(WARM_UP):
-            prepare()
-            trainer.step()
+    step = stepper(trainer, name)
+    for _ in range(WARM_UP):
+        step()
+    dr.sync_thread()
+    misses, times = dr.detail.launch_stats()[2], []
+    for _ in range(steps):
+        begin = time.perf_counter()
+        step()
         dr.sync_thread()
-        misses, times = dr.detail.launch_stats()[2], []
-        for _ in range(steps):
-            prepare()
-            begin = time.perf_counter()
-            trainer.step()
-            dr.sync_thread()
-            times.append(time.perf_counter() - begin)
-        misses = dr.detail.launch_stats()[2] - misses
-        prepare()
-        # The history has replayed kernels as well, which Dr.Jit's own count leaves out.
-        dr.kernel_history_clear()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            trainer.step()
-            dr.sync_thread()
-        launches = len(dr.kernel_history([dr.KernelType.JIT]))
-        stages = phase_times(trainer.step, max(steps // 3, 5), prepare)
+        times.append(time.perf_counter() - begin)
+    misses = dr.detail.launch_stats()[2] - misses
+    # The history has replayed kernels as well, which Dr.Jit's own count leaves out.
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        step()
+        dr.sync_thread()
+    launches = len(dr.kernel_history([dr.KernelType.JIT]))
+    stages = phase_times(step, max(steps // 3, 5))
     return StageProfile(name, 1e3 * float(np.median(times)), launches, misses, stages)
+
+
+def stepper(trainer: Trainer, name: str) -> Callable[[], None]:
+    """A function that takes a step near the end of a stage, as often as it is called; no event happens.
+
+    Each step filters its light, so that all are alike.
+    """
+    method, end = trainer.method, trainer.method.stage[name].until
+    begin = max((stage.until for _, stage in method.stages() if stage.until < end), default=0)
+    if method.light is not None:
+        method = replace(method, light=replace(method.light, every=1))
+    trainer.fit.prefilter.close()
+    trainer.setup = FitSetup(method, trainer.data)
+    iterations = cycle(range(max(begin + 1, end - NEAR_END), end + 1))
+    return lambda: trainer.gradient_step(next(iterations))
 
 
 def count_work(trainer: Trainer) -> Work:

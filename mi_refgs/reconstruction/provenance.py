@@ -11,7 +11,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.exposure import EXPOSURE_FILE
+from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
 from mi_refgs.formats import Shot
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json

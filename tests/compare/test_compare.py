@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs, page
 from mi_refgs.compare.jobs import Job, Shared
 from mi_refgs.errors import InputError
+from mi_refgs.fitting import decide
 from mi_refgs.runs.run import Run
 from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS, write_data, write_method
@@ -308,17 +308,14 @@ def test_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Pa
     assert row.seeds == [1] and "future" in row.failed[0]
 
 
-def test_run_that_selected_components_is_accepted(ball: Path, tmp_path: Path) -> None:
-    """A finished fit of a method that selects its terms is not taken for one of other settings."""
-    variant = tmp_path / "choosing.toml"
-    variant.write_text(
-        'extends = "base_2dgs"\n[select.component.colour]\nafter = 1\ntrial = 1\n'
-        "change = { surfels = { degree = { radiance_sh = 0 } } }\n"
-    )
-    job = jobs.plan(tmp_path / "out", [ball], [str(variant)], [0], Shared("quick", threads=1))[0]
-    chosen = methods.with_components(job.method(), ["colour"])
+def test_run_that_was_decided_is_accepted(ball: Path, tmp_path: Path) -> None:
+    """A finished fit that went on with another method is not taken for one of other settings."""
+    job = jobs.plan(tmp_path / "out", [ball], ["auto"], [0], Shared("quick", threads=1))[0]
+    rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x")]
+    chosen = decide.as_decided(job.method(), rows)
     job.run.create(chosen, str(ball))
-    assert chosen.components == ("colour",) and chosen.surfels.degree_of("radiance_sh") == 0
+    assert chosen.light is None and chosen.surfels.capacity == 2
+    job.run.save_checkpoint(3, {"decisions": np.frombuffer(json.dumps(rows).encode(), np.uint8)})
     jobs.require_same(job)
     job.run.write_method(dataclasses.replace(chosen, seed=3))
     with pytest.raises(InputError, match=r"seed: the run was made with 3"):

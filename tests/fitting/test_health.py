@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import health
 from mi_refgs.fitting.optim import Skipped
@@ -19,7 +18,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.highlight import ball, run_folder, small_method
+from tests.scenes.highlight import ball, run_folder, small_method, without
 
 
 @pytest.fixture
@@ -46,7 +45,7 @@ def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
     method: Method, tmp_path: Path
 ) -> None:
     """Steps on view 2 fail until the next check, every third iteration; then the culprits are gone."""
-    still = dataclasses.replace(method, refine=methods.Refine(), iterations=9)
+    still = dataclasses.replace(without(method), iterations=9)
     run = run_folder(tmp_path / "run", still)
     said: list[str] = []
     trainer = Trainer(still, ball(), run, warn=said.append)
@@ -99,7 +98,7 @@ def test_values_too_large_to_render_are_named_beside_those_that_are_not_finite(m
 def test_fit_in_which_every_step_fails_ends_with_one_sentence(method: Method, tmp_path: Path) -> None:
     """Too many surfels to be the cause: nothing is removed, nothing changes, and the view is named."""
     run = run_folder(tmp_path / "run", method)
-    trainer = Trainer(dataclasses.replace(method, refine=methods.Refine()), ball(), run)
+    trainer = Trainer(without(method), ball(), run)
     spoil_gradient(trainer, "scale", list(range(1000)), set(range(6)))
     before = trainer.surfels.to_numpy()
     with pytest.raises(InputError, match=r"view \d: scale not finite; .*look at that image"):

@@ -17,15 +17,19 @@ from mi_refgs.data.images import ImageFile
 from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import object_surface, refine
-from mi_refgs.fitting.control import AdaptiveControl, depth_outside, exchanged
+from mi_refgs.fitting.events import densify as densify_event
+from mi_refgs.fitting.events import follow_object
+from mi_refgs.fitting.events.densify import Densify
+from mi_refgs.fitting.events.photograph_light import PhotographLight
+from mi_refgs.fitting.events.reset_opacity import ResetOpacity
+from mi_refgs.fitting.exchange import depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.runner import begin, method_for
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
-from mi_refgs.methods.method import AROUND, LossWeight, Method, Refine, SurroundingsOptions
+from mi_refgs.methods.method import AROUND, LossWeight, Method, SurroundingsOptions
 from mi_refgs.methods.window import Window
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.run import Run
@@ -36,7 +40,7 @@ from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
-from tests.scenes.highlight import require_same_state, step_to
+from tests.scenes.highlight import require_same_state, step_to, without
 from tests.scenes.tiny import METHOD, REGION, write_data, write_open_data
 
 STEPS = 12
@@ -52,13 +56,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def method(tmp_path_factory: pytest.TempPathFactory) -> Method:
     """The tiny method with surroundings, edits of the tables and a reset."""
     path = tmp_path_factory.mktemp("method") / "tiny.toml"
-    path.write_text(METHOD + "[surroundings]\ndegree = 1\nheight = 8\n")
+    path.write_text(METHOD + "[surroundings]\ndegree = 1\n")
     settings = [
         f"iterations={STEPS}", "surfels.count=80", "surfels.max_count=100",
         "surroundings.count=60", "surroundings.max_count=90", "log_every=4",
-        "refine.densify={ start = 0, until = 10, every = 4 }",
-        "refine.reset={ start = 0, until = 6, every = 6 }", "loss.normal=0.1",
-        "light.photographed={ start = 0, until = 10, every = 4 }", "loss.photographed=1",
+        "event.densify.when={ start = 0, until = 10, every = 4 }",
+        "event.reset_opacity.when={ start = 0, until = 6, every = 6 }", "loss.normal=0.1",
+        "event.photograph_light.when={ start = 0, until = 10, every = 4 }", "loss.photographed=1",
     ]  # fmt: skip
     return methods.load(str(path), "quick", settings)
 
@@ -96,7 +100,10 @@ def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None
     assert 0.1 < seen.mean() < 0.9 and np.mean(error < 0.05) > 0.2  # the ball hides the rest
 
 
-def test_sparse_points_start_on_their_side_of_border(data: Dataset, method: Method) -> None:
+def test_sparse_points_start_on_their_side_of_border(
+    data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SurroundingsOptions, "scattered", 0.0)
     rng = np.random.default_rng(1)
     near, far = rng.normal(size=(2, 30, 3))
     near *= 0.4 / np.linalg.norm(near, axis=1, keepdims=True)
@@ -106,7 +113,7 @@ def test_sparse_points_start_on_their_side_of_border(data: Dataset, method: Meth
     no_random = replace(
         method,
         surfels=replace(method.surfels, inside=0.0, count=30),
-        surroundings=replace(method.surroundings, scattered=0.0, count=30),  # type: ignore[type-var]
+        surroundings=replace(method.surroundings, count=30),  # type: ignore[type-var]
     )
     params = initial_parameters(no_random, known, np.random.default_rng(0), True)
     found = params["position"].numpy()
@@ -146,7 +153,7 @@ def test_surfels_beyond_border_change_tables(method: Method) -> None:
     entered = own.surfels.to_numpy()
     np.testing.assert_array_equal(entered["radiance_sh"][3, :3], outer.to_numpy()["radiance_sh"][1])
     assert np.all(entered["radiance_sh"][3, 3:] == 0)
-    assert 1 / (1 + np.exp(-entered["metallic"][3, 0])) == pytest.approx(method.surfels.start("metallic"))
+    assert 1 / (1 + np.exp(-entered["metallic"][3, 0])) == pytest.approx(method.surfels.first("metallic"))
 
     full = replace(method, surfels=replace(method.surfels, max_count=3))
     assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 4  # for one came and two left
@@ -223,11 +230,11 @@ def test_region_follows_object_once(data: Dataset, method: Method, monkeypatch: 
     found = replace(REGION, radius=0.5, planes=((0.0, 0.0, 1.0, 0.0),), estimated=True)
     seen, said = list[int](), list[str]()
 
-    def followed(setup: FitSetup, depth_of: object) -> Region | None:
-        seen.append(len(setup.data.views))
+    def fitted(region: Region, cameras: np.ndarray, points: np.ndarray, seen_share: object) -> Region | None:
+        seen.append(len(cameras))
         return found
 
-    monkeypatch.setattr(object_surface, "followed", followed)
+    monkeypatch.setattr(follow_object, "fitted_region", fitted)
     step_to(Trainer(method, data), STEPS // 2)
     assert not seen  # region.json
     guessed = replace(data, region=replace(REGION, estimated=True))
@@ -238,7 +245,7 @@ def test_region_follows_object_once(data: Dataset, method: Method, monkeypatch: 
     resumed = Trainer(method, guessed, state=trainer.state())
     step_to(resumed, STEPS // 2)
     assert resumed.region == found and len(seen) == 1
-    monkeypatch.setattr(object_surface, "followed", lambda setup, depth_of: None)
+    monkeypatch.setattr(follow_object, "fitted_region", lambda *_: None)
     same = step_to(Trainer(method, guessed, tell=said.append), STEPS // 3 + 1)
     assert same.region == REGION and "stays" in said[-1]
 
@@ -277,9 +284,10 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
         found.append(faint)
         return densify(surfels, error, faint, *others, **options)
 
-    densify = refine.densify_and_prune
-    monkeypatch.setattr(refine, "densify_and_prune", edited)
-    AdaptiveControl(trainer.setup, trainer.fit).refine(4)
+    densify = densify_event.densify_and_prune
+    monkeypatch.setattr(densify_event, "densify_and_prune", edited)
+    trainer.fit.iteration = 4
+    trainer.method.event["densify"].apply(trainer)
     for faint, count, rows in zip(found, (80, 60), hidden, strict=True):
         assert np.isin(rows, faint).all() and len(faint) < count / 2
 
@@ -294,7 +302,7 @@ def test_space_in_front_of_cameras_is_cleared(data: Dataset, method: Method) -> 
         raw["position"][:7] = place
         raw["opacity"][:7] = 1
         table.replace(Surfels.from_numpy(raw))
-    AdaptiveControl(trainer.setup, trainer.fit)._clear_free_space(REGION)
+    Densify(Window(0, 1, 1))._clear_free_space(trainer)
     inner, background = (table.surfels.raw["position"].numpy() for table in trainer.fit.tables)
     assert len(inner) == 80 and not in_free_space(data.views, REGION, background).any()
     assert len(background) == 60 - 7
@@ -304,15 +312,16 @@ def test_space_in_front_of_cameras_is_cleared(data: Dataset, method: Method) -> 
 
 def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Method) -> None:
     """Transparent surfels without weight stay in a full table: opacities have not had the time to rise."""
-    for reset, left in ((Window(0, 3, 3), 5), (None, 0)):
-        refined = replace(method.refine, reset=reset, propagate=None, prune_extent=10.0)
+    densify = Densify(Window(0, 10, 4), prune_extent=10.0)
+    for events, left in (({"reset_opacity": ResetOpacity(Window(0, 3, 3))}, 5), ({}, 0)):
         full = replace(method.surfels, max_count=method.surfels.count)
-        trainer = Trainer(replace(method, refine=refined, surfels=full), data)
+        trainer = Trainer(replace(method, event={"densify": densify, **events}, surfels=full), data)
         table = trainer.fit.tables[0]
         raw = table.surfels.to_numpy()
         raw["opacity"][:5] = -10
         table.replace(Surfels.from_numpy(raw))
-        AdaptiveControl(trainer.setup, trainer.fit).refine(4)
+        trainer.fit.iteration = 4
+        trainer.happen()
         opacity = table.surfels.raw["opacity"].numpy()
         assert np.sum(opacity < -9) == left and len(opacity) > 50
 
@@ -364,7 +373,7 @@ def test_resume_with_images_of_the_other_kind_changes_nothing(
 
 def test_fit_of_open_scene_improves(data: Dataset, method: Method) -> None:
     """Object, surroundings and background learn; whatever is of alpha has no part in it."""
-    trainer = Trainer(replace(method, iterations=100, refine=Refine()), data)
+    trainer = Trainer(replace(without(method), iterations=100), data)
     start = {name: np.array(x) for name, x in trainer.state().items() if name.startswith("params/")}
     errors = []
     for _ in range(80):
@@ -402,8 +411,7 @@ def test_light_follows_photographs(data: Dataset, method: Method, monkeypatch: p
     after = float(known.difference(light.prefilter())[0])
     assert rendered == [4, 8] and after < 0.8 * before
     assert known.weight.max() == 1 and known.weight.min() == 0
-    off = replace(method, light=replace(method.light, photographed=None))  # type: ignore[type-var]
-    assert step_to(Trainer(off, data), 5).fit.photographed is None
+    assert step_to(Trainer(without(method, "photograph_light"), data), 5).fit.photographed is None
 
 
 def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None:
@@ -465,5 +473,4 @@ def test_images_without_alpha_have_a_method_of_their_own(
     objects = write_data(tmp_path, views=3, truth=False)
     assert method_for(objects, purpose, say=pytest.fail) == alpha
     chosen = methods.load(without)
-    assert chosen.surroundings is not None and chosen.light is not None
-    assert chosen.light.photographed is not None
+    assert chosen.surroundings is not None and isinstance(chosen.event["photograph_light"], PhotographLight)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -16,6 +15,7 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.fitting.objective import LOSSES
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.types import Float
+from tests.scenes.highlight import without
 
 SETTINGS = ["iterations=30", "surfels.count=80", "surfels.max_count=100", "stage.initial.until=1"]
 
@@ -38,7 +38,7 @@ def registered() -> Iterator[None]:
 def roughness_after(data: Path, method: Path, *settings: str) -> float:
     """Mean raw roughness after some steps of the deferred stage."""
     chosen = methods.load(str(method), "quick", [*SETTINGS, *settings])
-    trainer = Trainer(replace(chosen, refine=methods.Refine()), read_dataset(data, "train", truth=False))
+    trainer = Trainer(without(chosen), read_dataset(data, "train", truth=False))
     for _ in range(12):
         trainer.step()
     return float(np.mean(trainer.surfels.to_numpy()["roughness"]))

@@ -16,15 +16,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import train
-from mi_refgs.fitting.control import AdaptiveControl
+from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import DataOptions, Method, Rates
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
 from mi_refgs.runs.run import Run
-from tests.scenes.highlight import SIZE, ball, require_same_state, run_folder, small_method, step_to
+from tests.scenes.highlight import SIZE, ball, require_same_state, run_folder, small_method, step_to, without
 
 
 @pytest.fixture
@@ -34,7 +33,7 @@ def method(tmp_path: Path) -> Method:
 
 def test_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
-    method = dataclasses.replace(method, refine=methods.Refine(), data=DataOptions(), iterations=60)
+    method = dataclasses.replace(without(method), data=DataOptions(), iterations=60)
     trainer = Trainer(method, data)
     before = {name: tensor.numpy().copy() for name, tensor in trainer.fit.params.items()}
     losses = []
@@ -91,7 +90,7 @@ def test_resume_repeats_straight_run_bit_for_bit(
 
 def test_stage_has_its_own_rates(method: Method) -> None:
     initial = dataclasses.replace(method.stage["initial"], rates={"metallic": 0.0, "light": 0.1})
-    slow = dataclasses.replace(method, stage=method.stage | {"initial": initial}, refine=methods.Refine())
+    slow = dataclasses.replace(without(method), stage=method.stage | {"initial": initial})
     first = {}
     for name, chosen in (("slow", slow), ("own", dataclasses.replace(slow, stage=method.stage))):
         trainer = Trainer(chosen, ball())
@@ -116,7 +115,8 @@ def test_edit_clears_moments_of_what_it_changed(method: Method) -> None:
         return {name for name, value in trainer.state().items() if name.endswith("first") and np.any(value)}
 
     before = moving()
-    AdaptiveControl(trainer.setup, trainer.fit).refine(5)
+    trainer.fit.iteration = 5
+    trainer.happen()
     assert before - moving() == {"optimiser/opacity/first", "optimiser/scale/first"}
 
 
@@ -127,7 +127,7 @@ def test_statistics_distribute_the_squared_error_over_surfels(
 ) -> None:
     """They sum to the squared error times alpha, and each gets that of the pixels that show it."""
     only = {"only": dataclasses.replace(method.stage[stage], until=30, samples=samples)}
-    method = dataclasses.replace(method, stage=only, mesh=None)
+    method = dataclasses.replace(without(method, "mesh"), stage=only)
     frames, errors = [], []
     render, measure = train.supersampled, train.objective
 
@@ -155,7 +155,7 @@ def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
 ) -> None:
     """As a step on the whole image that weighs the pixels of the crop alone."""
     only = {"only": dataclasses.replace(method.stage["deferred"], until=30)}
-    plain = dataclasses.replace(method, stage=only, mesh=None, data=DataOptions(), loss={})
+    plain = dataclasses.replace(without(method, "mesh"), stage=only, data=DataOptions(), loss={})
     cropped = Trainer(dataclasses.replace(plain, data=DataOptions(crop=12 * 12)), ball())
     column, row, width, height = cropped.setup.crop(1, SIZE, SIZE) or (0, 0, SIZE, SIZE)
     assert width == height == 8
@@ -188,17 +188,17 @@ def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
 
 
 def send_in_iteration_7(monkeypatch: pytest.MonkeyPatch, *numbers: signal.Signals) -> list[int]:
-    """Send this process signals before the refinement of iteration 7; returns whether all were held."""
-    refine, held = AdaptiveControl.refine, []
+    """Send this process signals before the events of iteration 7; returns whether all were held."""
+    due, held = Densify.due, list[int]()
 
-    def interrupted_refine(control: AdaptiveControl, iteration: int) -> None:
-        if iteration == 7:
+    def interrupted(event: Densify, trainer: Trainer) -> bool:
+        if trainer.iteration == 7:
             for number in numbers:
                 os.kill(os.getpid(), number)
-            held.append(iteration)
-        refine(control, iteration)
+            held.append(7)
+        return due(event, trainer)
 
-    monkeypatch.setattr(AdaptiveControl, "refine", interrupted_refine)
+    monkeypatch.setattr(Densify, "due", interrupted)
     return held
 
 
@@ -213,7 +213,7 @@ def test_signal_waits_for_step_in_hand(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A signal inside iteration 7, before its refinement: the checkpoint contains the whole iteration."""
+    """A signal inside iteration 7, before its events: the checkpoint contains the whole iteration."""
     run = run_folder(tmp_path / "run", method)
     trainer = Trainer(method, ball(), run)
     send_in_iteration_7(monkeypatch, number)
@@ -312,7 +312,7 @@ def test_folder_that_cannot_be_written_is_refused_before_first_step(
     [({}, 80), ({"crop": 12 * 12}, 80), ({"traced_bounces": 1, "samples": 4, "antialias": True}, 100)],
 )
 def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: Method) -> None:
-    trainer = Trainer(dataclasses.replace(with_deferred(method, options), refine=methods.Refine()), ball())
+    trainer = Trainer(without(with_deferred(method, options)), ball())
     step_to(trainer, 22)  # into the deferred stage, with a mesh
     launches, _, misses = dr.detail.launch_stats()
     at_vertices = trainer.fit.occluder.vertex_surfels
@@ -325,7 +325,7 @@ def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: 
 
 def test_another_size_compiles_once(method: Method) -> None:
     """Images begin in blocks of 3², then of 2² pixels; the second step of each size compiles nothing."""
-    method = dataclasses.replace(method, refine=methods.Refine(), mesh=None)
+    method = dataclasses.replace(method, event={})
     trainer, misses = Trainer(method, ball()), []
     widths = [trainer.targets.at(iteration, 0).camera.width for iteration in range(1, 14)]
     assert widths == [SIZE // 3] * 6 + [SIZE // 2] * 6 + [SIZE]

@@ -74,7 +74,7 @@ def shadings() -> list[tuple[Shading, str]]:
     found: dict[tuple[Shading, str], None] = {}
     for name in read.names():
         method = read.load(name, "quick")
-        for (_, stage), meshed in itertools.product(method.stages(), {False, method.mesh is not None}):
+        for (_, stage), meshed in itertools.product(method.stages(), {False, method.has_mesh}):
             shading = Shading.resolve(stage.shading, meshed)
             found[replace(shading, at=shading.shaded_at), method.surfels.primitive] = None
     for name, model in MODELS.items():

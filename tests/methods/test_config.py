@@ -7,7 +7,6 @@ import functools
 import math
 import typing
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,16 @@ from hypothesis import strategies as st
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import refine
+from mi_refgs.fitting.events.densify import Densify
+from mi_refgs.fitting.events.mesh import ExtractMesh
+from mi_refgs.fitting.events.propagate import Propagate
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.build import build, by_kind, by_name, plain, scaled
+from mi_refgs.methods.event import EVENTS as REGISTERED
 from mi_refgs.methods.ranges import at_least
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.registry import Registry
 from mi_refgs.shade.shading import Shading
-from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes.highlight import ball
 
@@ -53,8 +54,9 @@ def test_presets_scale_the_whole_schedule() -> None:
     factor = standard.iterations / quick.iterations
     for name, stage in quick.stage.items():
         assert standard.stage[name].until == pytest.approx(stage.until * factor, abs=factor)
-    assert quick.refine.densify is not None and standard.refine.densify is not None
-    assert standard.refine.densify.until == pytest.approx(quick.refine.densify.until * factor, abs=factor)
+    long, short = (method.event["densify"] for method in (standard, quick))
+    assert isinstance(long, Densify) and isinstance(short, Densify)
+    assert long.when.until == pytest.approx(short.when.until * factor, abs=factor)
 
 
 def test_a_preset_of_numbers_scales_as_a_named_one() -> None:
@@ -81,14 +83,14 @@ def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
     path = tmp_path / "long.toml"
     path.write_text(
         "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
-        "[refine.propagate]\nwhen = {start = 0, until = 4000, every = 100}\nhold = 200\n"
+        "[event.propagate]\nwhen = {start = 0, until = 4000, every = 100}\nhold = 200\n"
         "[loss]\nsmooth = { weight = 1, until = 3000 }\n"
         "[data]\ncoarse = [{ until = 1000, block = 2, least = 400 }, { until = 400, block = 4 }]\n"
     )
     method = methods.load(str(path), "quick")
     assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
-    assert method.refine.propagate is not None
-    assert (method.refine.propagate.hold, method.loss["smooth"].until) == (100, 1500)
+    propagate = method.event["propagate"]
+    assert isinstance(propagate, Propagate) and (propagate.hold, method.loss["smooth"].until) == (100, 1500)
     assert [method.data.block_at(i, 1600) for i in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
     assert [method.data.block_at(i, 1599) for i in (1, 200, 201, 501)] == [4, 4, 1, 1]
 
@@ -164,22 +166,19 @@ diffuse = "irradiance"
 [stage.two]
 until = 7_000
 restart = ["metallic"]
-[mesh]
-extract = { start = 1_111, until = 5_001, every = 567 }
-[refine]
-densify = { start = 200, until = 3_001, every = 130 }
-reset = { start = 0, until = 1_999, every = 444 }
-propagate = { when = { start = 0, until = 2_601, every = 650 } }
+[event]
+mesh.when = { start = 1_111, until = 5_001, every = 567 }
+densify.when = { start = 200, until = 3_001, every = 130 }
+reset_opacity.when = { start = 0, until = 1_999, every = 444 }
+propagate.when = { start = 0, until = 2_601, every = 650 }
 """
 """Few of these numbers are whole, or multiples of each other, once a preset has scaled them."""
 
 
 EVENTS = {
     "ref_gaussian": dict(degree=2, densify=14, reset_opacity=1, mesh=8),
-    "ref_gaussian_paper": dict(
-        degree=3, densify=48, reset_opacity=8, propagate_normals=16, mesh=16, restart=1
-    ),
-    "many": dict(degree=3, densify=22, reset_opacity=4, propagate_normals=4, mesh=7, restart=1),
+    "ref_gaussian_paper": dict(degree=3, densify=48, reset_opacity=8, propagate=16, mesh=16, restart=1),
+    "many": dict(degree=3, densify=22, reset_opacity=4, propagate=4, mesh=7, restart=1),
 }
 """Numbers of events that differ between methods."""
 
@@ -193,22 +192,10 @@ def test_every_preset_has_the_same_events_in_the_same_order(
     path = str(tmp_path / "many.toml") if variant == "many" else variant
     done: list[str] = []
 
-    def recorder(name: str, result: Callable[[Surfels], Any]) -> Callable[..., Any]:
-        def record(surfels: Surfels, *_: object, **__: object) -> Any:
-            done.append(name)
-            return result(surfels)
-
-        return record
-
-    def same(surfels: Surfels) -> refine.TableEdit:
-        rows = np.arange(surfels.count, dtype=np.uint32)
-        return refine.TableEdit(surfels, rows, rows < 0)
-
-    monkeypatch.setattr(refine, "densify_and_prune", recorder("densify", same))
-    for name in ("reset_opacity", "propagate_normals", "restart"):
-        monkeypatch.setattr(refine, name, recorder(name, lambda surfels: surfels))
-    monkeypatch.setattr(Trainer, "extract_mesh", lambda self, cameras: done.append("mesh"))
-    monkeypatch.setattr(Trainer, "_gradient_step", lambda *_: None)
+    for kind in REGISTERED.values():
+        monkeypatch.setattr(kind, "apply", lambda event, trainer: done.append(event.name))
+    monkeypatch.setattr(Propagate, "due", Propagate._grows)
+    monkeypatch.setattr(Trainer, "gradient_step", lambda *_: None)
     monkeypatch.setattr(Shading, "resolve", staticmethod(functools.cache(Shading.resolve)))
     sequences = {}
     for preset in methods.PRESETS:
@@ -225,10 +212,12 @@ def test_every_preset_has_the_same_events_in_the_same_order(
 
 
 def test_assignments_are_applied_unscaled() -> None:
-    changes = ["loss.ssim=0.3", "mesh.resolution=64", "refine.densify.until=7"]
+    changes = ["loss.ssim=0.3", "event.mesh.resolution=64", "event.densify.when.until=7"]
     method = methods.load("ref_gaussian", "quick", changes)
-    assert method.mesh is not None and method.refine.densify is not None
-    assert (method.loss["ssim"].weight, method.mesh.resolution, method.refine.densify.until) == (0.3, 64, 7)
+    mesh, densify = method.event["mesh"], method.event["densify"]
+    assert isinstance(mesh, ExtractMesh) and isinstance(densify, Densify)
+    assert (method.loss["ssim"].weight, mesh.resolution, densify.when.until) == (0.3, 64, 7)
+    assert "mesh" not in methods.load("ref_gaussian", "quick", ["event.mesh=false"]).event
 
 
 STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
@@ -245,14 +234,14 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
         ("[stage.a]\nuntil = 10", ["missing key 'iterations'"]),
         ("iterations = [", ["not valid TOML"]),
         (
-            f"{STAGE}[refine]\nreset = {{start = 0, until = 9, every = 0}}",
-            ["refine.reset", "'every' above 0"],
+            f"{STAGE}[event.mesh]\nwhen = {{start = 0, until = 9, every = 0}}",
+            ["event.mesh.when", "'every' above 0"],
         ),
         (f"{STAGE}[data]\ncoarse = [{{until = 5, block = 1}}]", ["data.coarse.block: 1", "2 or more"]),
         (f"{STAGE}[data]\ncrop = 4000", ["data.crop: 4000", "4,096 or more"]),
         (f"{STAGE}[light]\nevery = 0", ["light.every: 0", "1 or more"]),
-        (f"{STAGE}[cameras]\nrate = -1", ["cameras.rate: -1", "0 or more"]),
-        (f"{STAGE}[cameras]\ncorrections = 'maybe'", ["cameras.corrections: 'maybe'", "judged or on or off"]),
+        (f"{STAGE}[event.cameras]\nafter = -1", ["event.cameras.after: -1", "0 or more"]),
+        (f"{STAGE}[event.camera]", ["event: 'camera' is unknown", "cameras"]),
     ],
 )
 def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> None:
@@ -283,12 +272,12 @@ def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: P
     (tmp_path / "below").mkdir()
     (tmp_path / "below" / "own.toml").write_text(f'extends = "{base}"\n[loss]\nssim = 0.5\n')
     grandchild = tmp_path / "grandchild.toml"
-    grandchild.write_text('extends = "below/own.toml"\ndrop = ["refine"]\n[loss]\nnormal = 0.3\n')
+    grandchild.write_text('extends = "below/own.toml"\ndrop = ["event.densify"]\n[loss]\nnormal = 0.3\n')
     shipped, changed = methods.load(base), methods.load(str(grandchild))
     normal = dataclasses.replace(shipped.loss["normal"], weight=0.3)
     assert changed.loss == shipped.loss | {"ssim": methods.LossWeight(0.5), "normal": normal}
-    assert changed.refine.densify is None and changed.refine.reset is None
-    same = dataclasses.replace(changed, loss=shipped.loss, refine=shipped.refine, name=base, file=base)
+    assert changed.event == {name: x for name, x in shipped.event.items() if name != "densify"}
+    same = dataclasses.replace(changed, loss=shipped.loss, event=shipped.event, name=base, file=base)
     assert same == shipped
 
 
@@ -300,9 +289,9 @@ def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: P
         ('extends = "gone.toml"', ["own.toml: extends: gone.toml: no such method", "ref_gaussian"]),
         ('extends = "ref_gausian"', ["own.toml: extends: ref_gausian: no such method", "ref_gaussian"]),
         ("extends = 3", ["own.toml: extends: expected a name", "3"]),
-        ('extends = "ref_gaussian"\ndrop = "mesh"', ["own.toml: drop: expected a list"]),
+        ('extends = "ref_gaussian"\ndrop = "event"', ["own.toml: drop: expected a list"]),
         ('extends = "ref_gaussian"\ndrop = ["seed.x"]', ["own.toml: drop: no key 'seed.x'"]),
-        ('drop = ["mesh"]', ["own.toml: extends: expected a name", "None"]),
+        ('drop = ["event"]', ["own.toml: extends: expected a name", "None"]),
         ('extends = "wrong.toml"', ["wrong.toml: not valid TOML"]),
     ],
 )
@@ -346,7 +335,7 @@ SURROUNDINGS = dict(count=0, degree=4, max_count=-1)
         ("stage.deferred.rates.light=nan", "out of range"),
         ("surfels.from_images=['metallic']", "metallic"),
         ("surfels.attributes=['metallic', 'roughness']", "albedo"),
-        ("refine.grow=-0.1", r"refine\.grow: -0\.1"),
+        ("event.densify.grow=-0.1", r"event\.densify\.grow: -0\.1"),
         ("loss.ssim=1.5", r"loss\.ssim\.weight: 1.5 is out of range; give a number from 0 to 1"),
         ("loss.normal=-0.1", r"loss\.normal\.weight: -0.1 is out of range; give 0 or more"),
         *((f"loss.normal.{key}=-5", rf"loss\.normal\.{key}: -5") for key in ("start", "rise", "until")),
@@ -364,35 +353,7 @@ def test_bad_settings_are_named(assignment: str, words: str) -> None:
         methods.load("relighting", "quick", [assignment])
 
 
-@pytest.mark.parametrize("change", [".loss.normal=0.7", "={loss={normal=0.7}}"])
-def test_a_component_has_its_assigned_changes(tmp_path: Path, change: str) -> None:
-    """They reach the trial, and a run of it is resumed by the same assignment."""
-    assigned = [f"select.component.surfels_2x.change{change}"]
-    made = methods.load("auto", "quick", assigned, ["surfels_2x"])
-    assert made.loss["normal"].weight == 0.7 != methods.load("auto", "quick", assigned).loss["normal"].weight
-    (tmp_path / "config.toml").write_text(methods.dump(made))
-    assert not methods.differences(methods.load_resolved(tmp_path / "config.toml"), made)
-
-
-def test_nothing_is_assigned_to_what_a_component_drops() -> None:
-    """Settings of the light or a stage do not bring them back, nor change what a component decides."""
-    settings = [
-        "stage.deferred.samples=4",
-        "stage.initial.rates={opacity=0.1}",
-        "light.height=64",
-        "light.every=1",
-    ]
-    settings += ["mesh.resolution=64", "rates.attribute.albedo=0.1", "surfels.initial.metallic=0.5"]
-    settings += ["surfels.degree.radiance_sh=1"]
-    plain = methods.load("auto", "quick", [], ["colour_alone"])
-    made = methods.load("auto", "quick", settings, ["colour_alone"])
-    assert dataclasses.replace(made, assignments=()) == plain and made.light is None is made.mesh
-    assert methods.load("auto", "quick", settings).stage["deferred"].samples == 4
-    made = methods.load("auto", "quick", ["loss.normal=0.7", "surfels.capacity=3"], ["surfels_2x"])
-    assert made.loss["normal"].weight == 0.7 and made.surfels.capacity == 2
-
-
-def test_trials_begin_with_no_more_surfels_than_the_selection_says() -> None:
+def test_a_method_limits_what_presets_allow() -> None:
     """Presets that allow more start as `quick`; presets that allow fewer, and settings, count."""
     counts = {
         preset: (method.surfels.count, method.surfels.max_count)
@@ -404,21 +365,6 @@ def test_trials_begin_with_no_more_surfels_than_the_selection_says() -> None:
     }
     assert methods.load("auto", "standard", ["surfels.max_count=50000"]).surfels.max_count == 50_000
     assert methods.load("ref_gaussian", "standard").surfels.max_count == 40_000
-
-
-def test_components_keep_what_python_changed() -> None:
-    """A `Method` that was changed is tried with its changes; those of a component come first."""
-    method = methods.load("auto", "quick", ["loss.ssim=0.3"])
-    rates = dataclasses.replace(method.rates, decay=0.7)
-    own = dataclasses.replace(method.downscaled(3), seed=5, rates=rates, log_every=7)
-    more = methods.with_components(own, ["surfels_2x"])
-    assert (more.seed, more.log_every, more.data.downscale, more.rates) == (5, 7, 3, rates)
-    assert more.surfels.capacity == 2 and more.loss["ssim"].weight == 0.3
-    alone = methods.with_components(more, ["colour_alone"])
-    assert alone.seed == 5 and alone.surfels.capacity == 1 and alone.light is None
-    assert alone.rates == methods.load("auto", "quick", [], ["colour_alone"]).rates
-    assert alone.data.downscale == 3 and alone.data.coarse != own.data.coarse
-    assert methods.with_components(alone, []) == dataclasses.replace(own, rates=methods.load("auto").rates)
 
 
 def test_a_stage_sets_every_shading_option() -> None:

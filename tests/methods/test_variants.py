@@ -11,6 +11,7 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.cli import main
+from mi_refgs.fitting.events.propagate import Propagate
 from tests.helpers import ROOT
 from tests.laws.covering import marked
 from tests.scenes.tiny import SETTINGS, write_data
@@ -21,17 +22,18 @@ FULL = "ref_gaussian"
 def test_what_defines_a_method() -> None:
     full = methods.load(FULL)
     only = {"no_initial_stage": "stage.initial", "gaussians_3d": "surfels.primitive"}
-    for ablation, key in (only | {"no_material_aware": "refine.propagate"}).items():
+    for ablation, key in (only | {"no_material_aware": "event.propagate"}).items():
         changed = methods.differences(full, methods.load(ablation)).keys() - {"name"}
         assert changed and all(one.startswith(key) for one in changed)
-    every_metal = methods.load("no_material_aware").refine.propagate
-    assert every_metal is not None and every_metal.roughness is None and full.refine.propagate is None
-    paper = methods.load("ref_gaussian_paper").refine.propagate
-    assert paper is not None and (paper.metallic, paper.roughness) == (0.02, 0.1)
+    every_metal = methods.load("no_material_aware").event["propagate"]
+    assert isinstance(every_metal, Propagate) and every_metal.roughness is None
+    paper = methods.load("ref_gaussian_paper").event["propagate"]
+    assert isinstance(paper, Propagate) and (paper.metallic, paper.roughness) == (0.02, 0.1)
+    assert "propagate" not in full.event
     assert [stage.shading.at for _, stage in methods.load("no_deferred").stages()] == ["surfel"] * 2
     assert [stage.shading.at for _, stage in methods.load("no_initial_stage").stages()] == ["pixel"]
     assert {stage.shading.reflectance for _, stage in methods.load("no_pbr").stages()} == {"mirror"}
-    assert methods.load("no_interreflection").mesh is None and full.mesh is not None
+    assert full.has_mesh and not methods.load("no_interreflection").has_mesh
 
 
 @pytest.mark.parametrize("variant", methods.names())
@@ -69,12 +71,11 @@ def test_every_method_fits_and_evaluates(variant: str, data: Path, tmp_path: Pat
     run = tmp_path / "run"
     method = methods.load(variant, "quick")
     settings = [*SETTINGS]
-    if method.select is None:  # a component may replace the stages
-        settings += [f"stage.{name}.until={2 * i + 2}" for i, (name, _) in enumerate(method.stages())]
+    settings += [f"stage.{name}.until={2 * i + 2}" for i, (name, _) in enumerate(method.stages())]
     if method.light is not None:
         settings.append("light.height=8")
-    if method.mesh is not None:
-        settings += ["mesh.resolution=12", "mesh.extract={start = 0, until = 6, every = 1}"]
+    if method.has_mesh:
+        settings += ["event.mesh.resolution=12", "event.mesh.when={start = 0, until = 6, every = 1}"]
     assert main(["train", str(data), "-o", str(run), "--method", variant, "--set", *settings]) == 0
     assert main(["eval", str(run)]) == 0
     assert main(["render", str(run), "-o", str(tmp_path / "view.exr")]) == 0

@@ -28,7 +28,7 @@ SETTINGS: dict[str, Any] = {
         "surfels.count=80",
         "surfels.max_count=100",
         "light.height=8",
-        "mesh.resolution=16",
+        "event.mesh.resolution=16",
     ),
     "lights": (ROOT / "scenes" / "lights" / "studio.exr",),
 }

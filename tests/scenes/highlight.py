@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -35,15 +36,19 @@ diffuse = "irradiance"
 [stage.deferred]
 until = 30
 restart = ["albedo", "metallic", "roughness", "light"]
-[mesh]
-extract = { start = 9, until = 30, every = 10 }
+[event.mesh]
+when = { start = 9, until = 30, every = 10 }
 resolution = 24
-[refine]
-densify = { start = 3, until = 24, every = 6 }
+[event.densify]
+when = { start = 3, until = 24, every = 6 }
 prune_extent = 1.0
-reset = { start = 0, until = 24, every = 14 }
-reset_raise = ["metallic"]
-propagate = { when = { start = 0, until = 24, every = 5 }, hold = 4, noise = 0.1 }
+[event.reset_opacity]
+when = { start = 0, until = 24, every = 14 }
+raise_to_start = ["metallic"]
+[event.propagate]
+when = { start = 0, until = 24, every = 5 }
+hold = 4
+noise = 0.1
 [data]
 coarse = [{ until = 6, block = 3 }, { until = 12, block = 2 }]
 [loss]
@@ -70,6 +75,12 @@ def small_method(folder: Path) -> Method:
     path = folder / "small.toml"
     path.write_text(METHOD)
     return load_resolved(path)
+
+
+def without(method: Method, *names: str) -> Method:
+    """The method without these events, by default those that edit surfels."""
+    gone = names or ("densify", "reset_opacity", "propagate")
+    return replace(method, event={name: x for name, x in method.event.items() if name not in gone})
 
 
 def run_folder(path: Path, method: Method) -> Run:

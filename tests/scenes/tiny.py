@@ -35,8 +35,8 @@ diffuse = "irradiance"
 [stage.deferred]
 until = {PRESETS["quick"].iterations}
 at = "pixel"
-[mesh]
-extract = {{ start = 3, until = 6, every = 1 }}
+[event.mesh]
+when = {{ start = 3, until = 6, every = 1 }}
 resolution = 16
 """
 """Written for the preset `quick`, so that nothing is scaled."""

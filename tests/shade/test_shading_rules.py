@@ -48,7 +48,7 @@ IMPOSSIBLE = {
     ),
     "bounces of a model that traces none": (
         f"[surfels]\nattributes = ['albedo', 'roughness']\n{LIGHT}{STAGE}reflectance = 'monte_carlo'\n"
-        "at = 'surfel'\ntraced_bounces = 1\n[mesh]",
+        "at = 'surfel'\ntraced_bounces = 1\n[event.mesh]",
         ["stage.only", "traced_bounces: needs reflectance = split_sum"],
     ),
     "a model of surfels shaded per pixel": (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS
-from mi_refgs.fitting import refine
-from mi_refgs.methods import Refine
+from mi_refgs.fitting.events import densify
+from mi_refgs.methods import Window
 from mi_refgs.reference import image
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import rotation_axes
@@ -112,11 +112,13 @@ def test_a_gaussian_is_split_along_its_longest_axis() -> None:
         "opacity": np.zeros((2, 1)),
     }
     gaussians = Surfels.from_numpy(raw)
-    edited = refine.densify_and_prune(gaussians, np.ones(2), refine.NO_ROWS, 1.0, Refine(grow=1.0), 4)
+    edited = densify.densify_and_prune(
+        gaussians, np.ones(2), densify.NO_ROWS, 1.0, densify.Densify(Window(0, 1, 1), grow=1.0), 4
+    )
     children = edited.surfels.to_numpy()
     assert edited.parent.tolist() == [0, 1, 0, 1] and edited.fresh.all()
     offsets = children["position"] - 1
-    expected = 0.3 * refine.SPLIT_OFFSET * np.array([[1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
+    expected = 0.3 * densify.SPLIT_OFFSET * np.array([[1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
     np.testing.assert_allclose(offsets, expected, atol=1e-6)
     shrunk = np.exp(children["scale"] - raw["scale"][[0, 1, 0, 1]])
-    np.testing.assert_allclose(shrunk, np.where(expected, refine.SPLIT_SCALE, 1), rtol=1e-5)
+    np.testing.assert_allclose(shrunk, np.where(expected, densify.SPLIT_SCALE, 1), rtol=1e-5)

@@ -19,9 +19,9 @@ from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import refine
+from mi_refgs.fitting.events import densify
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods import Refine
+from mi_refgs.methods import Window
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels import attributes, primitives
@@ -203,10 +203,12 @@ def test_balls_are_splatted_and_differentiated() -> None:
 def test_balls_are_split_and_written(tmp_path: Path) -> None:
     surfels = balls()
     error = np.arange(30.0) - 9  # two thirds have one
-    edited = refine.densify_and_prune(surfels, error, refine.NO_ROWS, 10.0, Refine(grow=1.0), 90)
+    edited = densify.densify_and_prune(
+        surfels, error, densify.NO_ROWS, 10.0, densify.Densify(Window(0, 1, 1), grow=1.0), 90
+    )
     before, after = surfels.to_numpy(), edited.surfels.to_numpy()
     assert len(edited.parent) == 50 and edited.fresh.sum() == 40
-    shrunk = np.where(edited.fresh, np.log(refine.SPLIT_SCALE), 0)
+    shrunk = np.where(edited.fresh, np.log(densify.SPLIT_SCALE), 0)
     np.testing.assert_allclose(after["radius"][:, 0], before["radius"][edited.parent, 0] + shrunk, rtol=1e-5)
     write_ply(tmp_path / "balls.ply", edited.surfels)
     read = read_ply(tmp_path / "balls.ply")
@@ -223,7 +225,7 @@ def test_balls_are_fitted(tmp_path: Path) -> None:
         checkpoint_every = 3
         surfels = {{ primitive = "ball", attributes = ["radiance_sh"], degree = {{ radiance_sh = 1 }} }}
         stage.all = {{ until = 6, reflectance = "radiance" }}
-        refine = {{ densify = {{ start = 1, until = 6, every = 2 }}, prune_extent = 10.0 }}
+        event.densify = {{ when = {{ start = 1, until = 6, every = 2 }}, prune_extent = 10.0 }}
         """
     )
     data, run = write_data(tmp_path / "data"), tmp_path / "run"

@@ -10,18 +10,24 @@ then on metallic learns per surfel.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.fitting.exposure import displayed_of, image_of, squared_error
-from mi_refgs.fitting.select import Decision
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.decide import Decision, Row, conclude, run
+from mi_refgs.fitting.image_error import displayed_of, image_of, squared_error
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload
+from mi_refgs.methods.event import register
+from mi_refgs.methods.method import Method
+from mi_refgs.methods.ranges import at_least
+from mi_refgs.methods.window import ITERATIONS
 from mi_refgs.splat.weights import blended_weights
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
@@ -43,54 +49,55 @@ dB, 92 % of the surface of `mixed` (metals and glazes) start as what they are; w
 CENTRES = 5_000  # surfels that the fraction is counted in: so many sums are computed
 
 
-def install_metal_trial(trainer: Trainer, tell: Callable[[str], None] = lambda _: None) -> None:
-    """Let a trainer choose between metal and dielectric before its first step.
-
-    Changes nothing if its method has no `metal_trial`. `tell` is called with a sentence about the choice.
-    """
-    options, earlier = trainer.method.metal_trial, trainer.before_step
-    if options is None:
-        return
-
-    def before_step(trainer: Trainer) -> None:
-        if earlier is not None:
-            earlier(trainer)
-        if trainer.iteration == 0:
-            steps = min(options.until, trainer.method.iterations)
-            tell(f"begins as dielectric and as metal, {steps} iterations each")
-            tell(choose_metallic(trainer, steps))
-
-    trainer.before_step = before_step
-
-
-def choose_metallic(trainer: Trainer, steps: int) -> str:
-    """Begin a fit as dielectric and as metal, continue one of them, and return a sentence.
+@dataclass(frozen=True)
+class Metal(Decision):
+    """Begins a fit as dielectric and as metal, and continues one of them.
 
     Metal has to be better by METAL_GAIN: in the whole images to be continued, around a surfel for the surfel
-    to start as metal.
+    to start as metal. From then on metallic learns per surfel.
     """
-    begin = time.perf_counter()
-    fits = [_begun(trainer, metallic, steps) for metallic in (DIELECTRIC, METAL)]
-    views = [trainer.data.views[i] for i in evenly_spread(len(trainer.data.views), JUDGED_VIEWS)]
-    errors = [[_squared_error(fit, view) for view in views] for fit in fits]
-    dielectric, metal = (psnr_of(float(np.mean([error.mean() for error in one]))) for one in errors)
-    is_metal = metal >= dielectric + METAL_GAIN
-    trainer.restore(fits[is_metal].state())
-    trainer.fit.optimiser.set_factor("metallic", 1.0)
 
-    # Each surfel starts as what has the smaller error around it.
-    excess = [one - 10 ** (METAL_GAIN / 10) * other for one, other in zip(*errors, strict=True)]
-    raw = trainer.surfels.to_numpy()
-    metals = _sum_around(raw["position"], _attributed(trainer.surfels, views, excess)) > 0
-    raw["metallic"] = np.where(metals[:, None], logit(METAL), logit(DIELECTRIC)).astype(np.float32)
-    trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("metallic",))
-    trainer.fit.seconds = time.perf_counter() - begin
-    reason = (
-        f"{metal:.2f} dB as metal, {dielectric:.2f} dB as dielectric, metal needs {METAL_GAIN:g} dB more; "
-        f"{metals.mean():.0%} of the surfels start as metal"
-    )
-    trainer.fit.decisions.append(asdict(Decision("metal", 0, is_metal, reason)))
-    return f"continues as {'metal' if is_metal else 'dielectric'}: {reason}"
+    name: ClassVar[str] = "metal"
+    validates: ClassVar[bool] = False  # by training images
+
+    trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations with every surfel metal, or none
+
+    def require(self, attributes: Collection[str]) -> None:
+        if "metallic" not in attributes:
+            raise InputError("there is no attribute 'metallic'; add it, or drop this")
+
+    def components(self) -> Sequence[str]:
+        return [self.name]
+
+    def chosen(self, method: Method, component: str) -> Method:
+        return method
+
+    def due(self, trainer: Trainer) -> bool:
+        return trainer.iteration == 0
+
+    def apply(self, trainer: Trainer) -> None:
+        began, steps = time.perf_counter(), min(self.trial, trainer.method.iterations)
+        trainer.tell(f"begins as dielectric and as metal, {steps} iterations each")
+        fits = [_begun(trainer, metallic, steps) for metallic in (DIELECTRIC, METAL)]
+        views = [trainer.data.views[i] for i in evenly_spread(len(trainer.data.views), JUDGED_VIEWS)]
+        errors = [[_squared_error(fit, view) for view in views] for fit in fits]
+        dielectric, metal = (psnr_of(float(np.mean([error.mean() for error in one]))) for one in errors)
+        is_metal = metal >= dielectric + METAL_GAIN
+        trainer.take(fits[is_metal], trainer.method)
+        trainer.fit.optimiser.set_factor("metallic", 1.0)
+
+        # Each surfel starts as what has the smaller error around it.
+        excess = [one - 10 ** (METAL_GAIN / 10) * other for one, other in zip(*errors, strict=True)]
+        raw = trainer.surfels.to_numpy()
+        metals = _sum_around(raw["position"], _attributed(trainer.surfels, views, excess)) > 0
+        raw["metallic"] = np.where(metals[:, None], logit(METAL), logit(DIELECTRIC)).astype(np.float32)
+        trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("metallic",))
+        reason = (
+            f"{metal:.2f} dB as metal, {dielectric:.2f} dB as dielectric, metal needs {METAL_GAIN:g} dB "
+            f"more; {metals.mean():.0%} of the surfels start as metal"
+        )
+        row = Row(self.name, 0, bool(is_metal), reason, dielectric, metal)
+        conclude(trainer, row, began, f"continues as {'metal' if is_metal else 'dielectric'}")
 
 
 def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
@@ -99,10 +106,7 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
     surfels = replace(surfels, initial={**surfels.initial, "metallic": metallic})
     copy = Trainer(replace(trainer.method, surfels=surfels), trainer.data, targets=trainer.targets)
     copy.fit.optimiser.set_factor("metallic", 0.0)
-    for _ in range(steps):
-        copy.step()
-        trainer.release()
-    return copy
+    return run(copy, steps, trainer)
 
 
 def _squared_error(trainer: Trainer, view: View) -> np.ndarray:
@@ -128,3 +132,6 @@ def _sum_around(positions: np.ndarray, values: np.ndarray) -> np.ndarray:
     sums = np.bincount(own, values, len(centres))
     _, nearest = tree.query(centres, max(round(NEIGHBOURHOOD * len(centres)), 1))
     return np.asarray(sums[nearest.reshape(len(centres), -1)].sum(axis=1)[own])
+
+
+register(Metal)

@@ -11,7 +11,7 @@ from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import metal_trial
+from mi_refgs.fitting.events import metal as event
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.runs.run import Run
@@ -19,7 +19,7 @@ from mi_refgs.splat import splat
 from mi_refgs.surfels.attributes import sigmoid
 from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
-TRIAL = "metal_trial.until=4"
+TRIAL = "event.metal.trial=4"
 
 
 @pytest.fixture(scope="module")
@@ -43,18 +43,18 @@ def metallic(trainer: Trainer) -> np.ndarray:
 
 def judged(
     monkeypatch: pytest.MonkeyPatch, dielectric: np.ndarray | float, metal: np.ndarray | float
-) -> list[Trainer]:
-    """Replace the errors of both trials, (H, W) each; returns the trials, when they have run."""
-    trials: list[Trainer] = []
+) -> list[tuple[int, np.ndarray]]:
+    """Replace the errors of both trials, (H, W) each; returns their iterations and metallic, when they have
+    run."""
+    judged, trials = list[Trainer](), list[tuple[int, np.ndarray]]()
 
     def error(trainer: Trainer, view: View) -> np.ndarray:
-        if trainer not in trials:
-            trials.append(trainer)
-        return np.broadcast_to(
-            metal if trainer is trials[-1] and len(trials) == 2 else dielectric, (SIZE, SIZE)
-        )
+        if trainer not in judged:
+            judged.append(trainer)
+            trials.append((trainer.iteration, metallic(trainer)))
+        return np.broadcast_to(metal if judged.index(trainer) else dielectric, (SIZE, SIZE))
 
-    monkeypatch.setattr(metal_trial, "_squared_error", error)
+    monkeypatch.setattr(event, "_squared_error", error)
     return trials
 
 
@@ -63,17 +63,16 @@ def test_the_gain_of_metal_decides(
     better: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Metal has to gain enough; metallic is held during the trial and learns afterwards."""
-    held = metal_trial.METAL if better == "metal" else metal_trial.DIELECTRIC
-    gain = metal_trial.METAL_GAIN * (1.01 if better == "metal" else 0.99)
+    held = event.METAL if better == "metal" else event.DIELECTRIC
+    gain = event.METAL_GAIN * (1.01 if better == "metal" else 0.99)
     trials = judged(monkeypatch, 0.01, 0.01 * 10 ** (-gain / 10))
     trainer, said = fitted(views, tmp_path, TRIAL)
-    assert [trial.iteration for trial in trials] == [4, 4]
-    np.testing.assert_allclose(metallic(trials[0]), metal_trial.DIELECTRIC, atol=1e-6)
-    np.testing.assert_allclose(metallic(trials[1]), metal_trial.METAL, atol=1e-6)
+    for (iteration, during), value in zip(trials, (event.DIELECTRIC, event.METAL), strict=True):
+        assert iteration == 4
+        np.testing.assert_allclose(during, value, atol=1e-6)
     assert f"continues as {better}: " in " ".join(said)
     (row,) = trainer.fit.decisions
     assert row["component"] == "metal" and row["stays"] == (better == "metal") and "as metal" in row["reason"]
-    assert trainer.method.components == ()
     found = metallic(trainer)
     assert trainer.iteration == 6 and np.abs(found - held).max() > 1e-4 and np.abs(found - held).mean() < 0.1
 
@@ -97,7 +96,7 @@ def test_each_region_starts_as_what_explains_it_better(
 def test_regions_need_the_gain(views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Metal is better everywhere, by enough in the upper half only."""
     upper = (np.arange(SIZE) < SIZE // 2)[:, None]
-    enough, too_little = (10 ** (-factor * metal_trial.METAL_GAIN / 10) for factor in (1.8, 0.5))
+    enough, too_little = (10 ** (-factor * event.METAL_GAIN / 10) for factor in (1.8, 0.5))
     judged(monkeypatch, 0.01, 0.01 * np.where(upper, enough, too_little))
     trainer, _ = fitted(views, tmp_path, TRIAL, "iterations=4")
     assert 0.2 < (metallic(trainer) > 0.5).mean() < 0.8
@@ -108,7 +107,7 @@ def test_errors_are_attributed_by_blending_weights(views: Dataset, tmp_path: Pat
     trainer, _ = fitted(views, tmp_path, TRIAL)
     surfels, view = trainer.surfels.detach(), views.views[0]
     error = np.random.default_rng(0).random((SIZE, SIZE))
-    found = metal_trial._attributed(surfels, [view, view], [error, 2 * error])
+    found = event._attributed(surfels, [view, view], [error, 2 * error])
     alpha = splat(surfels, [], view.camera()).alpha.numpy().reshape(SIZE, SIZE)
     assert found.shape == (surfels.count,) and found.min() >= 0
     np.testing.assert_allclose(found.sum(), 3 * (error * alpha).sum(), rtol=1e-4)
@@ -119,9 +118,9 @@ def test_a_choice_is_that_of_the_neighbourhood() -> None:
     rng = np.random.default_rng(1)
     positions = rng.normal(size=(8000, 3)) * 0.1 + np.repeat([[-1.0, 0, 0], [1, 0, 0]], 4000, axis=0)
     values = np.repeat([-0.3, 0.3], 4000) + rng.normal(size=8000)
-    found = metal_trial._sum_around(positions, values)
+    found = event._sum_around(positions, values)
     np.testing.assert_array_equal(found > 0, np.repeat([False, True], 4000))
-    one = metal_trial._sum_around(positions[:1], values[:1])
+    one = event._sum_around(positions[:1], values[:1])
     np.testing.assert_allclose(one, values[:1])
 
 
@@ -129,11 +128,11 @@ def test_images_of_a_fit_decide(
     views: Dataset, tmp_path: Path, one_thread: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The fit ends where one with that metallic and the same seed does, if its surfels choose together."""
-    monkeypatch.setattr(metal_trial, "NEIGHBOURHOOD", 1.0)
+    monkeypatch.setattr(event, "NEIGHBOURHOOD", 1.0)
     trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4")
     sentence = next(one for one in said if "continues as" in one)
     metal, dielectric = (float(part.split(" dB")[0].split()[-1]) for part in sentence.split(",")[:2])
-    value = metal_trial.METAL if metal >= dielectric + metal_trial.METAL_GAIN else metal_trial.DIELECTRIC
+    value = event.METAL if metal >= dielectric + event.METAL_GAIN else event.DIELECTRIC
     again, _ = fitted(
         views,
         tmp_path / "again",
@@ -156,7 +155,7 @@ def test_a_resumed_fit_is_not_tried_again(views: Dataset, tmp_path: Path) -> Non
 
 
 def test_what_cannot_be_tried_is_refused() -> None:
-    with pytest.raises(InputError, match=r"metal_trial\.until: 0 is out of range; give 1 or more"):
-        methods.load("relighting", "quick", ["metal_trial.until=0"])
-    with pytest.raises(InputError, match="metal_trial: there is no attribute 'metallic'"):
+    with pytest.raises(InputError, match=r"event\.metal\.trial: 0 is out of range; give 1 or more"):
+        methods.load("relighting", "quick", ["event.metal.trial=0"])
+    with pytest.raises(InputError, match=r"event\.metal: there is no attribute 'metallic'"):
         methods.load("base_2dgs", "quick", [TRIAL])

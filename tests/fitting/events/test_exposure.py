@@ -15,24 +15,24 @@ from PIL import Image
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import exposure
-from mi_refgs.fitting.exposure import exif_gains
+from mi_refgs.fitting import image_error, per_view
+from mi_refgs.fitting.events.exposure import DEAD_ZONE, Exposure, exif_gains
 from mi_refgs.fitting.objective import GAIN_PRIOR, LossInputs, objective
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import GAIN, DataOptions, ExposureOptions, Method, Refine
+from mi_refgs.methods.method import GAIN, DataOptions, Method
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
 from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, gradient, planes, shown, view_of
 from tests.helpers import with_pixels
-from tests.scenes.highlight import SIZE, ball, require_same_state, run_folder, small_method, step_to
+from tests.scenes.highlight import ball, require_same_state, run_folder, small_method, step_to
 
 GAINS = np.array([1.4, 0.7, 0.9])
-DECIDED = 8
+AFTER = 8
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_gain_of_open_scene_counts_what_lies_behind(picture: tuple[np.ndarray, n
     data = Dataset(Path("a"), "train", (view,), BACKGROUND, False, None)
     opacity, colour = upload(alpha), mi.Color3f(*(float(x) for x in behind))
     frame = Frame(opacity, opacity, None, mi.Color3f(*planes(radiance)), background=colour)
-    gain, image = exposure.with_gain(frame, view, data)
+    gain, image = image_error.with_gain(frame, view, data)
     np.testing.assert_allclose(gain, GAINS, rtol=2e-3)
     np.testing.assert_allclose(np.minimum(image, 1), view.image, atol=2e-3)
 
@@ -136,16 +136,8 @@ def method(tmp_path: Path) -> Method:
     """Without refinement, so that a few dozen steps settle."""
     small = small_method(tmp_path)
     rates = dataclasses.replace(small.rates, attribute={"albedo": 0.1, "radiance_sh": 0.1, "opacity": 0.2})
-    options = ExposureOptions(after=DECIDED, rate=3e-3)
-    return dataclasses.replace(
-        small, refine=Refine(), mesh=None, data=DataOptions(), iterations=120, exposure=options, rates=rates
-    )
-
-
-def decide(trainer: Trainer, iteration: int) -> None:
-    """Decide about gains as a step does that ends with this iteration."""
-    trainer.fit.iteration = iteration
-    trainer._decide_exposure()
+    small = dataclasses.replace(small, event={"exposure": Exposure(AFTER)}, rates=rates)
+    return dataclasses.replace(small, data=DataOptions(), iterations=120)
 
 
 def perfect(data: Dataset) -> Any:
@@ -161,72 +153,39 @@ def perfect(data: Dataset) -> Any:
     return frame
 
 
-def test_gains_are_switched_on_where_images_have_them(
+def test_gains_begin_as_those_of_the_images(
     method: Method, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They begin as those that bring the render to each image, up to the mean of all views."""
+    """Up to the mean of all views, less the dead zone; images of one exposure have none."""
     log, said = rng.uniform(-0.5, 0.3, (12, 3)), list[str]()
-    trainer = Trainer(method, exposed(ball(views=12), log))
-    trainer.tell = said.append
     monkeypatch.setattr(Trainer, "view", perfect(ball(views=12)))
-    decide(trainer, DECIDED - 1)
-    assert trainer.fit.exposure is None
-    decide(trainer, DECIDED)
-    decision, gains = trainer.fit.exposure, exposure.gains_of(trainer.fit.params)
-    assert decision is not None and decision["gains"] and decision["iteration"] == DECIDED
-    assert (
-        decision["psnr_gain"] > decision["psnr"] + 10 and len(said) == 1 and "one gain per image" in said[0]
-    )
+    for spread in (0.1, 1.0):
+        trainer = Trainer(method, exposed(ball(views=12), spread * log), tell=said.append)
+        trainer.fit.iteration = AFTER - 1
+        trainer.happen()
+        assert GAIN not in trainer.fit.params
+        trainer.fit.iteration = AFTER
+        trainer.happen()
+        trainer.happen()
+        expected = spread * (log - log.mean(axis=0))
+        expected = np.sign(expected) * np.maximum(abs(expected) - DEAD_ZONE, 0)
+        found = trainer.fit.params[GAIN].numpy()
+        np.testing.assert_allclose(found, expected, atol=5e-3)
+    assert len(said) == 2 and "exposure: gains of" in said[0]
+    gains = per_view.gains_of(trainer.fit.params)
     assert gains is not None
-    np.testing.assert_allclose(np.log(gains), log - log.mean(axis=0), atol=5e-3)
-    record = exposure.record(trainer.setup, trainer.fit)
-    assert record is not None and record["gain"]["3"] == gains[3].round(5).tolist()
     trainer.fit.params[GAIN] = trainer.fit.params[GAIN] + 0.3  # what all have in common is the scene's
-    used = exposure.log_gain(trainer.fit.params, 3)
+    used = per_view.log_gain(trainer.fit.params, 3)
     assert used is not None
     np.testing.assert_allclose([float(value[0]) for value in used], np.log(gains[3]), atol=1e-6)
-    decide(trainer, DECIDED + 1)
-    assert len(said) == 1
 
 
-def test_gains_that_fit_half_of_the_pixels_are_rejected(
-    method: Method, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every other square of an image has another exposure: what is fitted to some is wrong for the rest."""
-    data = ball(views=4)
-    row, column = np.indices((SIZE, SIZE)) // exposure.BLOCK
-    factor = np.where((row + column) % 2 == 0, 0.5, 1.0)[..., None]
-    trainer = Trainer(method, exposed(data, np.log(np.stack([factor] * 4))))
-    monkeypatch.setattr(Trainer, "view", perfect(data))
-    decide(trainer, DECIDED)
-    decision = trainer.fit.exposure
-    assert decision is not None and not decision["gains"] and decision["psnr_gain"] < decision["psnr"] - 3
-
-
-def test_rejected_gains_leave_fit_unchanged(method: Method, one_thread: None) -> None:
-    method = dataclasses.replace(method, iterations=DECIDED + 4)
-    both = method, dataclasses.replace(method, exposure=None)
-    trainer, without = (step_to(Trainer(chosen, ball()), method.iterations) for chosen in both)
-    assert trainer.fit.exposure is not None and not trainer.fit.exposure["gains"]
-    assert without.fit.exposure is None
-    found, expected = trainer.state(), without.state()
-    assert found.keys() - expected.keys() == {"exposure"} and GAIN not in trainer.fit.params
-    for name in expected.keys() - {"seconds"}:
-        assert np.array_equal(found[name], expected[name]), name
-    choices: list[tuple[Any, bool]] = [("off", False), ("on", True)]
-    for gains, there in choices:
-        chosen = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains, after=2)), ball())
-        decide(chosen, method.iterations)
-        assert (chosen.fit.exposure is not None) == (GAIN in chosen.fit.params) == there
-
-
-@pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED + 3])
+@pytest.mark.parametrize("stop", [AFTER - 1, AFTER + 3])
 def test_fit_with_gains_resumes_bit_for_bit(
     stop: int, method: Method, rng: np.random.Generator, tmp_path: Path, one_thread: None
 ) -> None:
-    """Started by EXIF data; stopped before or after the decision, which is not repeated."""
-    options = dataclasses.replace(method.exposure or ExposureOptions(), gains="on")
-    method = dataclasses.replace(method, exposure=options, iterations=DECIDED + 6)
+    """Started by EXIF data; stopped before or after the gains begin to learn."""
+    method = dataclasses.replace(method, iterations=AFTER + 6)
     data = exposed(ball(), rng.uniform(-0.5, 0.3, (6, 3)))
     views = tuple(dataclasses.replace(view, exposure=0.1 * i) for i, view in enumerate(data.views))
     data = dataclasses.replace(data, views=views)
@@ -235,7 +194,7 @@ def test_fit_with_gains_resumes_bit_for_bit(
     said: list[str] = []
     second = Trainer(method, data, Run(tmp_path / "run"), tell=said.append)
     step_to(second, method.iterations)
-    assert len(said) == (stop < DECIDED) and f"params/{GAIN}" in require_same_state(straight, second)
+    assert len(said) == (stop < AFTER) and f"params/{GAIN}" in require_same_state(straight, second)
     fewer = dataclasses.replace(data, views=data.views[1:])
     with pytest.raises(InputError, match="5 training views, but the checkpoint has gains of 6"):
         Trainer(method, fewer, Run(tmp_path / "run"))
@@ -243,7 +202,7 @@ def test_fit_with_gains_resumes_bit_for_bit(
 
 def test_warm_step_with_gains_compiles_nothing(method: Method) -> None:
     """Another view has other gains, and no other kernel; a view's gain moves with its own gradient."""
-    trainer = Trainer(dataclasses.replace(method, exposure=ExposureOptions(gains="on", after=2)), ball())
+    trainer = Trainer(dataclasses.replace(method, event={"exposure": Exposure(2)}), ball())
     step_to(trainer, 16)
     misses = dr.detail.launch_stats()[2]
     step_to(trainer, 20)
@@ -287,7 +246,7 @@ def test_exif_data_tell_exposure(tmp_path: Path, method: Method) -> None:
     np.testing.assert_allclose(gains[:, 1], np.log([1, 2, 0.5, 0.25]) + np.log(2) / 2, atol=1e-5)
     trainer = Trainer(method, dataclasses.replace(data, views=tuple(known)))
     np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), gains)
-    trainer.step()  # gains wait for the decision
+    trainer.step()  # gains do not learn yet
     np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), gains)
     alike = tuple(dataclasses.replace(view, exposure=log[0]) for view in known)
     assert exif_gains(dataclasses.replace(data, views=alike)) is None

@@ -20,12 +20,13 @@ from mi_refgs.data.images import Pixels
 from mi_refgs.data.poses import poses_around
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import poses
+from mi_refgs.fitting import per_view
+from mi_refgs.fitting.events.cameras import Cameras
 from mi_refgs.fitting.objective import LossInputs, objective
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods import load_resolved
-from mi_refgs.methods.method import POSE, CameraOptions, DataOptions, Method, Refine
+from mi_refgs.methods.method import POSE, DataOptions, Method
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.render.samples import supersampled
@@ -35,21 +36,18 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.highlight import ball, require_same_state, run_folder, small_method, step_to
 
-DECIDED = 8
+AFTER = 8
 
 
 @pytest.fixture
 def method(tmp_path: Path) -> Method:
-    """Without refinement and coarse images; corrections are switched on at iteration DECIDED."""
-    options = CameraOptions("on", after=DECIDED, rate=1e-3)
-    small = small_method(tmp_path)
-    return dataclasses.replace(small, refine=Refine(), mesh=None, data=DataOptions(), cameras=options)
+    """Without coarse images and other events; cameras learn from iteration AFTER on."""
+    return dataclasses.replace(small_method(tmp_path), event={"cameras": Cameras(AFTER)}, data=DataOptions())
 
 
 def with_rows(trainer: Trainer, rows: np.ndarray) -> Trainer:
     """The trainer with corrections of these values (V, 6)."""
-    state = poses.with_corrections(trainer.setup, trainer.state())
-    trainer.restore(state | {f"params/{POSE}": rows.astype(np.float32)})
+    trainer.fit.add(trainer.setup, POSE, upload_tensor(rows.astype(np.float32)))
     return trainer
 
 
@@ -89,7 +87,7 @@ def test_derivative_of_corrected_camera(method: Method, rng: np.random.Generator
         leaf = upload_tensor(table.astype(np.float32))
         if grad:
             dr.enable_grad(leaf)
-        eye = poses.corrected(trainer.setup, {POSE: leaf}, index, trainer.data.views[index].camera())
+        eye = per_view.corrected(trainer.setup, {POSE: leaf}, index, trainer.data.views[index].camera())
         found = dr.sum(dr.dot(weight, eye.to_camera(points)))
         if grad:
             dr.backward(found)
@@ -121,8 +119,7 @@ def test_gradient_of_step_is_that_of_moved_camera(
     """All losses of a step, in either shading order, also of a supersampled part of the view, within what
     differences of a float32 loss with the kinks of L1 and the cut of footprints resolve; `test_camera_motion`
     compares images with float64."""
-    trainer = step_to(Trainer(dataclasses.replace(method, cameras=None), ball(48)), 4)
-    trainer.setup = type(trainer.setup)(method, trainer.data)
+    trainer = step_to(Trainer(method, ball(48)), 4)
     rows, index = 0.01 * rng.normal(size=(6, 6)), 2
     with_rows(trainer, rows)
     shading = trainer.fit.shading(method.stage[stage])
@@ -133,7 +130,7 @@ def test_gradient_of_step_is_that_of_moved_camera(
         target = trainer.targets[index]
         if cropped:
             target = target.cropped(PATCH_EDGE, 0, 3 * PATCH_EDGE, 2 * PATCH_EDGE)
-        camera = poses.corrected(trainer.setup, {POSE: table}, index, target.camera)
+        camera = per_view.corrected(trainer.setup, {POSE: table}, index, target.camera)
         target = dataclasses.replace(target, camera=camera)
         view = partial(render, scene, request=Request(("normal",)))
         frame = supersampled(view, camera, 4 if cropped else 1)
@@ -155,36 +152,19 @@ def test_gradient_of_step_is_that_of_moved_camera(
 # ---------------- when they are switched on ----------------
 
 
-def test_rejected_corrections_leave_fit_unchanged(method: Method, one_thread: None) -> None:
-    judged = CameraOptions("judged", after=DECIDED, worth=100.0)
-    both = dataclasses.replace(method, cameras=judged), dataclasses.replace(method, cameras=None)
-    trainer, without = (step_to(Trainer(chosen, ball()), DECIDED + 3) for chosen in both)
-    decision = trainer.fit.cameras
-    assert decision is not None and not decision["corrected"] and decision["iteration"] == DECIDED
-    found, expected = trainer.state(), without.state()
-    assert found.keys() - expected.keys() == {"cameras"} and POSE not in trainer.fit.params
-    for name in expected.keys() - {"seconds"}:
-        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
-    off = Trainer(dataclasses.replace(method, cameras=CameraOptions("off", after=1)), ball())
-    assert step_to(off, 3).fit.cameras is None
-
-
-@pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED + 3])
+@pytest.mark.parametrize("stop", [AFTER - 1, AFTER + 3])
 def test_fit_with_corrections_resumes_bit_for_bit(
     stop: int, method: Method, tmp_path: Path, one_thread: None
 ) -> None:
-    """Stopped before or after the decision, which is not repeated; recorded poses are those of the fit."""
-    straight = step_to(Trainer(method, ball()), DECIDED + 6)
+    """Stopped before or after cameras begin to learn; recorded poses are those of the fit."""
+    straight = step_to(Trainer(method, ball()), AFTER + 6)
     run = run_folder(tmp_path / "run", method)
     step_to(Trainer(method, ball(), run), stop).save()
-    said: list[str] = []
-    second = Trainer(method, ball(), Run(tmp_path / "run"), tell=said.append)
-    step_to(second, DECIDED + 6)
+    second = step_to(Trainer(method, ball(), Run(tmp_path / "run")), AFTER + 6)
     state = require_same_state(straight, second)
-    assert len(said) == (stop < DECIDED) and np.abs(state[f"params/{POSE}"]).max() > 1e-4
-    record = poses.record(second.setup, second.fit)
-    assert record is not None and record["corrected"]
-    run.write_json(CAMERAS, record)
+    assert np.abs(state[f"params/{POSE}"]).max() > 1e-4
+    poses = {view.name: second.camera(i).pose().tolist() for i, view in enumerate(second.data.views)}
+    run.write_json(CAMERAS, {"to_world": poses})
     for i, view in enumerate(with_poses(second.data, run.cameras()).views):
         np.testing.assert_array_equal(view.to_world, second.camera(i).pose())
     fewer = dataclasses.replace(ball(), views=ball().views[1:])
@@ -225,10 +205,8 @@ reflectance = "radiance"
 [loss]
 normal = 0
 [rates]
-position_final = 2e-6
 attribute = { position = 2e-5, radiance_sh = 2e-4, scale = 2e-4, rotation = 2e-4, opacity = 2e-4 }
-[cameras]
-corrections = "on"
+[event.cameras]
 after = 1
 """
 

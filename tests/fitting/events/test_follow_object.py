@@ -6,7 +6,7 @@ import numpy as np
 
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
-from mi_refgs.fitting.object_surface import surface_points
+from mi_refgs.fitting.events.follow_object import surface_points
 from mi_refgs.reference.camera import look_at
 
 ORIGIN, TARGET = np.array([3.0, -2.0, 1.5]), np.array([0.2, 0.1, -0.3])

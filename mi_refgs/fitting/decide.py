@@ -1,0 +1,198 @@
+"""Decisions during a fit: it is continued both ways for some steps, and validation views choose.
+
+The better one continues, so a decision costs the steps of the other. Only errors and counts decide, never a
+clock: the same command makes the same decisions on every machine.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mi_refgs import methods
+from mi_refgs.fitting.image_error import displayed_of, image_of, psnr
+from mi_refgs.fitting.initial import converted, with_columns
+from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.state import decisions_of
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.event import Event
+from mi_refgs.methods.method import APART, AROUND, LIGHT, Method
+from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
+from mi_refgs.runs.run import Run
+
+DECISIONS = "decisions.json"  # file of a run
+HOLDOUT = 8  # every so many training views validate
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was decided about one component of a method, tried or not."""
+
+    component: str
+    iteration: int
+    stays: bool
+    reason: str
+    psnr_without: float | None = None  # dB, mean over the validation views
+    psnr_with: float | None = None
+
+
+class Decision(Event[Trainer]):
+    """An event that decides about components of a method, each once, between two steps."""
+
+    outside: ClassVar[bool] = True
+    validates: ClassVar[bool] = True  # by views that are held out
+
+    def components(self) -> Sequence[str]:
+        """The components, in the order in which they are decided."""
+        raise NotImplementedError
+
+    def chosen(self, method: Method, component: str) -> Method:
+        """The method with a component that stays."""
+        raise NotImplementedError
+
+    def pending(self, decisions: Sequence[Mapping[str, Any]]) -> list[str]:
+        """The components that are not decided yet."""
+        decided = {row["component"] for row in decisions}
+        return [name for name in self.components() if name not in decided]
+
+
+def waiting(trainer: Trainer) -> list[str]:
+    """The components that validation views are still to decide."""
+    of_views = [x for x in trainer.method.event.values() if isinstance(x, Decision) and x.validates]
+    return [name for decision in of_views for name in decision.pending(trainer.fit.decisions)]
+
+
+def validates(trainer: Trainer) -> bool:
+    """Whether there are such components, and views enough to hold some out."""
+    return len(trainer.whole.views) >= HOLDOUT and bool(waiting(trainer))
+
+
+def hold_out(trainer: Trainer) -> None:
+    """Fit all but the validation views as long as a decision needs them, then all views."""
+    wanted = validates(trainer)
+    if wanted == (trainer.validation is not None):
+        return
+    if wanted:
+        fitted, trainer.validation = trainer.data.held_out(HOLDOUT)
+        trainer.use(fitted)
+    else:
+        trainer.validation = None
+        trainer.use(trainer.whole)
+
+
+def as_decided(method: Method, decisions: Sequence[Mapping[str, Any]]) -> Method:
+    """The method with the components that decisions kept; those that it has already change nothing."""
+    for row in decisions:
+        for event in method.event.values():
+            if row["stays"] and isinstance(event, Decision) and row["component"] in event.components():
+                method = event.chosen(method, row["component"])
+                break
+    return method
+
+
+def differences(run: Run, now: Method) -> dict[str, tuple[Any, Any]]:
+    """Keys by which the method of a run differs from another one, with the run's decisions and image size."""
+    made = run.method()
+    if (state := run.load_checkpoint()) is not None:
+        made, now = (as_decided(method, decisions_of(state)) for method in (made, now))
+    if now.data.downscale is None:
+        now = now.downscaled(made.data.downscale)
+    return methods.differences(made, now)
+
+
+# ---------------- a trial ----------------
+
+
+def fork(trainer: Trainer, method: Method) -> Trainer:
+    """Copy a fit to a trainer of another method, at the same iteration, without a run folder.
+
+    Attributes, the light and the mesh that the other method lacks are dropped, SH of another degree are cut
+    or filled with zeros, new attributes start as the method says. What is kept has its history.
+    """
+    state = trainer.state()
+    old, rng = part(state, PARAMS), trainer.setup.rng(trainer.iteration, "branch")
+    widths = {name: method.surfels.columns(name) for name in method.surfels.names}
+    wanted = converted(old, widths, method, rng)
+    wanted |= {name: old[name] for name in old if name in APART or name.startswith(AROUND)}
+    if method.light is None:
+        wanted.pop(LIGHT, None)
+    dropped = (PARAMS, OPTIMISER) if method.has_mesh else (PARAMS, OPTIMISER, MESH)
+    new = {name: value for name, value in state.items() if not name.startswith(dropped)}
+    for name, values in wanted.items():
+        new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
+        new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}
+    made = Trainer(method, trainer.data, state=new, targets=trainer.targets)
+    made.whole, made.validation = trainer.whole, trainer.validation
+    return made
+
+
+def _history(
+    state: Mapping[str, np.ndarray], old: Mapping[str, np.ndarray], name: str, values: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Adam's moments of one tensor, with the names of `Adam.state_dict`."""
+    found = Adam.fresh_state(name, values.size)
+    for key, fresh in found.items():
+        kept = state.get(f"{OPTIMISER}{key}", fresh)
+        if kept.ndim and name in old and values.ndim == 2:
+            kept = with_columns(kept.reshape(old[name].shape), values.shape[1]).ravel()
+        if kept.size == fresh.size:
+            found[key] = kept
+    return found
+
+
+def run(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
+    """Take some steps in a trial of another fit, between which a pending interrupt is raised."""
+    for _ in range(steps):
+        trainer.step()
+        of.release()
+    return trainer
+
+
+def tried(trainer: Trainer, component: str, rival: Trainer, steps: int, gain: float) -> Row:
+    """Continue a fit for some steps, and a rival too, which stays if its validation PSNR is `gain` dB higher.
+
+    Both are copies, so that an interrupt leaves the fit as it was.
+    """
+    begin, plain = trainer.iteration, fork(trainer, trainer.method)
+    scores = [validation_psnr(run(one, steps, trainer)) for one in (rival, plain)]
+    gained = scores[0] - scores[1]
+    chosen = rival if gained >= gain else plain
+    trainer.take(chosen, chosen.method)
+    reason = f"{gained:+.2f} dB on validation views, {gain:+.2f} dB required"
+    return Row(component, begin, bool(gained >= gain), reason, scores[1], scores[0])
+
+
+def validation_psnr(trainer: Trainer) -> float:
+    """Mean PSNR (dB) of the present state on the validation views; waits for the device."""
+    assert trainer.validation is not None
+    frames = ((trainer.view(view.camera(), aovs=False), view) for view in trainer.validation.views)
+    return float(
+        np.mean([psnr(image_of(displayed_of(frame, trainer.data), view), view) for frame, view in frames])
+    )
+
+
+def conclude(trainer: Trainer, row: Row, began: float, verdict: str = "") -> None:
+    """Record a decision, with all the time since `time.perf_counter()` was `began`, and save."""
+    verdict = verdict or f"{row.component} {'stays' if row.stays else 'is left out'}"
+    trainer.tell(f"{verdict}: {row.reason}")
+    trainer.fit.decisions.append(asdict(row))
+    hold_out(trainer)
+    trainer.fit.seconds += time.perf_counter() - began
+    trainer.save()
+    if trainer.run is not None:
+        trainer.run.write_method(trainer.method)
+
+
+def table(decisions: Sequence[Mapping[str, Any]]) -> str:
+    """The decisions of a fit as a text table."""
+    rows = [("component", "iteration", "verdict", "reason")]
+    for row in decisions:
+        verdict = "stays" if row["stays"] else "left out"
+        rows.append((row["component"], str(row["iteration"]), verdict, row["reason"]))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
+    return "\n".join("  ".join(row).rstrip() for row in padded)

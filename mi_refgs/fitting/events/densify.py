@@ -1,0 +1,193 @@
+"""Densification by error, and pruning. [3DGS §5.2; Rota Bulò et al., Revising Densification, ECCV 2024, §3.1]
+
+The surfels with the largest squared error are split along their longest axis; transparent and oversized ones
+are removed, and those of the least blending weight. Splits run a few dozen times per fit, in NumPy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from mi_refgs.data.object_region import in_free_space
+from mi_refgs.data.view import evenly_spread
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.events.reset_opacity import ResetOpacity
+from mi_refgs.fitting.exchange import exchange
+from mi_refgs.fitting.state import TableEdit
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.event import Event, register
+from mi_refgs.methods.ranges import at_least, between
+from mi_refgs.methods.window import Window
+from mi_refgs.splat import surfel_count
+from mi_refgs.splat.weights import blended_weights, listed_tiles
+from mi_refgs.surfels.attributes import logit, sigmoid
+from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.table import Surfels
+
+SPLIT_OFFSET, SPLIT_SCALE = 0.6, 0.72
+"""Distance of a split surfel's two children from its centre, and their scale, both relative to its longest
+scale and along that axis. With `split_opacity` their composited profile is the parent's but for 0.4 to 1.8 %
+of its energy (opacity 0.3 to 0.99; least squares over scale and opacity at this distance). Smaller distances
+fit better, but the children then differ too little."""
+BACKGROUND_EXTENT = 0.5  # distances from the region's centre; larger surfels of the background are removed
+WEIGHED_VIEWS, WEIGHED_SIZE = 48, 128
+"""Training views in which faint surfels are looked for at most, and the longer side of their images there in
+pixels: an event then takes as long as 5 to 10 steps."""
+NO_ROWS = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True)
+class Densify(Event[Trainer]):
+    """Splits and prunes the surfels of the object and of the background."""
+
+    name: ClassVar[str] = "densify"
+
+    when: Window
+    grow: float = field(default=0.25, metadata=at_least(0))  # fraction of the surfels split at most
+    prune_opacity: float = field(default=0.05, metadata=between(0, 1))  # surfels of less are removed
+    prune_extent: float = field(default=0.1, metadata=at_least(0))  # scene extents; larger ones are removed
+    # Share of all blending weight; the surfels of the least weight per tile are removed.
+    prune_weight: float = field(default=0.01, metadata=between(0, 1))
+
+    def observes(self, trainer: Trainer) -> bool:
+        return trainer.iteration + 1 <= self.when.until
+
+    def due(self, trainer: Trainer) -> bool:
+        return self.when.due(trainer.iteration)
+
+    def apply(self, trainer: Trainer) -> None:
+        """Grow where the error is, prune, and let surfels of an open scene change tables."""
+        trainer.check()
+        fit, extent = trainer.fit, trainer.data.scene_extent
+        reset, rate = trainer.method.event.get(ResetOpacity.name), trainer.method.rates.of("opacity")
+        grown = not isinstance(reset, ResetOpacity) or reset.grown(fit.iteration, self.prune_opacity, rate)
+        options = self if grown else replace(self, prune_opacity=0.0)
+        if len(fit.tables) > 1:
+            self._clear_free_space(trainer)
+        faint = self._faint(trainer) if options.prune_opacity else [NO_ROWS] * len(fit.tables)
+        for table, few in zip(fit.tables, faint, strict=True):
+            largest: float | np.ndarray = self.prune_extent * extent
+            if table.prefix:  # the background's surfels may grow with their distance
+                region = trainer.region
+                assert region is not None
+                offset = table.surfels.raw["position"].numpy() - np.array(region.centre)
+                largest = BACKGROUND_EXTENT * np.maximum(np.linalg.norm(offset, axis=1), region.radius)
+            error = table.error_sum.numpy()
+            table.apply(
+                densify_and_prune(
+                    table.surfels, error, few, largest, options, table.max_count, keep_one=bool(table.prefix)
+                )
+            )
+        exchange(trainer.setup, fit)
+        fit.occluder.vertex_surfels = None
+        for table in fit.tables:
+            table.clear()
+
+    def _clear_free_space(self, trainer: Trainer) -> None:
+        """Remove the background's surfels right in front of cameras; one stays in any case."""
+        background, region = trainer.fit.tables[1], trainer.region
+        assert region is not None
+        floating = in_free_space(trainer.data.views, region, background.surfels.raw["position"].numpy())
+        floating &= np.cumsum(floating) < len(floating)
+        if floating.any():
+            background.remove(np.flatnonzero(floating))
+
+    def _faint(self, trainer: Trainer) -> list[np.ndarray]:
+        """The rows of each table with the least blending weight for the tiles they cost, these first."""
+        every, own, views = trainer.fit.detached(), trainer.surfels.count, trainer.data.views
+        weight, cost = np.zeros(surfel_count(every)), np.zeros(surfel_count(every))
+        for index in evenly_spread(len(views), WEIGHED_VIEWS):
+            camera = views[index].camera()
+            small = camera.resized(min(WEIGHED_SIZE, max(camera.width, camera.height)))
+            weight += blended_weights(every, small)[0]
+            cost += listed_tiles(every, small)
+        tables = zip(np.split(weight, [own]), np.split(cost, [own]), strict=True)
+        return [least_weight(w, c, self.prune_weight) for w, c in tables][: len(every)]
+
+
+def fill(trainer: Trainer) -> None:
+    """Split the object's surfels with the largest error, as many as there is room for; prune none."""
+    table = trainer.fit.tables[0]
+    options = Densify(Window(0, 0, 1), grow=1.0, prune_opacity=0.0)
+    error = table.error_sum.numpy()
+    table.apply(densify_and_prune(table.surfels, error, NO_ROWS, np.inf, options, table.max_count))
+    trainer.fit.occluder.vertex_surfels = None
+    table.clear()
+
+
+def split_opacity(opacity: np.ndarray) -> np.ndarray:
+    """Opacity (N,) of the two children of surfels of this opacity: the least-squares fit, linear in it."""
+    return opacity * (0.65 + 0.15 * opacity)
+
+
+def densify_and_prune(
+    surfels: Surfels,
+    error: np.ndarray,  # (N,) squared error that the surfels are responsible for: Σ w e² over recent pixels
+    faint: np.ndarray,  # rows that may be removed for others, the first ones first: `least_weight`
+    largest: float | np.ndarray,  # scene units, one or (N,): larger surfels are removed
+    options: Densify,
+    most: int,
+    keep_one: bool = False,
+) -> TableEdit:
+    """Split the surfels with the largest error; remove transparent and oversized ones, and faint ones.
+
+    At most `most` surfels result; faint ones are removed as far as splits lack room. A surfel is split along
+    its longest axis into two that together look like it, so that the image hardly changes. `keep_one`: the
+    most opaque surfel stays in any case. Raises InputError if no surfel would be left.
+    """
+    raw = surfels.to_numpy()
+    primitive = primitive_of(raw)
+    opacity = sigmoid(raw["opacity"][:, 0])
+    size = primitive.extent(raw)[1].max(axis=1)
+    keep = (size <= largest) & (opacity >= options.prune_opacity)
+    if keep_one and not keep.any():
+        keep[np.argmax(opacity)] = True
+    if not keep.any():
+        raise InputError(
+            "event.densify.prune_opacity: no surfel is opaque and small enough to stay; lower it, raise "
+            "prune_extent, or check that the images and their cameras belong together"
+        )
+
+    # Early in a fit most surfels are faint, those that will be needed, too: they only make room.
+    needed = math.ceil((1 + options.grow) * keep.sum()) - most
+    keep[faint[keep[faint]][: max(needed, 0)]] = False
+
+    # The surfels to split: those with the largest error, as many as there is room for.
+    left = int(keep.sum())
+    room = min(max(most - left, 0), math.ceil(options.grow * left))
+    lasting = split_opacity(opacity) >= options.prune_opacity  # else the next event would remove the children
+    candidates = np.flatnonzero(keep & lasting & (error > 0))
+    split = np.sort(candidates[np.argsort(-error[candidates], kind="stable")[:room]])
+    keep[split] = False
+
+    # Two children of each, in place of the parent.
+    kept = np.flatnonzero(keep)
+    parent = np.concatenate([kept, split, split])
+    fresh = np.arange(len(parent)) >= len(kept)
+    table = {name: values[parent].copy() for name, values in raw.items()}
+    if len(split):
+        children = slice(len(kept), len(parent))
+        axes, deviations = primitive.extent({name: values[children] for name, values in table.items()})
+        longest = deviations.argmax(axis=1)
+        along = np.take_along_axis(axes, longest[:, None, None], axis=1)[:, 0]
+        side = np.repeat([SPLIT_OFFSET, -SPLIT_OFFSET], len(split)) * deviations.max(axis=1)
+        table["position"][children] += (side[:, None] * along).astype(np.float32)
+        primitive.shrink(table, children, longest, SPLIT_SCALE)
+        table["opacity"][children, 0] = logit(split_opacity(opacity[parent[children]]))
+    return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)
+
+
+def least_weight(weight: np.ndarray, cost: np.ndarray, share: float) -> np.ndarray:
+    """Rows of the surfels that together have at most this share of all weight, least weight per cost first.
+
+    `weight`: blending weights (N,); `cost`: tiles (N,) in whose lists they are.
+    """
+    order = np.argsort(weight / np.maximum(cost, 1), kind="stable")
+    return order[np.cumsum(weight[order]) <= share * weight.sum()]
+
+
+register(Densify)

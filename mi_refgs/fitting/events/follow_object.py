@@ -1,0 +1,73 @@
+"""The region of interest during a fit: once its surfels have the scene's shape, it follows the object.
+
+The rendered depth of some training views gives points on all surfaces, without floaters that others hide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from mi_refgs.data.object_region import camera_positions, fitted_region, seen_share
+from mi_refgs.data.view import View, evenly_spread
+from mi_refgs.fitting.exchange import exchange
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.event import Event, register
+from mi_refgs.render.panorama import SURFACE
+from mi_refgs.render.pipeline import render_depth
+from mi_refgs.types import Float
+
+AFTER = 1 / 3  # fraction of the iterations after which the region follows the object
+DEPTH_VIEWS = 24  # training views whose depth is rendered
+LEVEL = 0.05  # difference of depth, in radii of the region, up to which two pixels show one surface
+LEVEL_COUNT = 3  # of the eight neighbours of a pixel; fewer are where an outline mixes near and far
+
+
+@dataclass(frozen=True)
+class FollowObject(Event[Trainer]):
+    """Adapts an estimated region of interest to the object, once; one that a user gave stays."""
+
+    name: ClassVar[str] = "follow_object"
+    always: ClassVar[bool] = True
+
+    def due(self, trainer: Trainer) -> bool:
+        region = trainer.data.region
+        open_ = trainer.setup.open_scene and region is not None and region.estimated
+        late = trainer.iteration >= AFTER * trainer.method.iterations
+        return open_ and late and trainer.fit.region is None
+
+    def apply(self, trainer: Trainer) -> None:
+        trainer.check()
+        region, around, views = trainer.region, trainer.surroundings, trainer.data.views
+        assert region is not None and around is not None
+        tables = trainer.surfels.detach(), around.surfels.detach()
+        points = []
+        for i in evenly_spread(len(views), DEPTH_VIEWS):
+            depth, alpha = render_depth(tables[0], views[i].camera(), tables[1])
+            points.append(surface_points(views[i], depth, alpha, region.radius))
+        seen, cameras = partial(seen_share, views), camera_positions(views)
+        found = fitted_region(region, cameras, np.concatenate(points), seen)
+        trainer.fit.region = found or region
+        if found is None:
+            trainer.tell("region of interest: no object is separate from the scene, so it stays")
+            return
+        centre = ", ".join(f"{x:.3g}" for x in found.centre)
+        trainer.tell(f"region of interest: the object is within {found.radius:.3g} units of ({centre})")
+        exchange(trainer.setup, trainer.fit)
+
+
+def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.ndarray:
+    """World points (P, 3) of the pixels that show a surface; `radius` of the region, scene units."""
+    z, opaque = (np.array(x).reshape(view.height, view.width) for x in (depth, alpha))
+    around = np.pad(z, 1, constant_values=np.inf)
+    shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
+    beside = np.stack([around[r : r + view.height, c : c + view.width] for r, c in shifts])
+    level = np.count_nonzero(abs(beside - z) < LEVEL * radius, axis=0) >= LEVEL_COUNT
+    row, column = np.nonzero((opaque > SURFACE) & level)
+    return np.asarray(view.to_world[:3, 3] + view.rays(row, column) * z[row, column, None])
+
+
+register(FollowObject)

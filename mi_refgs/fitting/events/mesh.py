@@ -1,0 +1,60 @@
+"""The mesh that occludes: extracted from the rendered depth of training views. [Ref-Gaussian §3.3]"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import tee
+from typing import ClassVar
+
+from mi_refgs.data.view import evenly_spread
+from mi_refgs.fitting.exchange import exchange
+from mi_refgs.fitting.train import FEW_VIEWS, Trainer
+from mi_refgs.methods.event import Event, register
+from mi_refgs.methods.ranges import at_least
+from mi_refgs.methods.window import Window
+from mi_refgs.occlusion.mesh import Mesh, extract_mesh
+from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
+from mi_refgs.render.pipeline import render_depth
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
+
+RELEASED = Window(20_000, 50_000, 2_000)  # of the released Ref-Gaussian code on synthetic scenes
+
+
+@dataclass(frozen=True)
+class ExtractMesh(Event[Trainer]):
+    """Fuses a new occluder from FEW_VIEWS training views, the last one, which is saved, from all.
+
+    The mirror rays of a fit need no more: *chair* at 200², 1,000 iterations, two seeds: 32.33 and 32.33 dB
+    from 24 views, 32.24 and 32.34 dB from 88.
+    """
+
+    name: ClassVar[str] = "mesh"
+
+    when: Window = RELEASED
+    resolution: int = field(default=128, metadata=at_least(2))  # voxels along the longest side
+
+    def due(self, trainer: Trainer) -> bool:
+        return self.when.due(trainer.iteration) and trainer.shading().traceable
+
+    def apply(self, trainer: Trainer) -> None:
+        trainer.check()
+        # What moved since the last densification is the object's, or is not.
+        exchange(trainer.setup, trainer.fit)
+        views, method = len(trainer.data.views), trainer.method
+        last = self.when.count(trainer.iteration) == self.when.count(method.iterations)
+        seen = range(views) if last else evenly_spread(views, FEW_VIEWS)
+        cameras = [trainer.camera(i) for i in seen]
+        trainer.fit.occluder.update(surface_of(trainer.surfels.detach(), cameras, self.resolution))
+
+
+def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int) -> Mesh:
+    """A mesh fused from the depth in all cameras, with `resolution` voxels along the longest side."""
+    bounds = bounds_from_points(surfels.to_numpy()["position"])
+    views = tee(render_depth(surfels, camera) for camera in cameras)
+    depths, alphas = (depth for depth, _ in views[0]), (alpha for _, alpha in views[1])
+    return extract_mesh(fuse(depths, alphas, iter(cameras), bounds, resolution))
+
+
+register(ExtractMesh)

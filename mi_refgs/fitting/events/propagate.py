@@ -1,0 +1,84 @@
+"""Normal propagation: surfels become opaque, and reflective ones grow over their neighbours.
+
+Enlarged opaque surfels cover their neighbours, whose reflections then follow the normals that already explain
+them. [3DGS-DR, Ye et al. 2024, §3.3; material-aware: Ref-Gaussian §3.4]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.event import Event, register
+from mi_refgs.methods.ranges import at_least, between, inside
+from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.surfels.attributes import logit, sigmoid
+from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.table import Surfels
+
+DULL = 0.05  # metallic up to which a surfel's colour gets noise
+
+
+@dataclass(frozen=True)
+class Propagate(Event[Trainer]):
+    """Enlarges the reflective surfels of the object; a rough metal has no sharp reflection.
+
+    Noise on the colour of the others keeps it from explaining reflections.
+    """
+
+    name: ClassVar[str] = "propagate"
+
+    when: Window
+    opacity: float = field(default=0.9, metadata=inside(0, 1))  # all surfels become at least this opaque
+    scale: float = field(default=1.5, metadata=at_least(0))  # factor of the scales of reflective surfels
+    metallic: float = field(default=0.02, metadata=between(0, 1))  # reflective: at least this metallic …
+    roughness: float | None = None  # … and at most this rough; absent: any roughness
+    noise: float = field(default=0.0, metadata=at_least(0))  # half its width, in SH coefficients
+    hold: int = field(default=200, metadata=ITERATIONS)  # iterations without opacity learning afterwards
+
+    def require(self, attributes: Collection[str]) -> None:
+        if "metallic" not in attributes:
+            raise InputError("there is no attribute 'metallic'; add it, or drop this")
+
+    def due(self, trainer: Trainer) -> bool:
+        held = trainer.fit.optimiser.factors.get("opacity", 1.0) == 0
+        return self._grows(trainer) or (held and trainer.iteration >= trainer.fit.held_until)
+
+    def apply(self, trainer: Trainer) -> None:
+        fit = trainer.fit
+        if self._grows(trainer):
+            edited = self.propagated(trainer.surfels, trainer.setup.rng(fit.iteration, "propagate"))
+            colour = ("radiance_sh",) if self.noise else ()
+            fit.tables[0].replace(edited, cleared=("opacity", *edited.primitive.sizes, *colour))
+            fit.optimiser.set_factor("opacity", 0.0)
+            fit.held_until = fit.iteration + self.hold
+        if fit.iteration >= fit.held_until:
+            fit.optimiser.set_factor("opacity", 1.0)
+
+    def _grows(self, trainer: Trainer) -> bool:
+        reset = trainer.method.event.get("reset_opacity")
+        # One that comes first in this iteration would be undone.
+        return self.when.due(trainer.iteration) and not (reset is not None and reset.due(trainer))
+
+    def propagated(self, surfels: Surfels, rng: np.random.Generator) -> Surfels:
+        """The surfels with these opacities, sizes and noise."""
+        raw = surfels.to_numpy()
+        raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(self.opacity)))
+        metallic = sigmoid(raw["metallic"][:, 0])
+        reflective = metallic >= self.metallic
+        if self.roughness is not None and "roughness" in raw:
+            reflective &= sigmoid(raw["roughness"][:, 0]) <= self.roughness
+        primitive_of(raw).resize(raw, reflective, self.scale)
+        if self.noise and "radiance_sh" in raw:
+            dull = np.flatnonzero(metallic <= DULL)
+            noise = rng.uniform(-self.noise, self.noise, (len(dull), 3))
+            raw["radiance_sh"][dull, :3] += noise.astype(np.float32)
+        return Surfels.from_numpy(raw)
+
+
+register(Propagate)

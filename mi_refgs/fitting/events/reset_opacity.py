@@ -1,0 +1,65 @@
+"""Resets of opacity: surfels that the images require grow back, others are pruned. [3DGS §5.2]"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.methods.event import Event, register
+from mi_refgs.methods.window import Window
+from mi_refgs.surfels.attributes import ATTRIBUTES, logit
+from mi_refgs.surfels.table import Surfels
+
+OPACITY = 0.01  # of all surfels after a reset, at most
+PATIENCE = 4.5
+"""Factor of the fewest steps in which an opacity can grow back: 150 iterations as shipped. Factor 2 (67
+iterations) was too small on a diffuse scene, which lost every surfel."""
+
+
+@dataclass(frozen=True)
+class ResetOpacity(Event[Trainer]):
+    """Lowers the opacities of the object; the background map would replace the background's surfels, blurred.
+
+    Attributes in `raise_to_start` rise to at least their initial value. [3DGS-DR, for metallic]
+    """
+
+    name: ClassVar[str] = "reset_opacity"
+
+    when: Window
+    raise_to_start: tuple[str, ...] = ()  # bounded attributes
+
+    def require(self, attributes: Collection[str]) -> None:
+        for name in self.raise_to_start:
+            if name not in attributes or ATTRIBUTES[name].activation != "sigmoid":
+                raise InputError(f"raise_to_start: '{name}' is no attribute between 0 and 1; remove it")
+
+    def due(self, trainer: Trainer) -> bool:
+        return self.when.due(trainer.iteration)
+
+    def apply(self, trainer: Trainer) -> None:
+        raw = trainer.surfels.to_numpy()
+        raw["opacity"] = np.minimum(raw["opacity"], np.float32(logit(OPACITY)))
+        for name in self.raise_to_start:
+            raw[name] = np.maximum(raw[name], np.float32(logit(trainer.method.surfels.first(name))))
+        cleared = ("opacity", *self.raise_to_start)
+        trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=cleared)
+
+    def grown(self, iteration: int, opacity: float, rate: float) -> bool:
+        """Whether opacities had time since the last reset before an iteration to grow back to `opacity`.
+
+        Adam raises a logit by about its rate per step, so from OPACITY it takes at least their distance over
+        the rate: 33 steps of 0.05 to an opacity of 0.05. Presets do not scale the rate, and so not this time.
+        """
+        if (since := self.when.since(iteration)) is None:
+            return True
+        lift = max(logit(opacity) - logit(OPACITY), 0.0)
+        return since >= (PATIENCE * lift / rate if rate > 0 else math.inf)
+
+
+register(ResetOpacity)

@@ -1,0 +1,82 @@
+"""Surfels that cross the border of the region of interest change tables.
+
+One of the object that is more than MARGIN radii outside becomes one of the background, with its geometry and
+the spherical harmonics of the background; one of the background that is as far inside becomes one of the
+object, whose other attributes start as the method says. Neither has a history in its new table. A table keeps
+at least one surfel, may become larger than its method allows, and does not grow then.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mi_refgs.data.region import Region
+from mi_refgs.fitting.initial import converted
+from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.fitting.state import FitState, TableEdit
+from mi_refgs.methods.method import Method
+from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.table import Surfels
+
+REACH = 2.0
+"""Standard deviations to which a surfel extends: one that extends through the plane below the object is the
+table's. On *tabletop*, the opacity of the object alone has an intersection over union with the jug's mask of
+0.90 by centres, 0.94 with 1, 0.96 with 2 and 3."""
+MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
+
+
+def exchange(setup: FitSetup, fit: FitState) -> None:
+    """Let the surfels beyond the border of the region change tables; of an open scene only."""
+    region = fit.region or setup.data.region
+    if not setup.open_scene or region is None:
+        return
+    inner, outer = (table.surfels for table in fit.tables)
+    edits = exchanged(inner, outer, setup.method, region, setup.rng(fit.iteration, "densify"))
+    for table, edit in zip(fit.tables, edits, strict=True):
+        table.apply(edit)
+    fit.occluder.vertex_surfels = None
+
+
+def exchanged(
+    inner: Surfels, outer: Surfels, method: Method, region: Region, rng: np.random.Generator
+) -> list[TableEdit]:
+    """Both tables after the exchange. One of another primitive keeps its axes and sizes, as far as it has
+    them."""
+    tables = [inner.to_numpy(), outer.to_numpy()]
+    own_depth, other_depth = (
+        depth_outside(table["position"], region, reach_of(table, region)) for table in tables
+    )
+    leaves = [own_depth > MARGIN, other_depth < -MARGIN]
+    for gone in leaves:  # one surfel stays
+        gone &= np.cumsum(gone) < len(gone)
+    edits = []
+    for own, other, gone, comes in zip(tables, tables[::-1], leaves, leaves[::-1], strict=True):
+        stays = np.flatnonzero(~gone)
+        widths = {name: values.shape[1] for name, values in own.items()}
+        arrives = {name: values[comes] for name, values in other.items()}
+        before, after = primitive_of(other), primitive_of(own)
+        if before is not after and comes.any():
+            arrives |= after.like(*before.extent(arrives))
+        moved = converted(arrives, widths, method, rng)
+        table = {name: np.concatenate([values[stays], moved[name]]) for name, values in own.items()}
+        parent = np.concatenate([stays, np.zeros(comes.sum(), int)]).astype(np.uint32)
+        edits.append(TableEdit(Surfels.from_numpy(table), parent, np.arange(len(parent)) >= len(stays)))
+    return edits
+
+
+def depth_outside(position: np.ndarray, region: Region, reach: np.ndarray | float = 0.0) -> np.ndarray:
+    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside.
+
+    From planes, it is the distance of the lower ends of what extends by `reach` (N, P) along their normals.
+    """
+    sphere = np.linalg.norm(position - np.array(region.centre), axis=1) / region.radius - 1
+    below = (reach - region.heights(position)) / region.radius
+    return np.asarray(np.maximum(sphere, below.max(axis=1, initial=-np.inf)))
+
+
+def reach_of(table: dict[str, np.ndarray], region: Region) -> np.ndarray:
+    """Extent (N, P) of surfels along the normals of a region's planes, scene units: REACH deviations."""
+    axes, deviations = primitive_of(table).extent(table)
+    normals = np.array(region.planes).reshape(-1, 4)[:, :3]
+    along = np.einsum("nai,pi->npa", axes, normals) * deviations[:, None]
+    return np.asarray(REACH * np.linalg.norm(along, axis=-1))

@@ -1,0 +1,42 @@
+"""Events of a fit, as methods know them: a table of settings, checked before the fit begins."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, ClassVar, Generic, TypeVar
+
+from mi_refgs.registry import Registry
+
+Fit = TypeVar("Fit")
+
+
+class Event(Generic[Fit]):
+    """What happens to a fit beside its gradient steps; subclasses are frozen dataclasses of their settings.
+
+    `Fit` is `mi_refgs.Trainer`. After each step, the events of a method that are due happen in the order of
+    `fitting.events`. What they change belongs to the fit, which is saved; an event has no state.
+    """
+
+    name: ClassVar[str]  # of its table in a method file, `[event.NAME]`
+    always: ClassVar[bool] = False  # happens, with the settings' defaults, in methods without its table
+    outside: ClassVar[bool] = False  # happens in `Trainer.train` alone, not in the steps of a trial
+
+    def require(self, attributes: Collection[str]) -> None:
+        """Raise InputError if the event cannot happen to surfels with these attributes."""
+
+    def observes(self, fit: Fit) -> bool:
+        """Whether the coming step adds to `ParameterTable.error_sum`, the error that each surfel causes."""
+        return False
+
+    def due(self, fit: Fit) -> bool:
+        """Whether the event happens now, after `fit.iteration` steps; 0 is before the first one."""
+        raise NotImplementedError
+
+    def apply(self, fit: Fit) -> None:
+        """Change the fit."""
+        raise NotImplementedError
+
+
+EVENTS = Registry[type[Event[Any]]]("event", package="mi_refgs.fitting.events")
+register = EVENTS.register
+"""Add an event, for which method files can have a table from then on."""
