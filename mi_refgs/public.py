@@ -16,6 +16,10 @@ from mi_refgs.fitting.train import Trainer as Trainer
 from mi_refgs.formats.format import Format as Format
 from mi_refgs.formats.format import Option as FormatOption
 from mi_refgs.formats.format import register as register_format
+from mi_refgs.methods.event import Event as Event
+from mi_refgs.methods.event import register as register_event
+from mi_refgs.methods.initialiser import Initialiser as Initialiser
+from mi_refgs.methods.initialiser import register as register_initialiser
 from mi_refgs.methods.method import Method as Method
 from mi_refgs.methods.read import load as load_method
 from mi_refgs.occlusion.mesh import Mesh as Mesh

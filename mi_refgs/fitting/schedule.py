@@ -28,7 +28,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.types import Float, TensorXf
 
-GAIN_RATES, POSE_RATES = (1e-3, 1e-4), (1e-3, 1e-4)
+GAIN_RATES, POSE_RATES = (1e-3, 1e-4), (2e-3, 6e-5)
 """Learning rates of log gains and of corrections, radians or half widths, at the start and at the end."""
 POSITION_STEPS = 0.6
 """Fraction of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the

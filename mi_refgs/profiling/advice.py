@@ -33,7 +33,7 @@ def _of_work(found: Profile) -> Iterator[str]:
         yield (
             f"{work.unseen_share:.0%} of the surfels contribute in none of {work.views} views, and are "
             "projected and optimised all the same: start with fewer (--set surfels.count), or prune more "
-            "(refine.prune_weight)."
+            "(event.densify.prune_weight)."
         )
     if work.single_share > MANY:
         yield (
@@ -46,7 +46,7 @@ def _of_work(found: Profile) -> Iterator[str]:
     if work.faint_share > MANY:
         yield (
             f"{low}, and {work.faint_share:.0%} of the surfels have an opacity below {FAINT:g}: prune them "
-            "earlier (--set refine.prune_opacity=0.1)."
+            "earlier (--set event.densify.prune_opacity=0.1)."
         )
     if work.aspect > THIN:
         yield (
@@ -79,7 +79,7 @@ def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[s
         yield (
             f"Stage {stage.name}: listing and sorting take {lists:.1f} ms, more than splatting "
             f"({splat:.1f} ms), for {found.work.pairs / max(found.work.surfels, 1):.0f} tiles per surfel: "
-            "large, faint surfels do that (--set refine.prune_opacity, refine.prune_extent)."
+            "large, faint surfels do that (--set event.densify.prune_opacity, …prune_extent)."
         )
     if of("ssim forward", "loss backward") > HEAVY * whole and method.loss["ssim"].weight:
         yield (

@@ -206,7 +206,7 @@ def profile(trainer: Trainer, names: list[str], steps: int) -> Profile:
 
 def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
     """Measure times, launches and cache misses of steps in one stage of the schedule."""
-    step = stepper(trainer, name)
+    setup, step = trainer.setup, stepper(trainer, name)
     for _ in range(WARM_UP):
         step()
     dr.sync_thread()
@@ -224,6 +224,7 @@ def profile_stage(trainer: Trainer, name: str, steps: int) -> StageProfile:
         dr.sync_thread()
     launches = len(dr.kernel_history([dr.KernelType.JIT]))
     stages = phase_times(step, max(steps // 3, 5))
+    trainer.setup = setup
     return StageProfile(name, 1e3 * float(np.median(times)), launches, misses, stages)
 
 

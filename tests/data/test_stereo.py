@@ -12,9 +12,10 @@ from mi_refgs.data import stereo as sweep
 from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.region import Region
 from mi_refgs.data.stereo import Stereo, stereo
-from mi_refgs.fitting.initial import open_points
+from mi_refgs.fitting.initialisers.along_pixels import along_pixels
 from mi_refgs.fitting.runner import begin
 from mi_refgs.methods import load
+from mi_refgs.methods.initialiser import Wanted
 from mi_refgs.runs.run import Run
 from tests.helpers import read_loaded, with_pixels
 from tests.scenes import photographed as scene
@@ -140,8 +141,10 @@ def test_fit_starts_from_stereo(
     assert np.median(off_surface(trainer.surfels.position().numpy().T)) < 0.2
     # Random points of the background: on rays of the other pixels, outside of the region, behind its centre.
     assert trainer.data.region is not None
-    known = replace(trainer.data, points=None)
-    placed, colour = open_points(300, 1.0, False, known, np.random.default_rng(0))
+    wanted = Wanted(300, trainer.data, np.random.default_rng(0), 1.0, trainer.data.region, inside=False)
+    start = along_pixels(wanted)
+    assert start is not None
+    placed, colour = start.position, start.colour
     assert not trainer.data.region.contains(placed).any() and len(placed) == len(colour) == 300
     nearest = np.min([np.linalg.norm(placed - view.to_world[:3, 3], axis=1) for view in data.views], axis=0)
     assert nearest.min() > 1

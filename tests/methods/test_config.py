@@ -111,11 +111,11 @@ def test_only_declared_fields_are_scaled() -> None:
 def test_every_number_of_iterations_is_declared() -> None:
     """The intervals of checkpoints, previews and logs are of the run, not of its schedule."""
     names = {"start", "rise", "until", "hold", "after", "trial", "iterations"}
-    waiting: list[Any] = [methods.Method]
+    waiting: list[Any] = [methods.Method, *REGISTERED.values()]
     for kind in waiting:
         hints = typing.get_type_hints(kind) if dataclasses.is_dataclass(kind) and kind is not Window else {}
         for field in dataclasses.fields(kind) if hints else ():
-            counts = field.name in names or field.name.endswith(("_start", "_rise", "_until"))
+            counts = field.name in names and "int" in str(hints[field.name])
             assert (ITERATIONS.items() <= field.metadata.items()) == counts, f"{kind.__name__}.{field.name}"
         waiting += [part for hint in hints.values() for part in (hint, *typing.get_args(hint))]
         waiting += [] if hints else typing.get_args(kind)

@@ -59,7 +59,7 @@ def fits() -> Iterator[Any]:
     for name in methods.names():
         method = methods.load(name)
         shadings = [f"{stage.shading.reflectance} at {stage.shading.at}" for _, stage in method.stages()]
-        cases.append({"primitive": method.surfels.primitive, "mesh": method.mesh is not None})
+        cases.append({"primitive": method.surfels.primitive, "mesh": method.has_mesh})
         cases[-1] |= dict.fromkeys(shadings)
     for name, marks in zip(methods.names(), marked(cases), strict=True):
         yield pytest.param(name, marks=marks)

@@ -12,7 +12,6 @@ import pytest
 import trimesh
 
 from mi_refgs.data.region import Region
-from mi_refgs.fitting.train import surface_of
 from mi_refgs.occlusion import tsdf
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.reference import occlusion as ref
@@ -159,26 +158,6 @@ def sheet(normal: np.ndarray, points: np.ndarray, size: float) -> Surfels:
     raw = from_points(points, normals, rng=rng, attributes=["radiance_sh"], opacity=0.99).to_numpy()
     raw["scale"] = np.full_like(raw["scale"], np.log(size))
     return Surfels.from_numpy(raw)
-
-
-def test_surroundings_are_in_the_mesh_where_it_is_unbounded() -> None:
-    """A small sheet in the region above a wide floor, which is there with its surfels and a region."""
-    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)), axis=-1).reshape(-1, 2)
-    up = np.array([0.0, 0.0, 1.0])
-    own = sheet(up, np.column_stack([0.35 * grid + [0.1, -0.1], np.full(len(grid), 0.2)]), 0.03)
-    floor = sheet(up, np.column_stack([5 * grid, np.full(len(grid), -0.6)]), 0.4)
-    eyes = [np.array([x, y, 2.0]) for x, y in ((2, 0), (0, 2), (-2, 0.1), (0.1, -2))]
-    cameras = [camera(look_at(eye, np.zeros(3))) for eye in eyes]
-    with dr.suspend_grad():
-        both = surface_of(own, cameras, 64, floor, REGION)
-        alone = surface_of(own, cameras, 64)
-    assert np.abs(alone.vertices[:, :2]).max() < 1
-    far = np.linalg.norm(both.vertices[:, :2], axis=1) > 2.5
-    assert far.sum() > 100
-    top = both.vertices[far & (both.vertices[:, 2] > -0.75)]
-    assert len(top) > 50 and np.abs(top[:, 2] + 0.6).mean() < 3 * both.voxel
-    on_sheet = np.abs(both.vertices - [0.1, -0.1, 0.2]).max(axis=1) < 0.3
-    assert np.abs(both.vertices[on_sheet][:, 2] - 0.2).min() < both.voxel
 
 
 def test_relighting_keeps_what_is_around_out_of_the_mesh() -> None:

@@ -321,7 +321,7 @@ def test_work_is_counted_over_views(trainer: Trainer) -> None:
 def test_work_includes_the_background(method: Path, tmp_path: Path) -> None:
     """Its surfels cost what those of the object do."""
     open_method = tmp_path / "open.toml"
-    open_method.write_text(method.read_text() + "[surroundings]\nheight = 8\n")
+    open_method.write_text(method.read_text() + "[surroundings]\n")
     trainer = new_trainer(write_open_data(tmp_path / "data"), open_method, "surroundings.count=60")
     both = count_work(trainer)
     assert both.surfels == 140

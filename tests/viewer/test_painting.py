@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mi_refgs.fitting.control import depth_outside
 
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.region import Region, read_region
+from mi_refgs.fitting.exchange import depth_outside
 from mi_refgs.io.ownership import RUN, OutputFolder
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.viewer.page import Page

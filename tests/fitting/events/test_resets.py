@@ -1,0 +1,51 @@
+"""Resets of opacity and restarts of materials: what changes, and what must not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refgs.fitting.events.reset_opacity import OPACITY
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.surfels.attributes import sigmoid
+from tests.scenes.highlight import ball, small_method, step_to
+
+
+@pytest.fixture
+def trainer(tmp_path: Path) -> Trainer:
+    """After three steps, of which the last lets the light learn."""
+    return step_to(Trainer(small_method(tmp_path), ball()), 3)
+
+
+def changed(trainer: Trainer, event: str, iteration: int) -> tuple[set[str], dict[str, np.ndarray]]:
+    """The parameters that an event changes after an iteration, and the activated ones of the object."""
+    before = {name: tensor.numpy().copy() for name, tensor in trainer.fit.params.items()}
+    trainer.fit.iteration = iteration
+    (one,) = (x for x in trainer.setup.events if x.name == event)
+    assert one.due(trainer)
+    one.apply(trainer)
+    after = {name: tensor.numpy() for name, tensor in trainer.fit.params.items()}
+    moved = {name for name in before if not np.array_equal(before[name], after[name])}
+    return moved, {name: sigmoid(x) for name, x in after.items()}
+
+
+def test_reset_lowers_opacity_and_lifts_metallic_only(trainer: Trainer) -> None:
+    raw = trainer.surfels.to_numpy()
+    raw["metallic"][:40] = -5
+    trainer.fit.tables[0].replace(type(trainer.surfels).from_numpy(raw))
+    moved, found = changed(trainer, "reset_opacity", 14)
+    assert moved == {"opacity", "metallic"}
+    np.testing.assert_allclose(found["opacity"], OPACITY, rtol=1e-5)
+    assert found["metallic"].min() == pytest.approx(0.3) and found["metallic"][:40].max() < 0.31
+    assert not trainer.state()["optimiser/opacity/first"].any()
+
+
+def test_restart_of_materials_leaves_geometry(trainer: Trainer) -> None:
+    """After the last iteration of the stage before."""
+    moved, found = changed(trainer, "restart", 8)
+    assert moved == {"albedo", "metallic", "roughness", "light"}
+    np.testing.assert_allclose(found["metallic"], 0.3, rtol=1e-5)
+    np.testing.assert_allclose(found["roughness"], 0.3, rtol=1e-5)
+    assert np.abs(found["albedo"] - 0.5).max() <= 0.025 + 1e-6
