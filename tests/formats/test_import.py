@@ -111,7 +111,7 @@ def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Pat
     run = tmp_path / "run"
     assert main(["import", str(theirs), "-o", str(run)]) == 0
     command = ["export", run, "--to", "mitsuba", "-o", tmp_path / "out"]
-    refused(command, f"{run}: albedo, metallic, roughness: the run has none; fit one")
+    refused(command, f"{run}: reflectance: displayed shows the light of the fit only; fit one")
 
 
 def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path) -> None:
