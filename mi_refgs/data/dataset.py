@@ -261,11 +261,8 @@ def read_dataset(
 
     # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored, but not that of masks.
     if _opaque(views) and (split == "train" or _opaque(training)):
-        own = sum(map(_own_alpha, views))
-        which = (
-            "images have alpha, but" if own == len(views) else f"{own} of {len(views)} images have alpha, but"
-        )
-        notes = (*notes, f"{which} no pixel is transparent: alpha is ignored")
+        which = f"{sum(map(_own_alpha, views))} of {len(views)} images have alpha"
+        notes = (*notes, f"{which}, but no pixel is transparent: alpha is ignored")
         ignored = (replace(v, pixels=v.pixels.without_alpha()) if _own_alpha(v) else v for v in views)
         views = tuple(ignored)
     without = [view.name for view in views if not view.has_alpha]
