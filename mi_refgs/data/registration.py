@@ -24,55 +24,43 @@ ENOUGH = 1e-3  # relative decrease of the squared error below which a size is fi
 Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a view's camera
 
 
-def registered(view: View, render: Render, distance: float, where: np.ndarray | None = None) -> View:
+def registered(view: View, render: Render, distance: float) -> View:
     """The view with the pose whose render differs least from its image.
 
-    `distance`: of what the camera looks at, scene units. `where` (H, W) bool: pixels that count, by default
-    all; averaged images are as small as it has whole blocks. The pose stays if no other is better.
+    `distance`: of what the camera looks at, scene units. The pose stays if no other is better.
     """
     view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
-    pixels = np.ones((view.height, view.width), bool) if where is None else where
-    size = min(view.width, view.height)
-    while size // (2 * blocks[0]) >= COARSEST and _whole(pixels, 2 * blocks[0]).any():
+    while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
         blocks.insert(0, 2 * blocks[0])
     found = view
     for block in blocks:
-        found = _fitted(found, render, distance, pixels, block)
-    errors = [np.mean(_difference(one, render, pixels, 1) ** 2) for one in (view, found)]
+        found = _fitted(found, render, distance, block)
+    errors = [np.mean(_difference(one, render, 1) ** 2) for one in (view, found)]
     return found if errors[1] < errors[0] else view
 
 
-def _difference(view: View, render: Render, where: np.ndarray, block: int) -> np.ndarray:
-    """Render minus image of the pixels that count, both averaged over block × block pixels as displayed.
+def _difference(view: View, render: Render, block: int) -> np.ndarray:
+    """Render minus image, both averaged over block × block pixels as displayed, flat.
 
     Renders are averaged, too: a smaller render would show other details, and fit best at another pose.
     """
     shown, truth = (box_downscale(np.clip(image, 0, 1), block) for image in (render(view), view.displayed))
-    return np.asarray((shown - truth)[_whole(where, block)], np.float64).ravel()
+    return np.asarray(shown - truth, np.float64).ravel()
 
 
-def _whole(where: np.ndarray, block: int) -> np.ndarray:
-    """Whether all pixels of block × block pixels count."""
-    return np.asarray(box_downscale(where[..., None].astype(np.float32), block)[..., 0] == 1)
-
-
-def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> View:
+def _fitted(view: View, render: Render, distance: float, block: int) -> View:
     """The view with its pose fitted to the image averaged over block × block pixels."""
     unit = np.repeat([1.0, distance], 3) * block / view.fx  # moves what the camera looks at by such a pixel
-
-    def difference(moved: View) -> np.ndarray:
-        return _difference(moved, render, where, block)
-
     # Derivatives are those of the first pose: taken anew after every change, they cost most of the time.
-    now = difference(view)
-    shifts = [difference(_moved(view, STEP * unit * axis)) - now for axis in np.eye(6)]
+    now = _difference(view, render, block)
+    shifts = [_difference(_moved(view, STEP * unit * axis), render, block) - now for axis in np.eye(6)]
     slope = np.stack(shifts, axis=1) / STEP
     normal = slope.T @ slope
     normal += DAMPING * np.diag(np.diag(normal))
     for _ in range(ROUNDS):
         change, *_ = np.linalg.lstsq(normal, -slope.T @ now, rcond=None)
         candidate = _moved(view, unit * change)
-        after = difference(candidate)
+        after = _difference(candidate, render, block)
         before, now_squared = float(now @ now), float(after @ after)
         if not now_squared < before:
             break
