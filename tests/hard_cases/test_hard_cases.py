@@ -30,7 +30,11 @@ ILL_CONDITIONED = {
 """What may miss the limits, and then only by what one unit in the last place of the inputs explains."""
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case",
+    [*CASES[::2], *(pytest.param(case, marks=pytest.mark.slow) for case in CASES[1::2])],
+    ids=lambda case: case.name,
+)
 def test_case(case: Case) -> None:
     row = measure(case, floors=False)
     assert row.verdict == "within limits" or case.name in ILL_CONDITIONED, row
