@@ -11,8 +11,9 @@ from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.methods.initialiser import INITIALISERS, Start, Wanted
-from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, LightOptions, Method
+from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.learnt import Learnt
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels import init
 from mi_refgs.surfels.attributes import attribute
@@ -34,8 +35,9 @@ def initial_parameters(
         params |= initial_surroundings(method, data, rng)
     if method.light is None:
         return params
-    light = seen_around(data, method.light.height) if open_scene else first_light(method.light)
-    return params | {LIGHT: light.raw}
+    if open_scene and isinstance(method.light, Learnt):
+        return params | {LIGHT: seen_around(data, method.light.height).raw}
+    return params | {LIGHT: method.light.start()}
 
 
 def started(names: Sequence[str], wanted: Wanted) -> Start:
@@ -66,11 +68,6 @@ def converted(
         for name, width in widths.items()
     }
     return {name: values.astype(np.float32) for name, values in made.items()}
-
-
-def first_light(options: LightOptions) -> EnvironmentLight:
-    """The initial environment: constant radiance."""
-    return EnvironmentLight.constant(options.radiance, options.height)
 
 
 def seen_around(data: Dataset, height: int) -> EnvironmentLight:

@@ -22,7 +22,8 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.methods.event import EVENTS, Event
 from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, POSE, Method
 from mi_refgs.runs.checkpoint import PARAMS, part
-from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
+from mi_refgs.shade.light.envmap import PrefilteredLight
+from mi_refgs.shade.light.kind import LightOfFit
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
@@ -124,8 +125,8 @@ class FitSetup:
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = Group(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None:
-            texels = rates.light, rates.light * rates.decay, iterations
-            groups[LIGHT] = Group(*texels, relative=rates.light_relative)
+            rate = rates.light if self.method.light.learnt else 0.0
+            groups[LIGHT] = Group(rate, rate * rates.decay, iterations, relative=rates.light_relative)
         for name, (rate, final) in {GAIN: GAIN_RATES, POSE: POSE_RATES}.items():
             if name in params:
                 groups[name] = Group(rate, final, iterations)
@@ -155,7 +156,8 @@ class FitSetup:
             background = replace(surfels, primitive=around.primitive, degree={"radiance_sh": around.degree})
             found |= {AROUND + name: (background.columns(name),) for name in around.names}
             found[BACKGROUND] = (2 * around.height, 3)
-        return found if self.method.light is None else found | {LIGHT: (2 * self.method.light.height, 3)}
+        light = self.method.light
+        return found if light is None else found | {LIGHT: tuple(light.start().shape[1:])}
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
         """Raise InputError if the method or the kind of images has changed since the state was written.
@@ -201,7 +203,7 @@ class SharedPrefilter:
         self._light: PrefilteredLight | None = None  # attached to the environment
         self._leaf: Float = None  # its levels, which accumulate the gradients of the steps
 
-    def light(self, environment: EnvironmentLight | None, shading: Shading) -> Light | None:
+    def light(self, environment: LightOfFit | None, shading: Shading) -> Light | None:
         """The light of a step, under AD; a light that is not filtered stays attached to its environment."""
         if self._light is not None and shading.model.light == "filtered":
             return replace(self._light, levels=self._leaf)
@@ -229,7 +231,7 @@ class SharedPrefilter:
         return {} if self._leaf is None else {GATHERED: np.array(dr.grad(self._leaf), dtype=np.float32)}
 
     def restore(
-        self, environment: EnvironmentLight | None, shading: Shading, state: Mapping[str, np.ndarray]
+        self, environment: LightOfFit | None, shading: Shading, state: Mapping[str, np.ndarray]
     ) -> None:
         """Continue from a checkpoint; a gradient of other levels, as in a trial, is left out."""
         self.clear()

@@ -44,7 +44,7 @@ from mi_refgs.runs.checkpoint import (
     tensors,
 )
 from mi_refgs.shade.ambient import update_occluder_caches
-from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.kind import LightKind, LightOfFit
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.init import morton_order
@@ -137,6 +137,7 @@ class FitState:
     decisions: list[dict[str, Any]] = field(default_factory=list)  # about components of the method
     region: Region | None = None  # of interest, once it has followed the object
     photographed: PhotographedLight | None = None  # the background as the object's light
+    light_kind: LightKind | None = None  # of the method
 
     @staticmethod
     def start(setup: FitSetup) -> FitState:
@@ -155,7 +156,7 @@ class FitState:
         if setup.open_scene and method.surroundings is not None:
             limits[""], limits[AROUND] = method.surroundings.limits(limits[""])
         tables = [ParameterTable(params, optimiser, prefix, most) for prefix, most in limits.items()]
-        return FitState(params, optimiser, tables)
+        return FitState(params, optimiser, tables, light_kind=method.light)
 
     def add(self, setup: FitSetup, name: str, tensor: TensorXf) -> None:
         """Add a parameter without history, or replace the one of this name."""
@@ -191,9 +192,9 @@ class FitState:
         return surroundings_of(self.params)
 
     @property
-    def light(self) -> EnvironmentLight | None:
-        """The environment map, also attached."""
-        return light_of(self.params)
+    def light(self) -> LightOfFit | None:
+        """The light, also attached."""
+        return light_of(self.light_kind, self.params)
 
     @property
     def near(self) -> NearField | None:

@@ -1,7 +1,7 @@
 """Methods as data: the TOML files of `variants/`, read strictly and scaled to a preset."""
 
 from mi_refgs.methods.build import plain
-from mi_refgs.methods.method import LightOptions, LossWeight, Method, Stage, SurfelOptions
+from mi_refgs.methods.method import LossWeight, Method, Stage, SurfelOptions
 from mi_refgs.methods.read import (
     PRESETS,
     assignments,
@@ -17,7 +17,6 @@ from mi_refgs.methods.window import Window
 
 __all__ = [
     "PRESETS",
-    "LightOptions",
     "LossWeight",
     "Method",
     "Stage",

@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Literal
 
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.errors import InputError
-from mi_refgs.methods.build import FLAT, by_name
+from mi_refgs.methods.build import FLAT, by_kind, by_name
 from mi_refgs.methods.event import EVENTS, Event
 from mi_refgs.methods.initialiser import INITIALISERS
-from mi_refgs.methods.ranges import allowed, at_least, between, more_than
+from mi_refgs.methods.ranges import at_least, between, more_than
 from mi_refgs.methods.window import ITERATIONS, Window
-from mi_refgs.shade.light.envmap import MIN_HEIGHT, is_height
+from mi_refgs.shade.light.kind import LIGHTS, LightKind
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, attribute
@@ -125,17 +125,6 @@ class SurroundingsOptions:
     def names(self) -> tuple[str, ...]:
         """All attributes of background Gaussians."""
         return (*PRIMITIVES.find(self.primitive, "primitive").widths, "radiance_sh")
-
-
-@dataclass(frozen=True)
-class LightOptions:
-    """The learnable lat-long environment map; without this table there is no light."""
-
-    # Texels; width is twice that.
-    height: int = field(default=64, metadata=allowed(is_height, f"a multiple of 4 from {MIN_HEIGHT}"))
-    radiance: float = 0.5  # initial, everywhere
-    # Iterations that share one prefiltered light, which then receives all their gradients.
-    every: int = field(default=1, metadata=at_least(1))
 
 
 @dataclass(frozen=True)
@@ -259,7 +248,7 @@ class Method:
     stage: dict[str, Stage]  # by name
     about: About = About()
     surfels: SurfelOptions = SurfelOptions()
-    light: LightOptions | None = None  # absent: no environment map
+    light: LightKind | None = field(default=None, metadata=by_kind(LIGHTS, "learnt"))  # absent: no light
     surroundings: SurroundingsOptions | None = None  # absent: the object is everything
     # What happens beside gradient steps (`fitting.events`), by name.
     event: dict[str, Event[Any]] = field(default_factory=dict, metadata=by_name(EVENTS))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from mi_refgs.methods.method import Method
 from mi_refgs.profiling.profile import FAINT, Profile, StageProfile
+from mi_refgs.shade.light.learnt import Learnt
 
 # Limits beyond which there is advice.
 LOW_SHARE = 0.25  # contributing part of the evaluations
@@ -69,7 +70,7 @@ def _of_stage(stage: StageProfile, found: Profile, method: Method) -> Iterator[s
         return sum(ms.get(name, 0.0) for name in names)
 
     light, splat = of("prefilter forward", "prefilter backward"), of("splat forward", "splat backward")
-    if light > splat and method.light is not None and method.light.height > SMALLEST_LIGHT:
+    if light > splat and isinstance(method.light, Learnt) and method.light.height > SMALLEST_LIGHT:
         yield (
             f"Stage {stage.name}: filtering the light takes {light:.1f} ms, more than splatting "
             f"({splat:.1f} ms): halve its rows (--set light.height={method.light.height // 2})."

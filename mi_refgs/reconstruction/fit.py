@@ -90,7 +90,8 @@ class Previews(Progress):
             return
         view = trainer.data.views[0].load()
         rendered = RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
-        light = None if trainer.light is None else light_panels(trainer.light.radiance().numpy())
+        map_ = None if trainer.light is None else trainer.light.environment()
+        light = None if map_ is None else light_panels(map_.radiance().numpy())
         image = contact_sheet([panels(rendered, view)], light)
         write_png(trainer.run.output.own(f"previews/{iteration:07d}.png"), image)
 

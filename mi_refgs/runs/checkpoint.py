@@ -20,6 +20,7 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.kind import LightKind, LightOfFit
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
@@ -32,9 +33,9 @@ def channels_of(params: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return {name: x for name, x in params.items() if name not in APART and not name.startswith(AROUND)}
 
 
-def light_of(params: Mapping[str, Any]) -> EnvironmentLight | None:
-    """The environment that the object reflects, if there is one; raises InputError for a wrong shape."""
-    return EnvironmentLight(params[LIGHT]) if LIGHT in params else None
+def light_of(kind: LightKind | None, params: Mapping[str, Any]) -> LightOfFit | None:
+    """The light that the object reflects, if there is one; raises InputError for a wrong shape."""
+    return None if kind is None or LIGHT not in params else kind.of(params[LIGHT])
 
 
 def surroundings_of(params: Mapping[str, Any]) -> Surroundings | None:
@@ -124,7 +125,6 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     try:
         table = Surfels(channels_of(params))
         geometry = table.primitive.widths
-        light_of(params)
         around = surroundings_of(params)
         if around is not None:
             around.check(table)
@@ -144,7 +144,7 @@ def check(state: Mapping[str, np.ndarray]) -> None:
     if part(state, PHOTOGRAPHED):
         if LIGHT not in params:
             raise DamagedError(f"{PHOTOGRAPHED}weight: there is no light")
-        height = len(params[LIGHT])
+        height = len(state.get(f"{PHOTOGRAPHED}radiance", ()))
         _check(state, [f"{PHOTOGRAPHED}centre"], (3,), signed=True)
         _check(state, [f"{PHOTOGRAPHED}radiance"], (height, 2 * height, 3))
         _check(state, [f"{PHOTOGRAPHED}{name}" for name in ("nearness", "weight")], (height, 2 * height))

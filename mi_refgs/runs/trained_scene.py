@@ -61,9 +61,10 @@ class TrainedScene:
         if len(state.get("mesh/faces", ())):
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
         _, stage = method.stage_at(max(iteration, 1))
+        light = light_of(method.light, params)
         return TrainedScene(
             Surfels(channels_of(params)),
-            light_of(params),
+            None if light is None else light.environment(),
             mesh,
             Shading.resolve(stage.shading, mesh is not None).antialiased(),
             iteration,

@@ -12,8 +12,9 @@ import pytest
 from mi_refgs import fitting
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.fitting.schedule import FitSetup
-from mi_refgs.methods.method import DataOptions, LightOptions, Method, Stage, SurfelOptions
+from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
 from mi_refgs.methods.window import Window
+from mi_refgs.shade.light.learnt import Learnt
 from tests.scenes.highlight import ball
 
 DATA = ball(size=4, views=7)
@@ -50,7 +51,7 @@ def test_every_operation_of_an_iteration_draws_on_its_own() -> None:
     package = Path(fitting.__file__).parent
     calls = [
         call.args[1]
-        for path in package.glob("*.py")
+        for path in package.rglob("*.py")
         for call in ast.walk(ast.parse(path.read_text()))
         if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr == "rng"
     ]
@@ -90,6 +91,6 @@ def test_the_degree_rises_with_its_window(iteration: int, degree: int) -> None:
 
 def test_the_light_learns_every_so_often_and_where_a_stage_ends() -> None:
     stages = {"a": Stage(until=10), "b": Stage(until=20)}
-    method = Method(iterations=20, stage=stages, light=LightOptions(every=4))
+    method = Method(iterations=20, stage=stages, light=Learnt(every=4))
     assert [i for i in range(1, 21) if FitSetup(method, DATA).light_learns(i)] == [4, 8, 10, 12, 16, 20]
     assert not any(schedule().light_learns(i) for i in range(20))

@@ -20,7 +20,7 @@ from mi_refgs.cli import main
 from mi_refgs.data import dataset as data_module
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import timing
-from mi_refgs.methods.method import LightOptions, Method
+from mi_refgs.methods.method import Method
 from mi_refgs.profiling import phases
 from mi_refgs.profiling.advice import advice
 from mi_refgs.profiling.profile import (
@@ -35,6 +35,7 @@ from mi_refgs.profiling.profile import (
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import PrefilteredLight
+from mi_refgs.shade.light.learnt import Learnt
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera, Composited, Footprints
 from tests.helpers import refused
@@ -338,7 +339,7 @@ def quiet_profile() -> Profile:
 
 
 def a_method() -> Method:
-    return replace(methods.load("base_2dgs", "quick"), light=LightOptions(height=64))
+    return replace(methods.load("base_2dgs", "quick"), light=Learnt(height=64))
 
 
 @pytest.mark.parametrize(

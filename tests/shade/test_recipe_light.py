@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -11,10 +12,18 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import mi_refgs
+from mi_refgs.cli import main
+from mi_refgs.errors import InputError
+from mi_refgs.io.exr import write_exr
 from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light import LIGHTS, FittedLight, LightKind
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import safe_normalize
 from tests.helpers import unit, vector
+from tests.scenes.tiny import train_command, write_data
 
 SHARPNESS = 40.0  # of the sun: radiance falls as exp(SHARPNESS (cosine - 1))
 
@@ -63,6 +72,19 @@ class Sun(LightKind):
         return FittedSun(raw)
 
 
+METHOD = """
+iterations = 2000
+[surfels]
+attributes = ["albedo", "metallic", "roughness"]
+[light]
+kind = "sun"
+elevation = 60
+[stage.only]
+until = 2000
+diffuse = "irradiance"
+"""
+
+
 @pytest.fixture(autouse=True)
 def sun() -> Iterator[None]:
     LIGHTS.register(Sun)
@@ -76,3 +98,48 @@ def test_the_map_that_a_run_saves_is_the_light(rng: np.random.Generator) -> None
     found, expected = (x.radiance(d).numpy() for x in (light.environment().prefilter(), light.prefilter()))
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
     assert not light.unusable() and Sun().of(mi.TensorXf(np.full((2, 3), np.nan, np.float32))).unusable() == 6
+
+
+def method(folder: Path, text: str) -> Path:
+    (folder / "own.toml").write_text(text)
+    return folder / "own.toml"
+
+
+def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
+    """Learnt, saved as a map that scene.xml reads, made again from a checkpoint; and relit."""
+    data, own = write_data(tmp_path / "data"), method(tmp_path, METHOD)
+    assert main(train_command(data, tmp_path / "run", own)) == 0
+    run: Any = mi_refgs.load(tmp_path / "run")
+    saved = run.trained.light.radiance().numpy()
+    before = Sun(elevation=60).of(Sun(elevation=60).start()).environment().radiance().numpy()
+    assert saved.shape == before.shape and 1e-4 < np.abs(saved - before).max()
+    rendered = mi.render(mi.load_file(str(tmp_path / "run" / "scene.xml")), spp=1).numpy()
+    assert np.isfinite(rendered).all() and rendered.max() > 0.1
+    state = Run(tmp_path / "run").load_checkpoint()
+    assert state is not None
+    again: Any = TrainedScene.from_state(run.method, state).light
+    np.testing.assert_allclose(again.radiance().numpy(), saved, rtol=1e-5)
+    relit = run.relight(EnvironmentLight.constant(0.5, 8))
+    assert np.isfinite(np.asarray(relit.render(0))).all()
+
+
+def lit(folder: Path, light: str) -> Any:
+    """Radiance of the light of a short fit with this table."""
+    text = METHOD.replace('kind = "sun"\nelevation = 60', light)
+    assert main(train_command(write_data(folder / "data"), folder / "run", method(folder, text))) == 0
+    run: Any = mi_refgs.load(folder / "run")
+    return run.trained.light.radiance().numpy()
+
+
+def test_a_constant_light_learns_one_colour(tmp_path: Path) -> None:
+    found = lit(tmp_path, 'kind = "constant"\nradiance = 0.7')
+    np.testing.assert_allclose(found, np.broadcast_to(found[0, 0], found.shape), rtol=1e-5)
+    assert 1e-4 < np.abs(found - 0.7).max() < 0.3
+
+
+def test_a_known_light_stays_what_it_is(tmp_path: Path, rng: np.random.Generator) -> None:
+    sky = rng.uniform(0.2, 1, (8, 16, 3)).astype(np.float32)
+    write_exr(tmp_path / "sky.exr", sky)
+    np.testing.assert_allclose(lit(tmp_path, f'kind = "file"\nfile = "{tmp_path}/sky.exr"'), sky, rtol=1e-5)
+    with pytest.raises(InputError, match=r"light\.file"):
+        LIGHTS["file"]().start()

@@ -26,14 +26,14 @@ class PhotographLight(Event[Trainer]):
 
     def apply(self, trainer: Trainer) -> None:
         trainer.check()
-        light, around, region = trainer.method.light, trainer.surroundings, trainer.region
+        light, around, region = trainer.light, trainer.surroundings, trainer.region
         assert light is not None and around is not None and region is not None
         views = trainer.data.views
         posed = [
             replace(views[i], to_world=trainer.camera(i).pose()) for i in evenly_spread(len(views), FEW_VIEWS)
         ]
         trainer.fit.photographed = PhotographedLight.of(
-            trainer.surfels.detach(), around, region, posed, light.height
+            trainer.surfels.detach(), around, region, posed, light.environment().height
         )
 
 

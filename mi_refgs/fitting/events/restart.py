@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mi_refgs.fitting.initial import first_light
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import Event, register
 from mi_refgs.methods.method import LIGHT
@@ -35,7 +34,7 @@ class Restart(Event[Trainer]):
             raw[name] = attribute(name).start(count, width, rng, method.surfels.first(name))
         fit.tables[0].replace(Surfels.from_numpy(raw), cleared=names)
         if LIGHT in stage.restart and method.light is not None:
-            fit.params[LIGHT] = first_light(method.light).raw
+            fit.params[LIGHT] = method.light.start()
             fit.optimiser.reset(LIGHT)
 
 

@@ -38,11 +38,15 @@ class FittedLight:
         """The map that a run saves, which every application shows, edits and exports."""
         directions = map_directions(DEFAULT_HEIGHT)
         light = self.prefilter().radiance(mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)))
-        return EnvironmentLight.from_radiance(light.numpy().T.reshape(directions.shape))
+        radiance = np.broadcast_to(light.numpy(), (3, directions.size // 3))  # a constant has width 1
+        return EnvironmentLight.from_radiance(radiance.T.reshape(directions.shape))
 
     def unusable(self) -> int:
         """Number of raw values that are not < RAW_LIMIT; waits for the device."""
         return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
+
+
+LightOfFit = FittedLight | EnvironmentLight
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class LightKind:
         """Raw values that a fit begins with; raises InputError if a setting cannot be used."""
         raise NotImplementedError
 
-    def of(self, raw: TensorXf) -> FittedLight | EnvironmentLight:
+    def of(self, raw: TensorXf) -> LightOfFit:
         """The light of raw values, under AD."""
         raise NotImplementedError
 
