@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result
-from mi_refgs.cli.render import scene_file
-from mi_refgs.errors import InputError
+from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result, RunFolder
 from mi_refgs.progress import say
 
 HOST = "127.0.0.1"
@@ -26,8 +23,7 @@ class View:
       refgs view runs/glossy --port 8080
     """
 
-    scene: Annotated[Positional[Path], arg(metavar="RUN|SCENE.xml")]
-    """run folder, or Mitsuba scene"""
+    run_folder: RunFolder
     output: OptionalOutput = None
     """folder of saved views (default: RUN/views)"""
     port: Port = PORT
@@ -38,20 +34,12 @@ class View:
 
     def run(self) -> Result:
         """Serve the page until it is interrupted."""
-        from mi_refgs.render.load_scene import load_scene
         from mi_refgs.runs.run import Run
-        from mi_refgs.viewer.page import require_free, require_viser
-        from mi_refgs.viewer.serve import serve_run, serve_scene
+        from mi_refgs.viewer.page import require_viser
+        from mi_refgs.viewer.serve import serve
 
         require_viser()
-        require_free(self.host, self.port)
-        if self.scene.is_dir():
-            page = serve_run(Run(self.scene), (self.host, self.port), self.output, self.data, say)
-        elif self.data is not None:
-            raise InputError(f"--data: {self.data}: a scene has no data set; give the run, or drop --data")
-        else:
-            loaded = load_scene(scene_file(self.scene), [])
-            page = serve_scene(loaded, self.scene, (self.host, self.port), self.output, say)
+        page = serve(Run(self.run_folder), (self.host, self.port), self.output, self.data, say)
         say(f"open {page.url} in a browser; Ctrl-C ends it")
         try:
             page.loop.run()

@@ -1,7 +1,6 @@
-"""The render thread: coarse frames during motion, refined at rest.
+"""The render thread: coarse frames during motion, refined at rest by one sample per pixel after another.
 
-An image is drawn in steps of one sample per pixel. A change is noticed between two steps, and the image that
-it outdates is dropped. Callbacks of the page run on other threads: they only queue tasks here.
+Callbacks of the page run on other threads: they only queue tasks here.
 """
 
 from __future__ import annotations
@@ -19,18 +18,15 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
+from mi_refgs.io.images import to_8_bits
 from mi_refgs.types import Float
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
-from mi_refgs.viewer.tonemap import DisplayOptions, displayed_planes, to_bytes
-from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
+from mi_refgs.viewer.viewer_scene import DisplayOptions, ViewerScene, displayed_planes
 
 FAR = 160.0
 """Depth where nothing is seen, scene units, and the largest: viser packs depth into 24 bits of 1e-5."""
-
-Comparison = Callable[[ViewerScene, DisplayOptions, tuple[int, int]], np.ndarray]
-"""Renders what a page displays instead, (H, W, 3) uint8, for a window's width and height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +37,6 @@ class DeliveredImage:
     progress: int  # from resolution.COARSE to resolution.DONE
     seconds: float  # of its last sample
     depth: np.ndarray | None = None  # (H, W) float32, if overlays require it
-    samples: int = 1  # per pixel
 
 
 @dataclass(eq=False)
@@ -51,7 +46,6 @@ class Client:
     deliver: Callable[[DeliveredImage], None]
     pose: Pose | None = None
     window: tuple[int, int] = (0, 0)  # pixels
-    comparison: Comparison | None = None  # replaces its image
     side: int = resolution.COARSEST  # resolution level of the next image during motion
     changed: float = -math.inf  # time of the last change of its view or of the scene
     version: int = 0  # counts these changes
@@ -171,8 +165,9 @@ class RenderLoop:
             self.report(str(error))
         except Exception as error:
             traceback.print_exc()
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-            self.report(f"{reason}; the image stays as it was, and the terminal shows where this failed")
+            self.report(
+                f"{type(error).__name__}: the image stays as it was; the terminal shows where it failed"
+            )
         else:
             return True
         return False
@@ -180,60 +175,42 @@ class RenderLoop:
     def _advance(self, client: Client) -> None:
         """Draw a client's next sample and deliver the image, unless it is outdated by then."""
         with self._wake:
-            version, before, comparison = client.version, client.progress, client.comparison
-            sums, pose, window, look = client.sums, client.pose, client.window, self.look
+            version, before, sums = client.version, client.progress, client.sums
+            pose, window, look = client.pose, client.window, self.look
         assert pose is not None
         begin = self.clock()
-        image, depth, progress, still, side = None, None, DONE, 0, 0
-        if comparison is not None:
-            image = comparison(self.scene, look, window)
-        else:
-            # Resolution level, and progress after this sample.
-            still = resolution.still_side(*window, look.largest)
-            side = (look.fixed or min(client.side, still)) if before == NOTHING else still
-            progress = before + 1 if before >= LARGE else LARGE if side >= still else COARSE
 
-            # One sample per pixel, added to those before.
-            index = max(progress - LARGE - 1, 0)
-            aspect = window[0] / max(window[1], 1)
-            exact = max(window[0], 1) / max(window[1], 1)
-            shape = exact if self.scene.square_pixels else resolution.shape_of(*window)
-            request = SampleRequest(
-                replace(pose, aspect=aspect),
-                *resolution.size_of(side, shape),
-                look,
-                resolution.offsets()[index] if progress > LARGE else (0.0, 0.0),
-                index,
-                settled=progress >= LARGE,
-            )
-            drawn = self.scene.draw(request)
-            sums = added(sums, drawn.planes)
+        # Resolution level, and progress after this sample.
+        still = resolution.still_side(*window, look.largest)
+        side = min(client.side, still) if before == NOTHING else still
+        progress = before + 1 if before >= LARGE else LARGE if side >= still else COARSE
 
-            # The mean as an image, if it is to be sent.
-            if progress <= LARGE or progress in SHOWN_AT:
-                share = dr.opaque(type(sums[0]), 1 / (index + 1))
-                mean = [plane * share for plane in sums] if index else sums
-                image = to_bytes(displayed_planes(mean, look), request.width, request.height)
-                if look.overlays and drawn.depth is not None:
-                    far = dr.select(drawn.depth > 0, drawn.depth, FAR)
-                    depth = np.array(image_array(far, request.height, request.width))
-            dr.sync_thread()
+        # One sample per pixel, added to those before.
+        width, height = resolution.size_of(side, resolution.shape_of(*window))
+        offset = resolution.offset_of(progress - LARGE) if progress >= LARGE else (0.0, 0.0)
+        camera = pose.camera(width, height, offset)
+        planes, distance = self.scene.draw(camera, look, progress >= LARGE)
+        sums = [a + b for a, b in zip(sums, planes, strict=True)] if sums else planes
+        dr.eval(sums)
+
+        # The mean as an image, if it is to be sent.
+        shown = None
+        if progress in SHOWN_AT:
+            share = dr.opaque(type(sums[0]), 1 / max(progress - COARSE, 1))
+            mean = [plane * share for plane in sums]
+            shown = image_array(displayed_planes(mean, look, self.scene.depths(pose)), height, width)
+        depth = None
+        if shown is not None and look.overlays and distance is not None:
+            depth = np.array(image_array(dr.select(distance > 0, distance, FAR), height, width))
+        dr.sync_thread()
         taken = self.clock() - begin
         with self._wake:
-            if comparison is None and before == NOTHING and look.fixed is None:
+            if before == NOTHING:
                 client.side = resolution.moving_side(side, taken, still)
             if client.version == version:
-                client.progress, client.sums = progress, sums if LARGE < progress < DONE else []
+                client.progress, client.sums = progress, sums if LARGE <= progress < DONE else []
             elif before != NOTHING:  # a coarse image is delivered: else nothing would be during motion
                 return
-        if image is not None:
+        if shown is not None:
             self.delivered += 1
-            samples = 1 if comparison is not None else max(progress - LARGE, 1)
-            client.deliver(DeliveredImage(image, progress, taken, depth, samples))
-
-
-def added(sums: list[Float], planes: list[Float]) -> list[Float]:
-    """Return sums of planes, evaluated."""
-    total = [a + b for a, b in zip(sums, planes, strict=True)] if sums else list(planes)
-    dr.eval(total)
-    return total
+            client.deliver(DeliveredImage(to_8_bits(shown), progress, taken, depth))

@@ -39,27 +39,22 @@ def require_viser() -> Any:
     try:
         import viser
     except ImportError:
-        raise InputError('view: viser is not installed; pip install "mi_refgs[view]"') from None
+        raise InputError("viser is not installed", "view", remedy='pip install "mi_refgs[view]"') from None
     return viser
 
 
 def require_free(host: str, port: int) -> None:
     """Raise InputError unless a server can listen there: viser would silently take another port."""
-    if not 0 <= port <= 65535:
-        raise InputError(f"--port: {port} is out of range; give 1 to 65535, or 0 for any that is free")
     try:
-        info = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"--host: {host} is no address ({reason}); give another --host") from error
-    try:
-        with socket.socket(info[0], socket.SOCK_STREAM) as probe:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(info[4])
-    except OSError as error:
-        option = "host" if error.errno == errno.EADDRNOTAVAIL else "port"
+            probe.bind((host, port))
+    except (OSError, OverflowError) as error:
+        is_host = isinstance(error, socket.gaierror) or getattr(error, "errno", 0) == errno.EADDRNOTAVAIL
+        option = "--host" if is_host else "--port"
+        reason = getattr(error, "strerror", None) or error
         raise InputError(
-            f"--{option}: {host}:{port} cannot be used ({error.strerror}); give another --{option}"
+            f"{host}:{port} cannot be used ({reason})", option, remedy=f"give another {option}"
         ) from error
 
 
@@ -73,41 +68,29 @@ class Page:
         title: str,
         address: tuple[str, int],  # host and port
         views_folder: Path,
-        begin: Pose | None = None,
     ) -> None:
         """Listen; raises InputError if the port is taken or viser is not installed."""
         viser = require_viser()
-        from mi_refgs.viewer.guard import Guard, guard_controls, guarded  # needs what viser installs
+        from mi_refgs.viewer.guard import guarded  # needs what viser installs
 
         host, port = address
         require_free(host, port)
-        self.scene, self.data, self.views_folder, self.begin = scene, data, views_folder, begin
+        self.scene, self.data, self.views_folder = scene, data, views_folder
         self.views = [view for split in ("test", "train") if split in data for view in data[split].views]
         self.up = up_of(self.views)
         self.loop = RenderLoop(scene)
         self.loop.report = self.complain
-        distance = float(np.linalg.norm(self.start().position - scene.centre))
-        depths = max(distance - scene.radius, 0.0), distance + scene.radius
-        self.loop.display(depths=depths)
         self.moving_side = COARSEST  # first resolution level of a client during motion
-        # What panels set.
-        self.status: Callable[[str], None] = lambda text: None
-        self.look_changed: Callable[[], None] = lambda: None
-        self.moved: Callable[[int, Pose], None] = lambda number, pose: None
+        self.status: Callable[[str], None] = lambda text: None  # set by a panel
         self._overlays: set[str] = set()  # that are displayed and need depth
         self._told = 0.0  # time of the last status
 
         # An image for a page that has been closed meanwhile is no problem.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-        self.guard = Guard(host)
-        with guarded(self.guard), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        with guarded(host), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
-        guard_controls(self.guard, self.server)
-        self.guard.refused = self.complain
-        if port and self.server.get_port() != port:
-            self.server.stop()
-            raise InputError(f"--port: {host}:{port} is in use; give another --port")
-        self.url = self.guard.url(self.server.get_port())
+        shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self.server.get_port()}/"
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self.server.gui.main_panel.dock_right()
         self._set_start()
@@ -115,9 +98,7 @@ class Page:
     # ---------------- cameras ----------------
 
     def start(self) -> Pose:
-        """Return the initial pose: the given one, the first test view, or one a little from above."""
-        if self.begin is not None:
-            return self.begin
+        """Return the initial pose: the first test view, or one a little from above."""
         if self.views:
             return Pose.of_view(self.views[0])
         outward = np.array([math.cos(0.6), math.sin(0.6), 0.5])
@@ -130,7 +111,7 @@ class Page:
         self.server.scene.set_up_direction(tuple(up))
         camera.position = pose.position
         camera.look_at = pose.look_at(self.scene.centre)
-        camera.up = pose.up if abs(pose.forward @ up) > 0.99 else up
+        camera.up = pose.to_world[:3, 1] if abs(pose.forward @ up) > 0.99 else up
         camera.fov = pose.fov
         camera.near, camera.far = 1e-3 * self.scene.radius, 1e3 * self.scene.radius
 
@@ -153,22 +134,17 @@ class Page:
     async def _connected(self, client: Any) -> None:
         new = Client(lambda shown: self._deliver(client, shown), side=self.moving_side)
         self.loop.enter(client.client_id, new)
+        near = self.views[0].near if self.views else 0.0
 
         async def moved(camera: Any) -> None:
-            self._moved(client.client_id, camera)
+            window = (camera.image_width, camera.image_height)
+            self.loop.change(client.client_id, pose=Pose.of_page(camera, near), window=window)
 
         client.camera.on_update(moved)
-        self._moved(client.client_id, client.camera)
+        await moved(client.camera)
 
     async def _left(self, client: Any) -> None:
         self.loop.leave(client.client_id)
-
-    def _moved(self, number: int, camera: Any) -> None:
-        window = (camera.image_width, camera.image_height)
-        near = self.views[0].near if self.views else 0.0
-        pose = Pose.of_page(camera.wxyz, camera.position, camera.fov, window[0] / window[1], near)
-        self.moved(number, pose)
-        self.loop.change(number, pose=pose, window=window)
 
     def _deliver(self, client: Any, shown: DeliveredImage) -> None:
         client.scene.set_background_image(
@@ -182,7 +158,8 @@ class Page:
         if shown.progress == DONE or now - self._told > STATUS_INTERVAL:
             self._told = now
             height, width = shown.image.shape[:2]
-            self.status(f"{width} × {height}, {shown.samples} per pixel, {1000 * shown.seconds:.0f} ms")
+            samples = max(shown.progress - COARSE, 1)
+            self.status(f"{width} × {height}, {samples} per pixel, {1000 * shown.seconds:.0f} ms")
 
     def close(self) -> None:
         """Stop listening."""
@@ -191,16 +168,11 @@ class Page:
 
     # ---------------- for panels ----------------
 
-    def set(self, **fields: Any) -> None:
-        """Set fields of the display options."""
-        self.loop.display(**fields)
-        self.look_changed()
-
     def overlay(self, name: str, visible: bool) -> None:
         """Say whether an overlay, which the image occludes, is displayed."""
         if visible != (name in self._overlays):
             self._overlays ^= {name}
-            self.set(overlays=bool(self._overlays))
+            self.loop.display(overlays=bool(self._overlays))
 
     def complain(self, message: str) -> None:
         """Display a sentence about bad input, or about a failure."""

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -27,18 +28,13 @@ class Pose:
     near: float = 0.0  # depth of the near plane, scene units
 
     @staticmethod
-    def of_page(
-        wxyz: np.ndarray,  # (4,) quaternion of OpenCV's axes, w first
-        position: np.ndarray,  # (3,) world
-        fov: float,
-        aspect: float,
-        near: float = 0.0,
-    ) -> Pose:
-        """Convert a camera of viser."""
+    def of_page(camera: Any, near: float = 0.0) -> Pose:
+        """Convert a camera of viser, whose axes are OpenCV's."""
         matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat(np.roll(np.asarray(wxyz, np.float64), -1)).as_matrix()
-        matrix[:3, 3] = position
-        return Pose(matrix @ MITSUBA_FROM_OPENCV, float(fov), float(aspect), near)
+        matrix[:3, :3] = Rotation.from_quat(np.roll(np.asarray(camera.wxyz, np.float64), -1)).as_matrix()
+        matrix[:3, 3] = camera.position
+        aspect = camera.image_width / max(camera.image_height, 1)
+        return Pose(matrix @ MITSUBA_FROM_OPENCV, float(camera.fov), aspect, near)
 
     @staticmethod
     def of_view(view: View) -> Pose:
@@ -49,12 +45,8 @@ class Pose:
     @staticmethod
     def looking_at(centre: np.ndarray, position: np.ndarray, fov: float) -> Pose:
         """Return the pose at a position (3,) that looks at a centre (3,), z up."""
-        forward = (centre - position) / np.linalg.norm(centre - position)
-        left = np.cross([0.0, 0.0, 1.0], forward)
-        left /= np.linalg.norm(left)
-        matrix = np.eye(4)
-        matrix[:3, :] = np.stack([left, np.cross(forward, left), forward, position], axis=1)
-        return Pose(matrix, fov, 1.0)
+        look_at = mi.ScalarTransform4f().look_at(position, centre, [0, 0, 1])
+        return Pose(np.array(look_at.matrix, np.float64), fov, 1.0)
 
     @property
     def position(self) -> np.ndarray:
@@ -67,11 +59,6 @@ class Pose:
         return self.to_world[:3, 2]
 
     @property
-    def up(self) -> np.ndarray:
-        """Unit direction (3,) of the image's upper edge."""
-        return self.to_world[:3, 1]
-
-    @property
     def page_rotation(self) -> np.ndarray:
         """Unit quaternion (4,), w first, of viser's axes, which are OpenCV's."""
         rotation = Rotation.from_matrix((self.to_world @ MITSUBA_FROM_OPENCV)[:3, :3])
@@ -81,11 +68,6 @@ class Pose:
         """Return the point (3,) of the viewing axis, in front of the camera, that is nearest to a centre."""
         along = float((centre - self.position) @ self.forward)
         return self.position + max(along, 1e-3 * float(np.linalg.norm(centre - self.position))) * self.forward
-
-    def difference(self, other: Pose, distance: float) -> float:
-        """Return the largest difference: of position in parts of a distance, of axis and fov in radians."""
-        moved = float(np.linalg.norm(self.position - other.position)) / max(distance, 1e-9)
-        return max(moved, float(np.linalg.norm(self.forward - other.forward)), abs(self.fov - other.fov))
 
     def camera(self, width: int, height: int, offset: tuple[float, float] = (0.0, 0.0)) -> Camera:
         """Return the renderer's camera with samples `offset` pixels off the pixel centres."""
@@ -106,8 +88,6 @@ class Pose:
 def up_of(views: list[View]) -> np.ndarray:
     """Return the unit up direction (3,) of a data set: z, unless its cameras agree on another one."""
     z = np.array([0.0, 0.0, 1.0])
-    if not views:
-        return z
-    mean = np.mean([view.to_world[:3, 1] for view in views], axis=0)
+    mean = np.mean([view.to_world[:3, 1] for view in views], axis=0) if views else z
     length = float(np.linalg.norm(mean))
     return z if length < 0.5 or mean[2] / length > UP_TOLERANCE else np.asarray(mean / length)

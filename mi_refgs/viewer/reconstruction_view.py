@@ -11,9 +11,10 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import Region
-from mi_refgs.editing.painting import selected_alpha
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
+from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import update_occluder_caches
@@ -22,15 +23,14 @@ from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.tonemap import IMAGE, backdrops_of
-from mi_refgs.viewer.viewer_scene import SampleRequest, SampleResult, ViewerScene
+from mi_refgs.viewer.resolution import SAMPLES
+from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, ViewerScene, backdrops_of
 
 OUTLIERS = 2.0
 """Percent of the surfels along each axis and side that do not count as the object."""
-TINT, TINT_SHARE = (1.0, 0.3, 0.0), 0.5
-"""Linear colour of highlighted surfels, and its share of theirs."""
 
 Change = Callable[[TrainedScene], TrainedScene]
 """An edit of a scene that keeps number and order of its surfels."""
@@ -41,16 +41,9 @@ def bounds_of(surfels: Surfels, region: Region | None = None) -> tuple[np.ndarra
     if region is not None:
         return np.array(region.centre), region.radius
     position = surfels.to_numpy()["position"].astype(np.float64)
-    return sphere_around(*box_of(position)) if len(position) else (np.zeros(3), 1.0)
-
-
-def box_of(position: np.ndarray) -> np.ndarray:
-    """Return lower and upper corner (2, 3) of the box of most positions (N, 3), N > 0."""
-    return np.percentile(position, (OUTLIERS, 100 - OUTLIERS), axis=0)
-
-
-def sphere_around(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return centre (3,) and radius of the sphere around a box."""
+    if not len(position):
+        return np.zeros(3), 1.0
+    low, high = np.percentile(position, (OUTLIERS, 100 - OUTLIERS), axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
@@ -76,8 +69,7 @@ class ReconstructionView(ViewerScene):
         self.can_relight = not lacking(scene)
         self.turn = 0.0  # rotation of the light about z, degrees, counter-clockwise seen from above
         self.environment = scene.light
-        self.changes: list[Change] = []
-        self.highlighted: np.ndarray | None = None  # surfels (N,) bool that are displayed in TINT
+        self.change: Change | None = None
         self._relightable: TrainedScene | None = None
         self.set_relit(False)
 
@@ -104,15 +96,13 @@ class ReconstructionView(ViewerScene):
         self.scene = self._base
         self._occluder = Occluder(self.scene.mesh)
         self._filter()
-        self.set_changes(self.changes)
+        self.set_change(self.change)
 
-    def set_changes(self, changes: list[Change]) -> None:
-        """Display the scene after these edits, in order."""
-        self.changes = list(changes)
-        scene = self._base
-        for change in self.changes:
-            scene = change(scene)
-        self.scene = replace(self.scene, surfels=scene.surfels)
+    def set_change(self, change: Change | None) -> None:
+        """Display the scene after an edit; None: as fitted."""
+        self.change = change
+        changed = self._base if change is None else change(self._base)
+        self.scene = replace(self.scene, surfels=changed.surfels)
         self._stale = True
 
     def _filter(self) -> None:
@@ -136,29 +126,28 @@ class ReconstructionView(ViewerScene):
 
     # ---------------- images ----------------
 
-    def draw(self, sample: SampleRequest) -> SampleResult:
-        """See `ViewerScene`; displayed images, but not saved ones, have highlighted surfels in another
-        colour."""
-        drawn = super().draw(sample)
-        if self.highlighted is None or sample.look.what != IMAGE or sample.exact is not None:
-            return drawn
-        share = TINT_SHARE * selected_alpha(self.original, self.highlighted, sample.camera())
-        tinted = [dr.lerp(x, colour, share) for x, colour in zip(drawn.planes[:3], TINT, strict=True)]
-        return drawn._replace(planes=[*tinted, *drawn.planes[3:]])
-
-    def frame(self, sample: SampleRequest) -> Frame:
+    def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
         """See `ViewerScene`; with ambient shadows that may be outdated unless it is `settled`."""
         light, scene = self.light, self.scene
         with dr.suspend_grad():
-            if self._stale and (sample.settled or self._lacks_caches):
+            if self._stale and (settled or self._lacks_caches):
                 update_occluder_caches(self._occluder, scene.surfels, light, scene.shading)
                 self._stale = False
-            background = None if sample.look.object_only else scene.surroundings
+            background = None if look.object_only else scene.surroundings
             rendered = SurfelScene(
                 scene.surfels, scene.shading, light, self._occluder, background, self._near
             )
-            request = Request(sample.aovs, forward_only=True)
-            return render(rendered, sample.camera(), request)
+            return render(rendered, camera, Request(look.aovs, forward_only=True))
+
+    def fine(self, camera: Camera, look: DisplayOptions, samples: int = SAMPLES) -> Frame:
+        """Render an image to save as `refgs render` does, in passes that fit into memory."""
+
+        def averaged(view: Camera) -> Frame:
+            return supersampled(lambda fine: self.frame(fine, look, True), view, samples)
+
+        factor = samples_per_axis(samples)
+        with dr.suspend_grad():
+            return in_passes(averaged, camera, factor, self.scene.shading.neighbours, self.scene.count)
 
     @property
     def _lacks_caches(self) -> bool:
@@ -167,7 +156,3 @@ class ReconstructionView(ViewerScene):
         ambient = bool(shading.ambient_rays) and occluder.ambient is None
         traced = bool(shading.traced_bounces) and occluder.vertex_surfels is None
         return not occluder.empty and (ambient or traced)
-
-    def cost(self) -> tuple[Shading, int]:
-        """See `ViewerScene`."""
-        return self.scene.shading, self.scene.count

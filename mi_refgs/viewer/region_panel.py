@@ -5,15 +5,15 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import REGION_FILE, Plane, Region
 from mi_refgs.io.files import write_json
-from mi_refgs.io.ownership import OutputFolder, require_no_run
+from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.viewer.page import Page
 
 OWNER = "view"
@@ -25,13 +25,9 @@ STEPS = 100
 OPPOSITE = 1e-6
 """Difference of unit normals up to which planes are opposite sides of a box."""
 
-MERIDIANS, PARALLELS, LINES = 6, 5, 7
-"""Circles of the sphere's wireframe, and lines on a plane along each axis."""
-POINTS = 49
-"""Points of each."""
+SUBDIVISIONS = 3
+"""Of the icosahedron that displays the sphere: 642 points."""
 COLOUR = (120, 230, 120)
-THICKNESS = 1.5
-"""Width of its lines, pixels."""
 
 
 class RegionPanel:
@@ -50,9 +46,7 @@ class RegionPanel:
                 gui.add_slider(f"Plane {i}", -radius, radius, radius / STEPS, 0.0, hint=hint)
                 for i in range(1, 1 + len(support_planes(region.planes)))
             ]
-            hint = f"The file to write, which is replaced; empty: {REGION_FILE} of the data set."
-            self.file = gui.add_text("Region file", "", hint=hint)
-            save = gui.add_button("Save region")
+            save = gui.add_button("Save region", hint=f"As {REGION_FILE} of the data set, for the next fit.")
             self.note = gui.add_markdown("")
         self.arrows = page.server.scene.add_transform_controls(
             "/region/centre",
@@ -81,8 +75,9 @@ class RegionPanel:
         self.note.content = f"centre ({centre}), radius {region.radius:.4g}"
         self.arrows.visible = self.show.value
         if self.show.value:
-            self.lines = self.page.server.scene.add_line_segments(
-                "/region/border", wireframe(region), COLOUR, thickness=THICKNESS, thickness_units="screen"
+            mesh = border(region)
+            self.lines = self.page.server.scene.add_mesh_simple(
+                "/region/border", mesh.vertices, mesh.faces, color=COLOUR, wireframe=True
             )
         elif self.lines is not None:
             self.lines.visible = False
@@ -90,28 +85,18 @@ class RegionPanel:
 
     def save(self) -> None:
         """Write the region; raises InputError as `save_region` does."""
-        file = self.file.value.strip()
-        self.note.content = save_region(self.region, self.data, Path(file) if file else None)
+        self.note.content = save_region(self.region, self.data)
 
 
-def save_region(region: Region, data: Dataset, file: Path | None = None) -> str:
+def save_region(region: Region, data: Dataset) -> str:
     """Write a region in the coordinates of a data set's files; return what the user does next.
 
-    The data set's region.json is replaced only if a page wrote it, unless `file` names it. Raises InputError
-    for another one that is there, a file of a run, and one that cannot be written.
+    Raises InputError for a region.json that no page wrote, and one that cannot be written.
     """
-    own = data.path / REGION_FILE
-    if file is None:
-        remedy = f"type {own} as region file to replace it, or another path"
-        OutputFolder(data.path, OWNER, remedy=remedy).claim(REGION_FILE)
-    else:
-        require_no_run(file)
-    path = file or own
-    write_json(path, replace(region, estimated=False).moved(np.array(data.offset)).content)
-    command = f"refgs train {shlex.quote(str(data.path))} -o RUN"
-    if path.resolve() == own.resolve():
-        return f"saved `{path}`; next: `{command}`"
-    return f"saved `{path}`; next: move it to `{own}`, then `{command}`"
+    OutputFolder(data.path, OWNER).claim(REGION_FILE)
+    moved = replace(region, estimated=False).moved(np.array(data.offset))
+    write_json(data.path / REGION_FILE, moved.content)
+    return f"saved `{data.path / REGION_FILE}`; next: `refgs train {shlex.quote(str(data.path))} -o RUN`"
 
 
 def support_planes(planes: Sequence[Plane]) -> Sequence[Plane]:
@@ -134,40 +119,10 @@ def adjusted(region: Region, centre: np.ndarray, radius: float, heights: Sequenc
     return Region((x, y, z), radius, tuple(planes))
 
 
-def wireframe(region: Region) -> np.ndarray:
-    """Return line segments (S, 2, 3) on the border of a region, on its sphere and on its planes."""
-    angle = np.linspace(0, 2 * np.pi, POINTS)
-    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(POINTS)], axis=-1)
-    centre = np.array(region.centre)
-
-    # Circles of the sphere.
-    curves = []
-    for latitude in np.pi * ((np.arange(PARALLELS) + 1) / (PARALLELS + 1) - 0.5):
-        curves.append(np.cos(latitude) * circle + (0, 0, np.sin(latitude)))
-    for turn in np.pi * np.arange(MERIDIANS) / MERIDIANS:
-        across = np.array([np.cos(turn), np.sin(turn), 0])
-        curves.append(circle[:, :1] * across + circle[:, 1:2] * (0, 0, 1))
-    found = [_segments(centre + region.radius * np.array(curves), region)]
-
-    # For each plane, the circle in which the sphere ends, and a grid of lines inside.
-    for plane in region.planes:
-        normal = np.array(plane[:3])
-        below = float(normal @ centre) - plane[3]
-        if abs(below) >= region.radius:
-            continue
-        rest = replace(region, planes=tuple(other for other in region.planes if other != plane))
-        wide = np.sqrt(region.radius**2 - below**2)
-        first, second = np.linalg.svd(normal[None])[2][1:]
-        at = np.linspace(-1, 1, LINES + 2)[1:-1, None]
-        along = np.linspace(-1, 1, POINTS) * np.sqrt(1 - at**2)
-        u = np.concatenate([circle[None, :, 0], along, np.broadcast_to(at, along.shape)])
-        v = np.concatenate([circle[None, :, 1], np.broadcast_to(at, along.shape), along])
-        on = centre - below * normal
-        found.append(_segments(on + wide * (u[..., None] * first + v[..., None] * second), rest))
-    return np.concatenate(found)
-
-
-def _segments(curves: np.ndarray, region: Region) -> np.ndarray:
-    """Return the segments (S, 2, 3) of curves (C, P, 3) whose ends are above the planes of a region."""
-    pairs = np.stack([curves[:, :-1], curves[:, 1:]], axis=2).reshape(-1, 2, 3)
-    return pairs[region.above(pairs).all(axis=1)]
+def border(region: Region) -> trimesh.Trimesh:
+    """Return the border of a region, which is convex: its sphere, cut by its planes."""
+    mesh = trimesh.creation.icosphere(SUBDIVISIONS, region.radius)
+    mesh.apply_translation(region.centre)
+    for *normal, distance in region.planes:
+        mesh = mesh.slice_plane(np.multiply(normal, distance), normal)
+    return mesh.convex_hull if len(mesh.faces) else mesh

@@ -17,23 +17,20 @@ SHAPES = (0.625, 1.0, 1.6, 2.5)
 MULTIPLE = 4
 """Width and height are multiples of this, the smallest tile."""
 
-STILL_AFTER = 0.15
-"""Seconds without a change after which an image is drawn large: more than the pauses of a slow hand."""
-SMOOTH_AFTER = 0.4
-"""Seconds without a change after which an image is supersampled."""
+STILL_AFTER, SMOOTH_AFTER = 0.15, 0.4
+"""Seconds without a change after which an image is drawn large, and after which it is supersampled."""
 GRID = 4
 """A supersampled image has a raster of GRID × GRID samples per pixel, as in `render.samples`."""
 SAMPLES = GRID * GRID
-
 SLOW, FAST = 1 / 22, 1 / 60
 """Seconds per image during motion: above the first the next image is a level coarser, below the second a
 level finer. Twice the area takes less than twice the time, so the level does not oscillate."""
 
 NOTHING, COARSE, LARGE = 0, 1, 2
-"""Progress of a display: no image of the present state, a coarse one, a large one; then LARGE + samples."""
-DONE = LARGE + SAMPLES
-SHOWN_AT = frozenset({LARGE + SAMPLES // 4, DONE})
-"""Progress at which supersampled images are sent: each has to be encoded and transferred."""
+"""Progress of a display: no image of the present state, a coarse one, a large one of 1 sample, of 2, …"""
+DONE = COARSE + SAMPLES
+SHOWN_AT = frozenset({COARSE, LARGE, COARSE + SAMPLES // 4, DONE})
+"""Progress at which images are sent: each has to be encoded and transferred."""
 
 
 def shape_of(width: int, height: int) -> float:
@@ -68,13 +65,9 @@ def due(progress: int, since: float) -> float:
     return max((STILL_AFTER if progress == COARSE else SMOOTH_AFTER) - since, 0.0)
 
 
-def offsets() -> list[tuple[float, float]]:
-    """Return the samples' offsets from the pixel centre, pixels; each four in turn lie in all quarters."""
-    x = [(i + 0.5) / GRID - 0.5 for i in range(GRID)]
-    half = GRID // 2
-    quarter = [(i, j) for j in range(half) for i in range(half)]
-    return [
-        (x[i + half * right], x[j + half * down])
-        for i, j in quarter
-        for right, down in ((0, 0), (1, 1), (1, 0), (0, 1))
-    ]
+def offset_of(sample: int) -> tuple[float, float]:
+    """Return a sample's offset from the pixel centre, pixels; each four in turn lie in all quarters."""
+    (row, column), quarter = divmod(sample // 4, GRID // 2), sample % 4
+    right, down = (0, 1, 1, 0)[quarter], (0, 1, 0, 1)[quarter]
+    x, y = column + GRID // 2 * right, row + GRID // 2 * down
+    return (x + 0.5) / GRID - 0.5, (y + 0.5) / GRID - 0.5

@@ -14,12 +14,11 @@ import numpy as np
 from mi_refgs.reconstruction.fit import ProgressBar
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import LOG, Run, read_log
-from mi_refgs.shade.shading import Shading
+from mi_refgs.splat.camera import Camera
 from mi_refgs.viewer.page import Page, require_free, require_viser
-from mi_refgs.viewer.panels import add_display, add_overlays
+from mi_refgs.viewer.panels import add_cameras, add_display
 from mi_refgs.viewer.reconstruction_view import bounds_of, variables_of
-from mi_refgs.viewer.tonemap import IMAGE, backdrops_of
-from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
+from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, ViewerScene, backdrops_of
 
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
@@ -44,13 +43,9 @@ class Training(ViewerScene):
         self.variables = tuple(name for name in names if name != "visibility")  # in all stages
         self.backdrops = backdrops_of(trainer.surroundings is not None, light=False)
 
-    def frame(self, sample: SampleRequest) -> Frame:
+    def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
         """See `ViewerScene`."""
-        return self.trainer.view(sample.camera(), sample.look.what != IMAGE, sample.look.object_only)
-
-    def cost(self) -> tuple[Shading, int]:
-        """See `ViewerScene`."""
-        return self.trainer.shading(), self.trainer.surfels.count
+        return self.trainer.view(camera, look.what != IMAGE, look.object_only)
 
 
 class TrainingViewer(ProgressBar):
@@ -93,13 +88,13 @@ class TrainingPage(Page):
         """Serve the page; raises InputError if the port is taken, and without viser."""
         data = {"train": trainer.data}
         super().__init__(Training(trainer), data, run.path.resolve().name, address, run.path / "views")
-        self.set(largest=LARGEST)
+        self.loop.display(largest=LARGEST)
         self.loop.smooth, self.loop.clock = False, clock
         self.log, self.clock = run.path / LOG, clock
         self.since, self.spent, self.refreshed = clock(), 0.0, -REFRESH
         add_display(self)
         self.curves = self._add_curves()
-        add_overlays(self, None)
+        add_cameras(self)
         self.listen()
 
     def step(self) -> None:

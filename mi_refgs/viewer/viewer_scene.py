@@ -1,94 +1,126 @@
-"""The interface of scenes that a page displays."""
+"""What a page displays: a scene that renders frames, and their conversion to display-encoded RGB."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.render.passes import in_passes
+from mi_refgs.plugins.aovs import aov_planes, suffixes, values_of_planes
+from mi_refgs.render.display import display_image, srgb_from_linear
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.render.samples import box_mean
 from mi_refgs.shade.light.light import Light
-from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Float
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.resolution import GRID
-from mi_refgs.viewer.tonemap import IMAGE, DisplayOptions, planes_of
+from mi_refgs.viewer.resolution import FINEST
+
+IMAGE = "image"
+"""What is displayed unless an AOV is chosen."""
+BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
+"""Display-encoded brightness behind the object, by name."""
+ENVIRONMENT = "environment map"
+"""The environment map as backdrop."""
+BACKGROUND = "background"
+"""The photographed background as backdrop; with all others the object only is displayed."""
 
 
-@dataclass(frozen=True, eq=False)
-class SampleRequest:
-    """One sample per pixel of an image."""
+def backdrops_of(background: bool, light: bool) -> tuple[str, ...]:
+    """Return the backdrops of a scene that has these or not, the initial one first."""
+    return (*((BACKGROUND,) if background else ()), *BACKDROPS, *((ENVIRONMENT,) if light else ()))
 
-    pose: Pose
-    width: int
-    height: int
-    look: DisplayOptions
-    offset: tuple[float, float] = (0.0, 0.0)  # of the samples from the pixel centres, pixels
-    index: int = 0  # of the sample
-    settled: bool = False  # whether nothing has moved for a while, so that it may take longer
-    exact: Camera | None = None  # replaces the pose, and has its own pixels
+
+@dataclass(frozen=True)
+class DisplayOptions:
+    """What is displayed of a scene, and how: on all pages, which share their controls."""
+
+    what: str = IMAGE  # or a type of `plugins.aovs`
+    exposure: float = 0.0  # stops
+    backdrop: str = "white"  # one of `backdrops_of`
+    largest: int = FINEST  # finest resolution level at rest
+    overlays: bool = False  # whether the browser draws over the image, which requires depth
+
+    @property
+    def object_only(self) -> bool:
+        """Whether the background is left out."""
+        return self.backdrop != BACKGROUND
 
     @property
     def aovs(self) -> frozenset[str]:
         """The AOVs to render."""
-        return frozenset({self.look.what, *(["depth"] if self.look.overlays else [])} - {IMAGE, "alpha"})
-
-    def camera(self) -> Camera:
-        """Return the renderer's camera."""
-        return self.exact or self.pose.camera(self.width, self.height, self.offset)
-
-
-class SampleResult(NamedTuple):
-    """A rendered sample."""
-
-    planes: list[Float]  # (H*W,) each, see `tonemap.planes_of`
-    depth: Float | None = None  # (H*W,) along the camera's z axis, 0 where nothing is seen; None if unknown
+        return frozenset({self.what, *(["depth"] if self.overlays else [])} - {IMAGE, "alpha"})
 
 
 class ViewerScene(ABC):
     """A scene that a page displays. The methods are called on the render thread."""
 
-    variables: tuple[str, ...]  # `tonemap.IMAGE` and the types of `plugins.aovs` that the scene has
-    backdrops: tuple[str, ...]  # see `tonemap.backdrops_of`
+    variables: tuple[str, ...]  # IMAGE and the types of `plugins.aovs` that the scene has
+    backdrops: tuple[str, ...]  # see `backdrops_of`
     centre: np.ndarray  # (3,) world, the point that cameras orbit
     radius: float  # of the object around it, scene units
     light: Light | None = None  # the environment map as backdrop
-    square_pixels = False  # whether its pixels must be square, whatever sizes that gives
 
     @abstractmethod
-    def frame(self, sample: SampleRequest) -> Frame:
-        """Render one sample per pixel; a scene without frames defines `draw`."""
+    def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
+        """Render one sample per pixel; `settled`: nothing has moved for a while, so it may take longer."""
 
-    def draw(self, sample: SampleRequest) -> SampleResult:
-        """Render one sample per pixel, as what is displayed."""
+    def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> tuple[list[Float], Float | None]:
+        """Render planes of `planes_of`, and depth along the camera's axis, 0 where nothing is."""
         with dr.suspend_grad():
-            frame = self.frame(sample)
-            return SampleResult(planes_of(frame, sample.camera(), sample.look, self.light), frame.depth)
+            frame = self.frame(camera, look, settled)
+            return planes_of(frame, camera, look, self.light), frame.depth
 
-    @abstractmethod
-    def cost(self) -> tuple[Shading, int]:
-        """Return the shading and the number of surfels, which decide about passes."""
+    def depths(self, pose: Pose) -> tuple[float, float]:
+        """Return the distances of the object's front and back, which are displayed as white and as black."""
+        distance = float(np.linalg.norm(pose.position - self.centre))
+        return max(distance - self.radius, 0.0), distance + self.radius
 
-    def fine(self, request: SampleRequest) -> list[Float]:
-        """Render an image to save, of square pixels: planes, means over GRID × GRID samples per pixel.
 
-        Displayed images average samples that are filtered for the displayed pixels. Here each sample is
-        filtered for its own footprint, as in `render.samples` and `refgs render`, in passes that fit into
-        memory.
-        """
+def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Float]:
+    """Return what is averaged over samples, (H*W,) each: the premultiplied image or AOV, and alpha.
 
-        def means(camera: Camera) -> list[Float]:
-            exact = camera.supersampled(GRID)
-            drawn = self.draw(replace(request, height=camera.height, settled=True, exact=exact))
-            pixels = dr.zeros(mi.Float, camera.width * camera.height)
-            return [box_mean(plane, camera, GRID) + pixels for plane in drawn.planes]
+    For an image with background or environment map, that is included, and alpha is 1.
+    """
+    if look.what != IMAGE:
+        return aov_planes(look.what, frame, camera)
+    behind = frame.background
+    if behind is None and look.backdrop == ENVIRONMENT and light is not None:
+        behind = light.radiance(dr.normalize(camera.rays()))
+    if behind is None:
+        return [*frame.radiance, frame.alpha]
+    return [*(frame.radiance + (1 - frame.alpha) * mi.Color3f(behind)), mi.Float(1)]
 
-        shading, surfels = self.cost()
-        return in_passes(means, request.camera(), GRID, shading.neighbours, surfels)
+
+def values_of(planes: list[Float], what: str) -> list[Float]:
+    """Return linear premultiplied RGBA, or the channels of the AOV, of the mean of `planes_of`."""
+    return planes if what == IMAGE else values_of_planes(what, planes)
+
+
+def displayed_planes(planes: list[Float], look: DisplayOptions, depths: tuple[float, float]) -> list[Float]:
+    """Return display-encoded RGB planes, not clipped, of the mean of `planes_of`.
+
+    The first of the two `depths` is displayed as white, the second as black.
+    """
+    what, alpha, behind = look.what, planes[-1], BACKDROPS.get(look.backdrop, 1.0)
+    values = values_of(planes, what)
+    if what == IMAGE or what in TERMS:
+        gain = dr.opaque(mi.Float, 2.0**look.exposure)
+        radiance = [value * gain for value in values[:3]]
+        if what == IMAGE:
+            return display_image(radiance, alpha, [behind] * 3)
+        return [srgb_from_linear(value) for value in radiance]
+    if what == "alpha":
+        return values * 3
+    match suffixes()[what]:
+        case "XYZ":
+            values = [0.5 + 0.5 * value for value in values]
+        case "RGB":
+            values = [srgb_from_linear(value) for value in values]
+        case "T":
+            near, far = (dr.opaque(mi.Float, x) for x in depths)
+            values = [dr.clip((far - values[0]) / (far - near), 0, 1)]
+    return [alpha * value + (1 - alpha) * behind for value in values * (3 // len(values))]

@@ -41,12 +41,9 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer import viewer_scene
-from mi_refgs.viewer.mitsuba_scene import MitsubaScene
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.tonemap import BACKGROUND, IMAGE, DisplayOptions, composited
-from mi_refgs.viewer.viewer_scene import SampleRequest, ViewerScene
+from mi_refgs.viewer.viewer_scene import BACKGROUND, IMAGE, DisplayOptions, planes_of, values_of
 from tests.laws.covering import covering_array, marked
 from tests.scenes.integrator import (
     OTHER_OPTIONS,
@@ -200,11 +197,22 @@ def by_command_with_a_camera(case: Case) -> Maps:
 
 
 def by_viewer_of_a_run(case: Case) -> Maps:
-    return of_viewer(case, ReconstructionView(case.made.trained))
-
-
-def by_viewer_of_a_scene(case: Case) -> Maps:
-    return of_viewer(case, MitsubaScene(load_scene(case.folder / SCENE), "scene.xml"))
+    """The planes that a page shows at one sample per pixel, and those that it saves at several."""
+    view, drawable = Camera.from_sensor(sensor()), ReconstructionView(case.made.trained)
+    pose = Pose(view.pose(), 2 * np.arctan(HEIGHT / 2 / -view.fy[0]), WIDTH / HEIGHT, NEAR)
+    camera = pose.camera(WIDTH, HEIGHT)
+    around = not case.alone and case.made.trained.surroundings is not None
+    backdrop = BACKGROUND if around else "white"
+    assert backdrop in drawable.backdrops
+    found = {}
+    for what in [IMAGE, *drawable.variables[1 + case.part :: 3]]:
+        look = DisplayOptions(what, backdrop=backdrop)
+        if case.samples == 1:
+            planes, _ = drawable.draw(camera, look, True)
+        else:
+            planes = planes_of(drawable.fine(camera, look, case.samples), camera, look, None)
+        found[what] = image_array(values_of(planes, what), HEIGHT, WIDTH)
+    return case.of_whole(found)
 
 
 def by_layers(case: Case) -> Maps:
@@ -230,7 +238,6 @@ ROUTES: tuple[Callable[[Case], Maps], ...] = (
     by_command_of_a_scene,
     by_command_with_a_camera,
     by_viewer_of_a_run,
-    by_viewer_of_a_scene,
     by_layers,
 )
 """Every way to an image; the first one is compared with all others."""
@@ -260,27 +267,6 @@ def of_layers(layers: dict[str, np.ndarray], names: Sequence[str]) -> Maps:
         if (name := key.partition(".")[0]) in found:
             found[name].append(layers[key])
     return {name: np.stack(values, axis=-1) for name, values in found.items()}
-
-
-def of_viewer(case: Case, drawable: ViewerScene) -> Maps:
-    """The planes that a page shows at one sample per pixel, and those that it saves at several."""
-    view = Camera.from_sensor(sensor())
-    pose = Pose(view.pose(), 2 * np.arctan(HEIGHT / 2 / -view.fy[0]), WIDTH / HEIGHT, NEAR)
-    around = not case.alone and case.made.trained.surroundings is not None
-    backdrop = BACKGROUND if around else "white"
-    assert backdrop in drawable.backdrops
-    found = {}
-    pictures = [IMAGE, *drawable.variables[1 + case.part :: 3]]
-    for what in pictures:
-        look = DisplayOptions(what, backdrop=backdrop)
-        if case.samples == 1:
-            shown = drawable.draw(SampleRequest(pose, WIDTH, HEIGHT, look, settled=True)).planes
-        else:
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(viewer_scene, "GRID", round(case.samples**0.5))
-                shown = drawable.fine(SampleRequest(pose, WIDTH, HEIGHT, look))
-        found[what] = image_array(composited(shown, look), HEIGHT, WIDTH)
-    return case.of_whole(found)
 
 
 # ---------------- states ----------------
