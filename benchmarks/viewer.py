@@ -1,6 +1,6 @@
 """How fast a page of `refgs view` is: in a headless browser, on a run.
 
-    python -m benchmarks.viewer RUN [--window 1000x640] [--moving 800]
+    python -m benchmarks.viewer RUN [--window 1000x640]
 
 Measures, with the viewer in a process of its own:
 
@@ -121,14 +121,6 @@ def first_picture(page: Any, url: str) -> float:
     return time.monotonic() - begin
 
 
-def choose(page: Any, label: str, value: str) -> None:
-    """Choose in a drop-down."""
-    page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator(
-        "input"
-    ).first.click()
-    page.get_by_role("option", name=value, exact=True).click()
-
-
 def orbit(page: Any, viewer: Viewer, seconds: float) -> dict[str, float]:
     """Drag the camera round for some time."""
     box = page.locator("canvas").first.bounding_box()
@@ -172,11 +164,6 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         }
         page.wait_for_timeout(3000)
         result["orbit"] = orbit(page, viewer, args.seconds)
-        for side in args.moving:
-            choose(page, "Moving", f"{side}²")
-            page.wait_for_timeout(3000)
-            orbit(page, viewer, 2)  # the first of this size
-            result[f"orbit_{side}"] = orbit(page, viewer, args.seconds)
         result["console_errors"] = errors
         result["load_after"] = os.getloadavg()[0]
     return result
@@ -188,7 +175,6 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each orbit")
     parser.add_argument("--window", default="1000x640", help="pixels of the page")
-    parser.add_argument("--moving", type=int, nargs="*", default=[200, 800], help="sizes to orbit at, too")
     print(json.dumps(measure(parser.parse_args()), indent=1))
 
 

@@ -8,6 +8,7 @@ lower bound of the time of any renderer of these surfels.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -22,12 +23,12 @@ from benchmarks.common import timing
 from benchmarks.common.fits import make_trainer, sphere_data
 from benchmarks.common.timing import in_fresh_process, once
 from benchmarks.splatting.cases import COLOUR, FEATURES, Settings, Workload, sphere
+from benchmarks.splatting.counts import Counts
 from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.measure import measure as measure_case
 from mi_refgs.constants import tile_size
-from mi_refgs.profiling.phases import phase_times
-from mi_refgs.profiling.profile import Counts, profile_stage, stepper
+from mi_refgs.evaluation.profile import phases_of, stepper
 from mi_refgs.splat import list_by_tile, project
 
 FLOPS = {"forward": 60, "both": 260}
@@ -153,15 +154,21 @@ def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
     for name, stage in trainer.method.stages():
         if stage.shading.at == "pixel" and "mesh" in trainer.method.event:
             trainer.method.event["mesh"].apply(trainer)
-        found = profile_stage(trainer, name, steps)
-        splat = Ours.of_step(stepper(trainer, name)).both
-        splat_ms = timing.milliseconds({name: splat}, STEP_SECONDS, steps)[name]
+        step, times = stepper(trainer, name), []
+        phases = phases_of(step, max(steps // 3, 5))
+        for _ in range(steps):
+            begin, misses = time.perf_counter(), dr.detail.launch_stats()[2]
+            step()
+            dr.sync_thread()
+            times.append(1e3 * (time.perf_counter() - begin))
+        misses = dr.detail.launch_stats()[2] - misses
+        splat_ms = timing.milliseconds({name: Ours.of_step(step).both}, STEP_SECONDS, steps)[name]
         result[name] = {
-            "step_ms": round(found.step_ms, 2),
+            "step_ms": round(float(np.median(times)), 2),
             "splat_ms": round(splat_ms, 2),
-            "launches": found.launches,
-            "cache_misses": found.misses,
-            "phases_ms": {key: round(value, 2) for key, value in found.phases_ms.items()},
+            "launches": sum(row.launches for row in phases),
+            "cache_misses": misses,
+            "phases_ms": {row.phase: round(row.ms, 2) for row in phases},
         }
     return result
 
@@ -185,7 +192,7 @@ def case(workload: Workload, settings: Settings, gflops: float) -> Row:
     times = timing.milliseconds(calls, settings.seconds / len(calls), settings.repeats, slow)
     launches = {kind: full.launches(getattr(full, kind)) for kind in ("forward", "both")}
     bound = lower_bound(counts, gflops)
-    phases = phase_times(full.both, min(PHASE_REPEATS, settings.repeats))
+    phases = {row.phase: row.ms for row in phases_of(full.both, min(PHASE_REPEATS, settings.repeats))}
     row: Row = {"spread": workload.spread, "surfels": count, "size": size}
     names = ("pixels", "covered", "pairs", "evaluated", "contributing")
     row |= {name: getattr(counts, name) for name in names}

@@ -11,9 +11,9 @@ import numpy as np
 
 from benchmarks.common.view import perspective
 from benchmarks.splatting.cases import COLOUR, Workload
+from benchmarks.splatting.counts import Counts, count
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import listening, phase
-from mi_refgs.profiling.profile import Counts, count
 from mi_refgs.splat import Camera, Composited, list_by_tile, project, splat
 from mi_refgs.surfels.table import Surfels
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 import contextlib
 import importlib
 import inspect
-import io
 import json
 import os
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -41,12 +39,8 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
         "import": ("import_splats:Import", "convert a 3DGS or 2DGS PLY to a run folder"),
     },
     "Measure and set up": {
-        "profile": (
-            "profile:ProfileCommand",
-            "measure where the time of a step and of a frame goes, with advice",
-        ),
+        "profile": ("profile:Profile", "measure where the time of a step goes"),
         "doctor": ("doctor:Doctor", "examine the installation or a data set: problems and remedies"),
-        "completion": ("completion:Completion", "print the script for completion in a shell"),
     },
 }
 """Group → command → its class (or a function that returns it) and summary."""
@@ -90,47 +84,17 @@ def command_class(name: str) -> tuple[type[Any], str]:
 def parse(argv: Sequence[str]) -> Any:
     """Parse a command line without `refgs`; returns an object of its class (command.py).
 
-    Raises InputError for bad input, SystemExit after `COMMAND --help`.
+    Raises InputError for an unknown command, SystemExit after `COMMAND --help`, and with code 2 for bad
+    options, of which tyro prints what is wrong.
     """
-    name, *options = argv
-    kind, summary = command_class(name)
-    return run_tyro(kind, options, name, f"{summary[0].upper()}{summary[1:]}.")
-
-
-def run_tyro(kind: Any, options: list[str], name: str, summary: str) -> Any:
-    """Call `tyro.cli`, whose boxed errors become an InputError of one sentence."""
     import tyro
     from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
 
-    description = f"{summary}\n\n{inspect.cleandoc(kind.__doc__)}"
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(errors):
-            return tyro.cli(
-                kind,
-                args=options,
-                prog=f"refgs {name}".strip(),
-                description=description,
-                config=(FlagCreatePairsOff, OmitArgPrefixes),
-            )
-    except SystemExit as error:
-        if error.code in (None, 0):
-            raise
-        raise InputError(f"{name}: {_sentence(errors.getvalue())}; see `refgs {name} --help`") from None
-
-
-def _sentence(box: str) -> str:
-    """Return the message in an error box of tyro, in one line.
-
-    Rules separate sections of a box: the first one is the message, or the title of a box without borders
-    (where the output is not UTF-8).
-    """
-    rows = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
-    sections = re.split(r"\n[─-]{4,}\n", "\n".join(rows))
-    text = " ".join(sections[0 if "│" in box or len(sections) == 1 else 1].split())
-    if match := re.match(r"Error parsing (.+?): .*?\[(.*?)\]", text):
-        return f"{match[1].split('/')[-1]}: {match[2]}: no such value"
-    return text.removesuffix(".").replace("(required)", "").strip()
+    name, *options = argv
+    kind, summary = command_class(name)
+    description = f"{summary[0].upper()}{summary[1:]}.\n\n{inspect.cleandoc(kind.__doc__ or '')}"
+    config = (FlagCreatePairsOff, OmitArgPrefixes)
+    return tyro.cli(kind, args=options, prog=f"refgs {name}", description=description, config=config)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -157,8 +121,8 @@ def _run(argv: list[str]) -> int:
         with _standard_output_to_error():
             command.common.prepare()
             result = command.run()
-    except SystemExit:  # after --help
-        return 0
+    except SystemExit as error:  # of tyro: after --help, or what is wrong with the options
+        return int(error.code or 0)
     except InputError as error:
         return _failed(str(error), 2)
     except UnusableError as error:

@@ -2,7 +2,7 @@
 
 `phase` marks a function as a phase, `boundary` a value at which the backward pass enters another phase.
 Without a listener both do nothing: no kernel, no launch, no node of the AD graph. Names of phases are those
-of `profiling.phases`.
+of `evaluation.profile`.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from mi_refgs.io.ownership import RECORD, OutputFolder
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.relight import relight
 from mi_refgs.runs.run import RUN_FILES, Run
-from mi_refgs.viewer.saving import write_view
-from mi_refgs.viewer.viewer_scene import SampleRequest
+from mi_refgs.viewer.panels import write_view
+from mi_refgs.viewer.viewer_scene import DisplayOptions
 from tests.helpers import command_names, refused
 from tests.scenes.tiny import train_command
 
@@ -146,7 +146,7 @@ CASES = [
         "view",
         lambda place: ["view"],
         (),
-        ("views/view_000.png", "views/view_000.json", "views/view_001.exr"),
+        ("views/view_000.png", "views/view_000.json", "views/view_000.exr"),
     ),
 ]
 
@@ -198,11 +198,10 @@ def run(case: Case, place: Path) -> int:
     if case.command != "view":
         return main(case.arguments(place))
     planes = [np.full(4, 0.5, np.float32)] * 4
-    drawable: Any = SimpleNamespace(fine=lambda *_: planes)
-    pose: Any = SimpleNamespace(transforms=lambda *_: {})
-    look: Any = SimpleNamespace(what="image", exposure=0.0)
-    for suffix in (".json", ".exr"):
-        write_view(drawable, SampleRequest(pose, 2, 2, look), place / "views", suffix)
+    frame = SimpleNamespace(background=None, radiance=planes[:3], alpha=planes[3])
+    drawable: Any = SimpleNamespace(fine=lambda *_: frame, light=None)
+    pose: Any = SimpleNamespace(camera=lambda *_: None, transforms=lambda *_: {})
+    write_view(drawable, pose, (2, 2), DisplayOptions(), place / "views")
     return 0
 
 

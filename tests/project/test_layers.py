@@ -24,7 +24,7 @@ FLOORS: list[set[str]] = [
     {"capture", "methods", "plugins", "synthesis"},
     {"runs"},
     {"fitting"},
-    {"evaluation", "profiling"},
+    {"evaluation"},
     {"compare", "editing"},
     {"formats"},
     {"reconstruction"},

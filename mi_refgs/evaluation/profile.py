@@ -1,4 +1,4 @@
-"""Wall time of a training step by phase, between barriers.
+"""Where the time of a training step goes: wall time and kernel launches by phase, between barriers.
 
 The clock listens to the hooks of `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit:
 identities at the boundaries between phases notify the clock of the phase that the pass has reached.
@@ -9,12 +9,15 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import cycle
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from mi_refgs.fitting.setup import FitSetup
+from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.timing import listening
 
 PHASES = (
@@ -40,12 +43,16 @@ covers."""
 WARM_UP = 4
 """Steps with barriers before the first measured one: a kernel that ends at a barrier is compiled anew."""
 
+NEAR_END = 100
+"""Steps before the end of a stage, where every SH degree is in use."""
+
 
 class PhaseClock:
-    """Sums wall time by innermost phase; a `timing.Listener`."""
+    """Sums wall time and kernel launches by innermost phase; a `timing.Listener`."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
+        self.launches: dict[str, int] = defaultdict(int)  # with Dr.Jit's KernelHistory only
         self._phase: str | None = None
         self._since = 0.0
 
@@ -80,9 +87,11 @@ class PhaseClock:
         dr.eval()
         dr.sync_thread()
         now = time.perf_counter()
+        launched = len(dr.kernel_history([dr.KernelType.JIT]))
         if self._phase is not None:
             self.seconds[self._phase] += now - self._since
-        self._phase, self._since = phase, now
+            self.launches[self._phase] += launched
+        self._phase, self._since = phase, time.perf_counter()
 
 
 class _Boundary(dr.CustomOp):
@@ -116,20 +125,45 @@ def _map(value: Any, change: Callable[[Any], Any]) -> Any:
     return value
 
 
-def phase_times(
-    step: Callable[[], Any], steps: int, before: Callable[[], None] = lambda: None
-) -> dict[str, float]:
-    """Median milliseconds of a step by phase, in the order of PHASES; `before` is called before each step.
+@dataclass(frozen=True)
+class Phase:
+    """A row of the table."""
+
+    phase: str
+    ms: float  # median over steps
+    launches: int  # kernels
+    share: float  # of the sum of `ms`
+
+
+def phases_of(step: Callable[[], Any], steps: int) -> list[Phase]:
+    """Measure the phases of a step, in the order of PHASES.
 
     The sum exceeds the time of a step if kernels fuse across phases, since there are barriers in between.
     """
-    rows = []
+    clocks = []
     for _ in range(WARM_UP + steps):
-        before()
         clock = PhaseClock()
-        with listening(clock):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory), listening(clock):
+            dr.kernel_history_clear()
             clock.call("rest", step)
-        rows.append(clock.seconds)
-    rows = rows[WARM_UP:]
-    named = [phase for phase in PHASES if any(phase in row for row in rows)]
-    return {phase: 1e3 * float(np.median([row.get(phase, 0.0) for row in rows])) for phase in named}
+        clocks.append(clock)
+    clocks = clocks[WARM_UP:]
+    named = [phase for phase in PHASES if any(phase in clock.seconds for clock in clocks)]
+    ms = {name: 1e3 * float(np.median([clock.seconds[name] for clock in clocks])) for name in named}
+    whole = max(sum(ms.values()), 1e-9)
+    return [Phase(name, ms[name], clocks[-1].launches[name], ms[name] / whole) for name in named]
+
+
+def stepper(trainer: Trainer, name: str) -> Callable[[], None]:
+    """A function that takes a step near the end of a stage, as often as it is called; no event happens.
+
+    Each step filters its light, so that all are alike.
+    """
+    method, end = trainer.method, trainer.method.stage[name].until
+    begin = max((stage.until for _, stage in method.stages() if stage.until < end), default=0)
+    if method.light is not None:
+        method = replace(method, light=replace(method.light, every=1))
+    trainer.fit.prefilter.close()
+    trainer.setup = FitSetup(method, trainer.data)
+    iterations = cycle(range(max(begin + 1, end - NEAR_END), end + 1))
+    return lambda: trainer.gradient_step(next(iterations))

@@ -1,0 +1,119 @@
+"""`refgs profile`: time is booked where it is spent, and nothing is changed."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from mi_refgs import methods
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.evaluation import profile as phases
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.kernels import timing
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.shade.light.envmap import PrefilteredLight
+from mi_refgs.splat import Composited, Footprints
+from tests.scenes.tiny import SETTINGS
+
+PAUSE = 0.25
+"""Seconds that a planted sleep takes: far more than any phase of the tiny scene, on a busy machine too."""
+
+
+@pytest.fixture(scope="module")
+def trainer(data: Path, method: Path) -> Trainer:
+    """Stages up to iterations 30 and 60; at 35, shading is deferred."""
+    mi.set_variant("llvm_ad_rgb")
+    until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
+    made = Trainer(methods.load(str(method), "quick", [*SETTINGS, *until]), read_dataset(data, "train"))
+    made.fit.iteration = 35
+    return made
+
+
+class SleepyClock(phases.PhaseClock):
+    """Sleeps in the function of one phase."""
+
+    def __init__(self, place: str) -> None:
+        super().__init__()
+        self.place = place
+
+    def call(self, phase: str, function: Callable[[], Any], arguments: Any = ()) -> Any:
+        def slow() -> Any:
+            time.sleep(PAUSE)
+            return function()
+
+        return super().call(phase, slow if phase == self.place else function, arguments)
+
+
+@pytest.mark.parametrize("place", ["project", "splat forward", "optimiser"])
+def test_time_counts_for_innermost_phase(
+    place: str, trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each is inside `rest`."""
+    monkeypatch.setattr(phases, "WARM_UP", 1)
+    monkeypatch.setattr(phases, "PhaseClock", lambda: SleepyClock(place))
+    found = {row.phase: row for row in phases.phases_of(trainer.step, 2)}
+    assert found[place].ms > 1e3 * PAUSE
+    assert max(row.ms for row in found.values() if row.phase != place) < 1e3 * PAUSE
+    assert sum(row.share for row in found.values()) == pytest.approx(1)
+    assert found["splat forward"].launches > 0 and set(found) == {*phases.PHASES}
+
+
+class Notes:
+    """A listener that writes down what it hears, in order, and changes nothing."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.boundaries: dict[str, Any] = {}
+
+    def call(self, phase: str, function: Callable[[], Any], arguments: Any) -> Any:
+        self.calls.append(phase)
+        return function()
+
+    def boundary(self, value: Any, phase: str) -> Any:
+        self.boundaries[phase] = value
+        return value
+
+
+def test_hooks_enclose_the_phases_of_their_names(trainer: Trainer) -> None:
+    notes = Notes()
+    with timing.listening(notes):
+        trainer.step()
+    assert sorted(notes.calls) == sorted([*phases.PHASES[:8], "optimiser"])
+    footprints, features = notes.boundaries.pop("surfels backward")
+    assert isinstance(footprints, Footprints) and dr.width(features[0]) == trainer.surfels.count
+    kinds = {"splat backward": Composited, "shade backward": Frame, "prefilter backward": PrefilteredLight}
+    assert {name: type(value) for name, value in notes.boundaries.items()} == kinds
+
+
+def test_hooks_do_nothing_unless_somebody_listens() -> None:
+    value = [object()]
+    assert timing.boundary(value, "sort") is value
+    twice = timing.phase("sort")(lambda x: 2 * x)
+    assert twice(3) == 6
+    notes = Notes()
+    with timing.listening(notes):
+        assert twice(3) == 6 and timing.boundary(value, "project") is value
+    assert (notes.calls, notes.boundaries) == (["sort"], {"project": value})
+    assert twice(3) == 6 and notes.calls == ["sort"]
+
+
+@pytest.mark.parametrize("folder", ["run", "data"])
+def test_command_prints_a_table(
+    folder: str, finished: Path, data: Path, method: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = finished if folder == "run" else data
+    before = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
+    more = [] if folder == "run" else ["--method", str(method), "--preset", "quick", "--set", *SETTINGS]
+    assert main(["profile", str(path), "--steps", "1", "--json", *more]) == 0
+    rows = json.loads(capsys.readouterr().out)["phases"]
+    assert {"project", "splat forward", "optimiser"} <= {row["phase"] for row in rows}
+    assert all(row["ms"] >= 0 and row["launches"] >= 0 and 0 <= row["share"] <= 1 for row in rows)
+    assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == before
