@@ -68,7 +68,7 @@ PARTS = (
     Part("stability", 15, "benchmarks.stability", "--quick --only light"),
     Part("memory", 6, "benchmarks.memory"),
     *_fits(),
-    Part("frames", 2, "mi_refgs profile {run} --json"),
+    Part("frames", 2, "benchmarks.frames {run}"),
     Part("viewer", 2, "benchmarks.viewer {run}"),
 )
 """In this order: those with {run} need groups of fits."""

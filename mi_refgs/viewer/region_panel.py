@@ -91,9 +91,11 @@ class RegionPanel:
 def save_region(region: Region, data: Dataset) -> str:
     """Write a region in the coordinates of a data set's files; return what the user does next.
 
-    Raises InputError for a region.json that no page wrote, and one that cannot be written.
+    Raises InputError for a region.json that no page wrote, unless it is an estimate, and one that cannot be
+    written.
     """
-    OutputFolder(data.path, OWNER).claim(REGION_FILE)
+    estimated = data.region is not None and data.region.estimated
+    OutputFolder(data.path, OWNER, overwrite=estimated).claim(REGION_FILE)
     moved = replace(region, estimated=False).moved(np.array(data.offset))
     write_json(data.path / REGION_FILE, moved.content)
     return f"saved `{data.path / REGION_FILE}`; next: `refgs train {shlex.quote(str(data.path))} -o RUN`"

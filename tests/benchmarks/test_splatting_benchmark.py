@@ -10,7 +10,6 @@ import pytest
 
 from benchmarks.splatting import measure
 from benchmarks.splatting.cases import Workload, sphere
-from benchmarks.splatting.counts import Counts
 from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability import measure as stability
 from benchmarks.stability.cases import Case, sky
