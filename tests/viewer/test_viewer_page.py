@@ -254,7 +254,7 @@ def test_every_panel_does_what_it_says(tab: Tab, scene: TrainedScene, tmp_path: 
 
     # A bad selection is a sentence; a good one is edited, and saved.
     tab.type("Where", "metallic > ")
-    tab.says("a name or a number is missing")
+    tab.says("(still 6,000 of 6,000 surfels)")
     tab.type("Where", "metallic > 0.5")
     tab.says("3,000 of 6,000 surfels")
     tab.type("Roughness", "0.9")
