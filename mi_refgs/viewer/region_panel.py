@@ -123,8 +123,10 @@ def adjusted(region: Region, centre: np.ndarray, radius: float, heights: Sequenc
 
 def border(region: Region) -> trimesh.Trimesh:
     """Return the border of a region, which is convex: its sphere, cut by its planes."""
-    mesh = trimesh.creation.icosphere(SUBDIVISIONS, region.radius)
-    mesh.apply_translation(region.centre)
+    sphere = trimesh.creation.icosphere(SUBDIVISIONS, region.radius)
+    vertices, faces = np.add(sphere.vertices, region.centre), sphere.faces
     for *normal, distance in region.planes:
-        mesh = mesh.slice_plane(np.multiply(normal, distance), normal)
-    return mesh.convex_hull if len(mesh.faces) else mesh
+        at = np.multiply(normal, distance)
+        vertices, faces, _ = trimesh.intersections.slice_faces_plane(vertices, faces, normal, at)
+    mesh = trimesh.Trimesh(vertices, faces)
+    return mesh.convex_hull if len(faces) else mesh
