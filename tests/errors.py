@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.cli import main
+from mi_refgs.cli.command import METHODS
 from tests.scenes.tiny import train_command, write_data, write_method
 
 LIST = Path(__file__).with_name("errors.txt")
@@ -123,6 +124,7 @@ def listed() -> str:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             prepare()
         found = errors().replace(os.path.realpath(folder), "HERE")
+    found = found.replace(METHODS, "NAMES OF METHODS")
     return found.replace(f"give 1 to {4 * (os.cpu_count() or 1)}", "give 1 to 4 × CORES")
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refgs.fitting.setup import FitSetup
+from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.timing import listening
 

@@ -111,7 +111,7 @@ class MaterialsPanel:
         with gui.add_folder("Materials"):
             hint = "An expression such as `metallic > 0.5 and z < 0`; empty: all surfels."
             self.where = gui.add_text("Where", "", hint=hint)
-            self.note = gui.add_text("Selected", self._counted(), disabled=True)
+            self.note = gui.add_markdown(self._counted())
             self.sliders = {
                 name: gui.add_slider(name.capitalize(), 0, 1, 0.01, 0) for name in scene.materials
             }
@@ -136,9 +136,9 @@ class MaterialsPanel:
         try:
             self.mask = select(self.scene.original, Selection(where=self.where.value.strip() or None))
         except InputError as error:
-            self.note.value = f"{error.advice} (still {self._counted()})"
+            self.note.content = f"{error.advice} (still {self._counted()})"
             return
-        self.values, self.note.value = {}, self._counted()
+        self.values, self.note.content = {}, self._counted()
         self.scene.set_change(None)
         raw = self.scene.scene.surfels.to_numpy()
         for name, slider in self.sliders.items():

@@ -79,7 +79,6 @@ def _options_of(form: str) -> list[str]:
 SEED = "out/runs/data/tiny/seed0"
 CASES = [
     Case("doctor", lambda place: ["doctor", str(place / "data")], ("data",)),
-    Case("completion", lambda place: ["completion", "bash"], ()),
     Case("profile", _on("profile", "--size", "8"), ("bare@run",)),
     Case(
         "demo",

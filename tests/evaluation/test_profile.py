@@ -29,12 +29,10 @@ PAUSE = 0.25
 
 @pytest.fixture(scope="module")
 def trainer(data: Path, method: Path) -> Trainer:
-    """Stages up to iterations 30 and 60; at 35, shading is deferred."""
+    """Stages up to iterations 30 and 60."""
     mi.set_variant("llvm_ad_rgb")
     until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
-    made = Trainer(methods.load(str(method), "quick", [*SETTINGS, *until]), read_dataset(data, "train"))
-    made.fit.iteration = 35
-    return made
+    return Trainer(methods.load(str(method), "quick", [*SETTINGS, *until]), read_dataset(data, "train"))
 
 
 class SleepyClock(phases.PhaseClock):
@@ -59,7 +57,7 @@ def test_time_counts_for_innermost_phase(
     """Each is inside `rest`."""
     monkeypatch.setattr(phases, "WARM_UP", 1)
     monkeypatch.setattr(phases, "PhaseClock", lambda: SleepyClock(place))
-    found = {row.phase: row for row in phases.phases_of(trainer.step, 2)}
+    found = {row.phase: row for row in phases.phases_of(phases.stepper(trainer, "deferred"), 2)}
     assert found[place].ms > 1e3 * PAUSE
     assert max(row.ms for row in found.values() if row.phase != place) < 1e3 * PAUSE
     assert sum(row.share for row in found.values()) == pytest.approx(1)
@@ -85,7 +83,7 @@ class Notes:
 def test_hooks_enclose_the_phases_of_their_names(trainer: Trainer) -> None:
     notes = Notes()
     with timing.listening(notes):
-        trainer.step()
+        phases.stepper(trainer, "deferred")()
     assert sorted(notes.calls) == sorted([*phases.PHASES[:8], "optimiser"])
     footprints, features = notes.boundaries.pop("surfels backward")
     assert isinstance(footprints, Footprints) and dr.width(features[0]) == trainer.surfels.count

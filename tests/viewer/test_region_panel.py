@@ -10,7 +10,7 @@ import pytest
 
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.region import Region, read_region
-from mi_refgs.fitting.control import depth_outside
+from mi_refgs.fitting.exchange import depth_outside
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
