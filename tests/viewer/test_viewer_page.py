@@ -1,4 +1,4 @@
-"""`refgs view` in a real browser: one page on which every panel does what it says; a running fit is slow."""
+"""`refgs view` in a real browser: one page on which every panel does what it says; and that of a running fit."""
 
 from __future__ import annotations
 
@@ -117,7 +117,10 @@ class Tab:
             "width": 0.65 * box["width"],
             "height": 0.8 * box["height"],
         }
-        return np.asarray(Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB"), np.int16)
+        return np.asarray(
+            Image.open(io.BytesIO(self.page.screenshot(clip=clip, timeout=1000 * PATIENCE))).convert("RGB"),
+            np.int16,
+        )
 
     def until(self, done: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
         """The canvas as soon as it is so."""
@@ -211,6 +214,7 @@ def tab(chromium: Any, scene: TrainedScene, tmp_path: Path) -> Iterator[Tab]:
     assert opened.errors == [] and "images displayed" in result
 
 
+@pytest.mark.slow
 def test_every_panel_does_what_it_says(tab: Tab, scene: TrainedScene, tmp_path: Path) -> None:
     """One page, from the first image to the saved view: opening it takes longer than its tests."""
     before = tab.still()
