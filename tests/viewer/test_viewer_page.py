@@ -1,4 +1,4 @@
-"""`refgs view` in a real browser: one page on which every panel does what it says; and that of a running fit."""
+"""`refgs view` in a real browser: every panel of a page, and the page of a running fit."""
 
 from __future__ import annotations
 
