@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mi_refgs import methods
+from mi_refgs.errors import InputError
 from mi_refgs.fitting.image_error import displayed_of, image_of, psnr
 from mi_refgs.fitting.initial import converted, with_columns
 from mi_refgs.fitting.optim import Adam
@@ -158,12 +159,16 @@ def tried(trainer: Trainer, component: str, rival: Trainer, steps: int, gain: fl
     Both are copies, so that an interrupt leaves the fit as it was.
     """
     begin, plain = trainer.iteration, fork(trainer, trainer.method)
-    scores = [validation_psnr(run(one, steps, trainer)) for one in (rival, plain)]
-    gained = scores[0] - scores[1]
+    try:
+        better = validation_psnr(run(rival, steps, trainer))
+    except InputError as error:
+        return Row(component, begin, False, f"its fit failed: {error}")
+    psnr = validation_psnr(run(plain, steps, trainer))
+    gained = better - psnr
     chosen = rival if gained >= gain else plain
     trainer.take(chosen, chosen.method)
     reason = f"{gained:+.2f} dB on validation views, {gain:+.2f} dB required"
-    return Row(component, begin, bool(gained >= gain), reason, scores[1], scores[0])
+    return Row(component, begin, bool(gained >= gain), reason, psnr, better)
 
 
 def validation_psnr(trainer: Trainer) -> float:
