@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import sigmoid
 
@@ -47,10 +46,3 @@ class Owners:
         """Return the triangles (F,) bool of the chosen surfels (N,) bool of the object."""
         padded = np.where(np.pad(chosen, (0, len(self.opacity) - self.count)), self.opacity, 0)
         return np.asarray(padded[self.surfel].sum(axis=1) > MAJORITY * self.total)
-
-
-def object_mesh(scene: TrainedScene) -> Mesh | None:
-    """Return the triangles of the object's own surfels."""
-    if scene.mesh is None or scene.surroundings is None or not len(scene.mesh.faces):
-        return scene.mesh
-    return scene.mesh.part(Owners(scene).of(np.ones(scene.surfels.count, bool)))
