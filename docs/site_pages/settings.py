@@ -39,7 +39,7 @@ def page() -> str:
         title = f"`[{name}]`" if name else "Top level"
         remark = (inspect.getdoc(kind) or "").split("\n\n")[0]
         text += [
-            f"## {title} {{#{name or 'top'}}}",
+            f"## {title} {{#{re.sub('[^a-z_.]+', '-', name) or 'top'}}}",
             remark,
             table(["key", "type", "default", "meaning"], rows),
         ]
@@ -56,7 +56,9 @@ def tables() -> dict[str, type]:
         for field in (one for one in dataclasses.fields(kind) if one.metadata != FLAT):
             name, registry = field.name, field.metadata.get("by_name", {})
             by_name = [(inner, f".{key}") for key, inner in registry.items()]
-            for inner, suffix in by_name or _classes(hints[name]):
+            kinds, usual = field.metadata.get("by_kind", ({}, ""))
+            by_kind = [(inner, "" if key == usual else f", kind = {key}") for key, inner in kinds.items()]
+            for inner, suffix in by_name or by_kind or _classes(hints[name]):
                 if inner is not Window and dataclasses.fields(inner):
                     found[f"{prefix}{name}{suffix}"] = inner
                     waiting.append((f"{prefix}{name}{suffix}.", inner))
@@ -74,7 +76,8 @@ def _classes(hint: Any) -> list[tuple[type, str]]:
 def fields(kind: type) -> list[tuple[str, str, str, str]]:
     """Name, type, default and remark of each field: the comment beside or above it in the source."""
     found = []
-    source, hints = inspect.getsource(kind), typing.get_type_hints(kind)
+    owners = [owner for owner in kind.__mro__ if dataclasses.is_dataclass(owner)]
+    source, hints = "".join(map(inspect.getsource, owners)), typing.get_type_hints(kind)
     for field in (one for one in dataclasses.fields(kind) if one.metadata != NOT_A_SETTING):
         if field.metadata == FLAT:
             found += fields(hints[field.name])

@@ -15,8 +15,8 @@ from mi_refgs.types import TensorXf
 class Known(LightKind):
     """The lat-long map of a file (EXR, HDR), in the orientation of Mitsuba's `envmap` without rotation."""
 
-    file: str = ""
-    height: int | None = None  # texels; width is twice that. None: those of the file
+    file: str = ""  # its path
+    height: int | None = None  # texels; width is twice that; absent: those of the file
 
     name: ClassVar[str] = "file"
     learnt: ClassVar[bool] = False

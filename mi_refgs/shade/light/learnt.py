@@ -9,15 +9,14 @@ from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentL
 from mi_refgs.shade.light.kind import LightKind
 from mi_refgs.types import TensorXf
 
+HEIGHT = {"allowed": (is_height, f"a multiple of 4 from {MIN_HEIGHT}")}
+
 
 @dataclass(frozen=True)
 class Learnt(LightKind):
     """An environment map, each of whose texels is learnt."""
 
-    # Texels; width is twice that.
-    height: int = field(
-        default=DEFAULT_HEIGHT, metadata={"allowed": (is_height, f"a multiple of 4 from {MIN_HEIGHT}")}
-    )
+    height: int = field(default=DEFAULT_HEIGHT, metadata=HEIGHT)  # texels; width is twice that
     radiance: float = 0.5  # initial, everywhere
 
     name: ClassVar[str] = "learnt"
