@@ -114,9 +114,7 @@ def test_wrong_footprint_gradients_fail(monkeypatch: pytest.MonkeyPatch) -> None
 def test_measured_file(tmp_path: Path) -> None:
     assert run.main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
     text = (tmp_path / "stability.json").read_text()
-    assert (
-        '"one surfel"' in text and '"within limits"' in text and "NaN" not in text
-    )
+    assert '"one surfel"' in text and '"within limits"' in text and "NaN" not in text
 
 
 def test_verdicts() -> None:
