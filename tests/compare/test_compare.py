@@ -308,14 +308,17 @@ def test_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Pa
     assert row.seeds == [1] and "future" in row.failed[0]
 
 
-def test_run_that_was_decided_is_accepted(ball: Path, tmp_path: Path) -> None:
+def test_run_that_was_decided_is_accepted(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A finished fit that went on with another method is not taken for one of other settings."""
     job = jobs.plan(tmp_path / "out", [ball], ["auto"], [0], Shared("quick", threads=1))[0]
     rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x")]
     chosen = decide.as_decided(job.method(), rows)
     job.run.create(chosen, str(ball))
     assert chosen.light is None and chosen.surfels.capacity == 2
-    job.run.save_checkpoint(3, {"decisions": np.frombuffer(json.dumps(rows).encode(), np.uint8)})
+    state = {"decisions": np.frombuffer(json.dumps(rows).encode(), np.uint8)}
+    monkeypatch.setattr(Run, "load_checkpoint", lambda _: state)
     jobs.require_same(job)
     job.run.write_method(dataclasses.replace(chosen, seed=3))
     with pytest.raises(InputError, match=r"seed: the run was made with 3"):
