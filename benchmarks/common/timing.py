@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
-import psutil
 
 from benchmarks.common.view import ROOT
 
@@ -59,15 +58,9 @@ def once(call: Callable[[], Any]) -> float:
 
 
 def peak_bytes() -> int:
-    """Largest resident memory of this process since it began, or since `forget_peak`; requires Linux."""
+    """Largest resident memory of this process since it began; requires Linux."""
     status = Path("/proc/self/status").read_text()
     return 1024 * int(status.partition("VmHWM:")[2].split()[0])
-
-
-def forget_peak() -> int:
-    """Let `peak_bytes` begin anew; return the resident memory now."""
-    Path("/proc/self/clear_refs").write_text("5")
-    return int(psutil.Process().memory_info().rss)
 
 
 def in_fresh_process(module: str, *arguments: Any, seconds: float | None = None) -> dict[str, Any]:
