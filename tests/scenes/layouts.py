@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from benchmarks.common.colmap_files import ColmapCamera, ColmapImage, Model, colmap_binary, colmap_text
+from tests.scenes.colmap_files import ColmapCamera, ColmapImage, Model, colmap_binary, colmap_text
 from tests.scenes.dots import COLOURS, POINTS, Shot
 
 SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]

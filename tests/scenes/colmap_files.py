@@ -1,4 +1,4 @@
-"""The files of a COLMAP model, as text and as binary records, for tests and the fuzzer."""
+"""The files of a COLMAP model, as text and as binary records, for tests."""
 
 from __future__ import annotations
 
