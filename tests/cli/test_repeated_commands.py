@@ -52,6 +52,9 @@ def test_a_fit_resumes_with_its_own_options_only(
     again = lambda: reconstruct.fit(data, longer, output=run, resume=True, progress=Progress())  # noqa: E731
     refused(again, "method: iterations: the run was started with 6", " 500")
     assert tree(run / "checkpoints") == state
+    moved = shutil.copytree(data, tmp_path / "moved")
+    assert main(["train", str(moved), "-o", str(run), "--resume"]) == 0
+    assert str(moved) in (run / "dataset.json").read_text()
 
 
 def test_a_data_set_is_completed_or_replaced(tmp_path: Path) -> None:
