@@ -7,6 +7,7 @@ exist are not made again, except images of an exhibit that has been fitted anew.
 from __future__ import annotations
 
 import io
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ from mi_refgs.evaluation.images import (
 )
 from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
 from mi_refgs.io.images import read_png, to_8_bits
-from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.io.ownership import own_folder
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.progress import say
 from mi_refgs.reconstruction import relight as relighting
@@ -186,9 +187,8 @@ def make_gallery(
             f"{out / RECORD}: the gallery was made with {record['settings']}, not {settings}; repeat "
             "that, or choose another --out"
         )
-    images = (FIRST, DECOMPOSITION, RELIT, TURNTABLE, EDITS, LIT, COMPARED)
-    output = OutputFolder(out, "gallery", (RECORD, PAGE, *(f"*/{image}" for image in images)), marker=RECORD)
-    output.claim(RECORD, PAGE, *(f"{name}/{image}" for name in (*scenes, *(rooms or {})) for image in images))
+    if not is_file(out / RECORD):
+        own_folder(out, "gallery")
     found, in_rooms = dict(record["scenes"]), dict(record["rooms"])
 
     def write_page() -> None:
@@ -201,14 +201,14 @@ def make_gallery(
         say(f"{number + 1} of {len(scenes)}: {name}")
         run, others, scores = _fitted(name, work / name, settings)
         if scores != found.get(name):  # images of another fit
-            output.remove(f"{name}/{image}" for image in images)
+            shutil.rmtree(out / name, ignore_errors=True)
         found[name] = scores
         _write_images(name, run, others, scores, out / name, settings, lights)
         write_page()
     for name, folder in (rooms or {}).items():
         in_rooms[name] = evaluation.read_metrics(Run(folder)) or evaluation.evaluate(Run(folder))
         in_rooms[name] = {key: in_rooms[name][key] for key in ("psnr", "psnr_region", "normal_mae_deg")}
-        output.remove(f"{name}/{image}" for image in images)
+        shutil.rmtree(out / name, ignore_errors=True)
         write_room(load(folder), out / name)
         write_page()
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from mi_refgs.cli.command import Flag, OtherData, Output, Rendering, Result, RunFolder, joined
@@ -41,7 +39,7 @@ class Edit:
         from mi_refgs.reconstruction.reconstruction import load
         from mi_refgs.runs.run import Run
 
-        _require_free(self.output)
+        Run(self.output).require_none()
         options = vars(self.selection) | vars(self.change)
         options["set"] = joined(options["set"])
         # Both are checked before the run is read, which takes seconds.
@@ -61,7 +59,7 @@ class Edit:
         sheet = _preview(whole, edited) if self.preview else None
         edited.save(self.output)
         if sheet is not None:
-            write_png(Run(self.output).output.own(PREVIEW), sheet)
+            write_png(self.output / PREVIEW, sheet)
         selected = f"{entry['selected']} of {entry['of']} surfels selected"
         text = f"{self.output}: {selected}; the new run has {entry['surfels']}"
         return Result({"output": str(self.output), **entry}, text)
@@ -78,15 +76,3 @@ def _preview(before: Any, after: Any) -> Any:
     return before_and_after(
         before.trained, after.trained, cameras, views.background, views.is_linear_radiance
     )
-
-
-def _require_free(out: Path) -> None:
-    """Raise InputError unless the path does not exist or is an empty folder."""
-    from mi_refgs.io.files import cannot_write
-
-    try:
-        taken = os.path.lexists(out) and not (out.is_dir() and not any(out.iterdir()))
-    except (OSError, ValueError) as error:
-        raise cannot_write(out, error) from error
-    if taken:
-        raise InputError(f"{out}: output: exists already; choose another -o")

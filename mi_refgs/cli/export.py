@@ -6,10 +6,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from mi_refgs.cli.command import (
-    Flag,
     OptionalOutput,
     OtherData,
     Rendering,
@@ -21,11 +20,6 @@ from mi_refgs.cli.command import (
 )
 from mi_refgs.errors import InputError, SceneError
 from mi_refgs.progress import say
-
-if TYPE_CHECKING:
-    from mi_refgs.io.ownership import OutputFolder
-    from mi_refgs.runs.run import Run
-
 
 MOST_LISTED = 12  # files of a folder that are named one by one; the default export writes 10
 
@@ -39,18 +33,17 @@ class Export:
     """folder (default: RUN itself); with --to the file, or the folder of several"""
     to: Words = ()
     data: OtherData = None
-    overwrite: Flag = False
-    """replace files in the output folder that are not this export of RUN, but never those of a run"""
     format: Any = None
     common: Rendering = Rendering()
 
     def run(self) -> Result:
         """Export the run."""
         from mi_refgs.formats import write
+        from mi_refgs.io.ownership import own_folder
         from mi_refgs.reconstruction.provenance import Provenance
         from mi_refgs.runs.export import export, newest
         from mi_refgs.runs.run import Run
-        from mi_refgs.runs.trained_scene import ARTEFACTS, TrainedScene
+        from mi_refgs.runs.trained_scene import TrainedScene
 
         # Refuse options that do not belong together.
         names = separated(self.to)
@@ -72,19 +65,17 @@ class Export:
             say(f"note: {source.data} is gone; cameras are around the object, or give --data")
         shots = source.shots(fitted, "test", "train")
         target = self.output or folder.path
-        output = _output(folder, target, self.overwrite)
-        if not names:
-            output.require_free(ARTEFACTS)
-
         if names:
             say(f"{target}: writing {', '.join(names)}")
             try:
-                written = write(fitted, names, target, shots, options, folder.path, self.overwrite)
+                written = write(fitted, names, target, shots, options, folder.path)
             except SceneError as error:
                 raise InputError(f"{folder.path}: {error}") from error
             files = [str(path) for paths in written.values() for path in paths]
         else:
-            files = [str(path) for path in export(fitted, target, shots[0].camera, output=output)]
+            if target.resolve() != folder.path.resolve():
+                own_folder(target, f"export of {folder.path.resolve()}")
+            files = [str(path) for path in export(fitted, target, shots[0].camera)]
         data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
         return Result(data, "\n".join(_listed(files)))
 
@@ -130,16 +121,3 @@ def command() -> type[Export]:
     example = ["example:", "  refgs export runs/glossy --to 3dgs-ply cameras -o out"]
     export.__doc__ = "\n".join([Export.__doc__ or "", "", "formats:", *lines, "", *example])
     return export
-
-
-def _output(run: Run, target: Path, overwrite: bool) -> OutputFolder:
-    """Return the folder for the artefacts; raises InputError for the folder of another run."""
-    from mi_refgs.io.ownership import OutputFolder
-    from mi_refgs.runs.run import Run
-
-    if target.resolve() == run.path.resolve():
-        return run.output
-    if Run(target).exists():
-        raise InputError(f"{target}: output: contains a run, which is never overwritten; choose another -o")
-    remedy = "choose another -o, or replace it with --overwrite"
-    return OutputFolder(target, f"export of {run.path.resolve()}", remedy=remedy, overwrite=overwrite)

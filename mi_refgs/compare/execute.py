@@ -82,7 +82,7 @@ def _process(job: Job, stop: threading.Event | None) -> int:
     package = str(Path(__file__).resolve().parents[2])
     paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
     try:
-        log = job.run.output.own(LOG).open("ab")
+        log = (job.run.path / LOG).open("ab")
     except OSError as error:
         raise cannot_write(job.run.path / LOG, error) from error
     with log:

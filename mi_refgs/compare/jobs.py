@@ -19,7 +19,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.decide import differences
 from mi_refgs.io.files import read_json, write_json
-from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.io.ownership import own_folder
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
@@ -68,6 +68,8 @@ class Job:
 
     def write(self) -> None:
         """Write the job into its run folder; raises InputError where that is impossible."""
+        if not self.run.exists():
+            self.run.require_none()
         self.run.write_json(JOB, dataclasses.asdict(self))
 
     @staticmethod
@@ -133,18 +135,12 @@ def settings_of(folder: Path) -> dict[str, Any]:
     return read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
 
 
-def output_folder(folder: Path) -> OutputFolder:
-    """Return the folder of a comparison with its files beside the runs."""
-    files = (SETTINGS, TABLE, TABLE_TEXT, PAGE, f"{PICTURES}/*_psnr.png")
-    return OutputFolder(folder, "compare", files, marker=SETTINGS)
-
-
 def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequence[str]) -> None:
     """Write the settings of the comparison and the jobs, which are rows of the table from now on.
 
     Raises InputError where that is impossible.
     """
-    output_folder(folder).require_free()
+    own_folder(folder, "compare")
     for job in planned:
         job.write()
     before = settings_of(folder)
@@ -157,7 +153,7 @@ def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequenc
         "command": shlex.join(["refgs", *arguments]),
         "version": __version__,
     }
-    write_json(output_folder(folder).own(SETTINGS), about, indent=2)
+    write_json(folder / SETTINGS, about, indent=2)
 
 
 def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:
@@ -196,10 +192,9 @@ def require_settings(folder: Path, shared: Shared) -> None:
 
 
 def require_same(job: Job) -> None:
-    """Raise InputError if the job's folder has a run of another method or other data, or foreign files."""
+    """Raise InputError if the job's folder has a run of another method or other data."""
     if not job.run.exists():
         job.method()
-        job.run.output.require_free()
         return
     remedy = "choose another -o, or remove that run"
     for key, (before, now) in differences(job.run, job.method()).items():

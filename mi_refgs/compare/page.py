@@ -9,7 +9,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from mi_refgs.compare.jobs import PAGE, PICTURES, TABLE, TABLE_TEXT, output_folder
+from mi_refgs.compare.jobs import PAGE, PICTURES, TABLE, TABLE_TEXT
 from mi_refgs.compare.table import (
     Scene,
     Table,
@@ -25,7 +25,6 @@ from mi_refgs.compare.table import (
 from mi_refgs.compare.worker import CURVE, CURVE_KEYS
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_bytes
-from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.runs.run import read_log
 
 STYLE = """
@@ -47,27 +46,26 @@ def write(folder: Path) -> Table:
 
     Raises InputError if there are none, or a file cannot be written.
     """
-    table, output = table_of(folder), output_folder(folder)
+    table = table_of(folder)
     if not table.scenes:
         raise InputError(
             "none given, and the folder has no comparison", "DATA", remedy="name data sets to fit"
         )
-    output.require_free()
     content = json.dumps(asdict(table), indent=1, ensure_ascii=False)
-    write_bytes(output.own(TABLE), f"{content}\n".encode())
-    write_bytes(output.own(TABLE_TEXT), markdown(table).encode())
-    write_page(output, table)
+    write_bytes(folder / TABLE, f"{content}\n".encode())
+    write_bytes(folder / TABLE_TEXT, markdown(table).encode())
+    write_page(folder, table)
     return table
 
 
-def write_page(output: OutputFolder, table: Table) -> None:
+def write_page(folder: Path, table: Table) -> None:
     """Write index.html and its plots; raises InputError if a file cannot be written."""
     title = escape(f"Comparison: {', '.join(scene.name for scene in table.scenes)}")
     about, workers = table.about, int(table.about.get("workers", 1))
     timed = "with the machine to themselves" if workers == 1 else f"while {workers} jobs shared the machine"
     machines = (", ".join(f"{key} {value}" for key, value in machine.items()) for machine in table.machines)
     made = " ".join(["mi_refgs", about.get("version", ""), "with preset", about.get("preset", "")])
-    sections = "".join(_section(output, scene, i) for i, scene in enumerate(table.scenes))
+    sections = "".join(_section(folder, scene, i) for i, scene in enumerate(table.scenes))
     notes = "".join(f"<li>{escape(text)}</li>\n" for text in table.footnotes)
     content = f"""<!DOCTYPE html>
 <html lang="en">
@@ -85,10 +83,10 @@ training were timed {timed}.</p>
 <p>The same numbers: <a href="table.json">table.json</a>, <a href="table.md">table.md</a>.</p>
 </html>
 """
-    write_bytes(output.own(PAGE), content.encode())
+    write_bytes(folder / PAGE, content.encode())
 
 
-def _section(output: OutputFolder, scene: Scene, number: int) -> str:
+def _section(folder: Path, scene: Scene, number: int) -> str:
     """Write the plot of a scene; returns its section of the page, whose best means are bold."""
     columns = columns_of(scene)
     lines = ["".join(f"<th>{escape(head)}</th>" for head in ["method", *map(header, columns)])]
@@ -105,7 +103,7 @@ def _section(output: OutputFolder, scene: Scene, number: int) -> str:
     notes = "".join(f"<p>{escape(remark)}</p>\n" for remark in remarks(scene))
     curves = f"{PICTURES}/{number}_psnr.png"
     plot = ""
-    if write_curves(output.path, scene, output.own(curves)):
+    if write_curves(folder, scene, folder / curves):
         said = "PSNR on a few test views, one line per seed"
         plot = f'<p>{said}:</p>\n<img src="{curves}" alt="{said}">\n'
     return f"<h2>{escape(heading(scene))}</h2>\n<table>\n{body}</table>\n{notes}{plot}"

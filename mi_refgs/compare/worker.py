@@ -39,7 +39,7 @@ def main(folder: Path) -> int:
     try:
         with Run(folder).alone(PATIENCE):
             job = Job.read(folder)
-            job.run.output.remove([FAILED])
+            (folder / FAILED).unlink(missing_ok=True)
             fit_and_measure(job)
     except KeyboardInterrupt:
         return STOPPED

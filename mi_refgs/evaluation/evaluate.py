@@ -75,11 +75,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     method = run.method()
     views = views_of_run(run, method, "test", data)
     renders = render_names(views.views)
-    outputs = [*renders, SHEET, METRICS]
-    run.output.require_free(outputs)
     fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
     per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
-    run.output.claim(*outputs)
 
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)

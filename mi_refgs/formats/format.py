@@ -5,9 +5,6 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-import os
-import tempfile
-import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import cannot_write, make_folder
-from mi_refgs.io.ownership import OutputFolder, require_no_run
+from mi_refgs.io.files import make_folder
+from mi_refgs.io.ownership import own_folder, require_no_run
 from mi_refgs.registry import Registry
 
 if TYPE_CHECKING:
@@ -123,15 +120,13 @@ def write(
     shots: Sequence[Shot],
     options: Mapping[str, Any] | None = None,
     source: Path | None = None,
-    overwrite: bool = False,
 ) -> dict[str, list[Path]]:
     """Write a scene in one format at `output`, or in several in that folder; return the files by format.
 
     `options` are keywords of the formats; each format gets those that it declares. A file that `output` names
-    is replaced. In a folder, only files that the same format wrote for the same `source`, a run folder, are
-    replaced, unless `overwrite` permits all. Raises InputError for an unknown format, an option that
-    none of them has, a scene that one cannot represent, a path that cannot be written, and a foreign file in
-    the way.
+    is replaced; a folder has to be empty, or filled for the same `source`, a run folder. Raises InputError
+    for an unknown format, an option that none of them has, a scene that one cannot represent, and a path
+    that cannot be written.
     """
     chosen, given = [FORMATS.find(name, "--to") for name in names], dict(options or {})
     if not chosen:
@@ -140,20 +135,14 @@ def write(
         able = ", ".join(made.name for made in FORMATS.values() if name in [o.name for o in made.options])
         remedy = f"leave it out, or choose a format that has it ({able or 'none'})"
         raise InputError(f"no option of {', '.join(names)}", f"--{name.replace('_', '-')}", remedy=remedy)
-    remedy = "choose another output, or replace it with --overwrite (overwrite=True in Python)"
     found, shots = {}, tuple(shots)
     for made in chosen:
         target = _target(made, Path(output), len(chosen) > 1)
-        owner = f"{made.name} of {source.resolve() if source else uuid.uuid4().hex}"
         own = {option.name: given.get(option.name, option.default) for option in made.options}
-        if not made.suffix:
-            folder = OutputFolder(target, owner, remedy=remedy, overwrite=overwrite)
-            found[made.name] = _write_folder(folder, made, trained, shots, own)
-            continue
-        if target == Path(output):
+        if made.suffix and target == Path(output):
             require_no_run(target)
         else:
-            OutputFolder(target.parent, owner, remedy=remedy, overwrite=overwrite).claim(target.name)
+            own_folder(target.parent if made.suffix else target, f"export of {source and source.resolve()}")
         found[made.name] = made.writer(trained, target, shots, **own)
     return found
 
@@ -167,22 +156,5 @@ def _target(made: Format, output: Path, several: bool) -> Path:
         output = output / f"{made.name}{made.suffix}"
     elif made.suffix and output.suffix.lower() != made.suffix:
         raise InputError(f"{made.name} writes {made.suffix}", output, "suffix", "name the file so")
-    make_folder(output.parent if made.suffix else output)
+    make_folder(output.parent)
     return output
-
-
-def _write_folder(
-    output: OutputFolder, made: Format, trained: TrainedScene, shots: Sequence[Shot], options: dict[str, Any]
-) -> list[Path]:
-    """Write a format into a temporary folder, then move its files to `output`, or none if one is foreign."""
-    try:
-        with tempfile.TemporaryDirectory(prefix=".refgs_", dir=output.path) as name:
-            stage = Path(name)
-            listed = [path.relative_to(stage) for path in made.writer(trained, stage, shots, **options)]
-            files = [path.relative_to(stage) for path in stage.rglob("*") if path.is_file()]
-            output.claim(*(path.as_posix() for path in files))
-            for path in files:
-                os.replace(stage / path, output.path / path)
-    except OSError as error:
-        raise cannot_write(output.path, error) from error
-    return [output.path / path for path in listed]

@@ -46,13 +46,15 @@ def make_folder(path: Path) -> None:
 
 
 def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Write a file atomically: `write(temporary)` makes a file beside `path`, which is then moved there.
+    """Write a file atomically: `write(temporary)` makes a file beside `path`, which is then moved there. Its
+    folder is made if need be.
 
     The data is flushed to disk before the move, so that also a power cut leaves the old file or the new one.
     The temporary name has the suffix of `path`; a killed process may leave it behind (`remove_temporaries`).
-    Raises InputError if the folder is missing or the file cannot be written.
+    Raises InputError if that fails.
     """
     path = Path(path)
+    make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
     try:
         write(temporary)

@@ -93,7 +93,7 @@ class Previews(Progress):
         map_ = None if trainer.light is None else trainer.light.environment()
         light = None if map_ is None else light_panels(map_.radiance().numpy())
         image = contact_sheet([panels(rendered, view)], light)
-        write_png(trainer.run.output.own(f"previews/{iteration:07d}.png"), image)
+        write_png(trainer.run.path / f"previews/{iteration:07d}.png", image)
 
 
 class ProgressBar(Previews):

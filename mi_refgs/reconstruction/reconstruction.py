@@ -209,7 +209,7 @@ class Reconstruction:
         self.provenance.save(self.trained, Path(folder), self.cameras()[0])
         return load(folder)
 
-    def export(self, form: str, path: str | Path, *, overwrite: bool = False, **options: Any) -> list[Path]:
+    def export(self, form: str, path: str | Path, **options: Any) -> list[Path]:
         """Write a file or folder of another program, such as "3dgs-ply" or "cameras"; returns the files.
 
         `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. In a
@@ -217,7 +217,7 @@ class Reconstruction:
         scene that the format cannot represent, a missing package, and a path that cannot be written.
         """
         shots = self.provenance.shots(self.trained, "test", "train")
-        return formats.write(self.trained, [form], Path(path), shots, options, self.folder, overwrite)[form]
+        return formats.write(self.trained, [form], Path(path), shots, options, self.folder)[form]
 
     # ---------------- changes ----------------
 

@@ -29,7 +29,7 @@ from mi_refgs.evaluation.scores import caption
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
-from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.io.ownership import own_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.new_light import NewLight, truth_under
@@ -37,7 +37,6 @@ from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.trained_scene import ARTEFACTS
 
 SHEET, RESULT = "sheet.png", "relight.json"
 SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
@@ -98,13 +97,14 @@ def relight(
     folder = run.path / "relight" / f"{name}{light.suffix}" if out is None else out
     inside = folder.resolve().is_relative_to(run.path.resolve())  # both may then move together
     owner = f"relight {requested.identity}" + ("" if inside else f" of {run.path.resolve()}")
-    output = OutputFolder(folder, owner, remedy="choose another -o")
+    own_folder(folder, owner)
     kind, place = ("turntable/t", "turntable/") if turntable else ("test/r", "")
     images = [f"{kind}_{i:03d}.png" for i in range(len(cameras))]
-    _prepare(output, kind, [*images, place + RESULT, place + SHEET])
+    for stale in folder.glob(f"{kind}_*.*"):  # of more views, or another data set
+        stale.unlink()
 
     # Files of the scene and its images.
-    export(relit.trained, folder, cameras[0], output=output)
+    export(relit.trained, folder, cameras[0])
     ours = []
     jobs = list(zip(images, cameras, strict=True))
     for image, camera in with_bar(jobs, "relight", unit="view", disable=not progress):
@@ -138,18 +138,6 @@ def relight(
     write_png(folder / place / SHEET, contact_sheet(rows, {"environment map": environment}))
     write_json(folder / place / RESULT, result)
     return result
-
-
-def _prepare(output: OutputFolder, kind: str, names: Sequence[str]) -> None:
-    """Remove the images of the last call for the same light, and claim the names of the new ones."""
-    out = output.path
-    if (out / "config.toml").exists() or any(out.glob("transforms*.json")):
-        what = "contains a run or a data set, whose files would be replaced"
-        raise InputError(what, out, "output", "choose another -o")
-    names = [*names, *(str(Path(name).with_suffix(".exr")) for name in names if name.startswith(kind))]
-    output.require_free([*names, *ARTEFACTS])
-    output.remove(path.relative_to(out).as_posix() for path in output.owned(f"{kind}_*.*"))
-    output.claim(*names)
 
 
 def _true_views(method: Method, folder: Path, views: Dataset) -> Dataset:

@@ -18,7 +18,7 @@ from mi_refgs.formats.cameras import TRANSFORMS, transforms
 from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
-from mi_refgs.io.ownership import OutputFolder
+from mi_refgs.io.ownership import own_folder, owner_of
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.fit import fit
@@ -69,17 +69,18 @@ def import_relightable(
         for split in VIEWS
         for i, camera in enumerate(held_out(cameras or (), split))
     ]
-    views = OutputFolder(run.path / DATA, f"import of {path.resolve()}", FILES)
+    views, owner = run.path / DATA, f"import of {path.resolve()}"
     if not (resume and run.exists()):
         run.require_none()
         pixels = PRESETS.get(wanted.preset, PRESETS[DEFAULT_PRESET]).pixels
         shots = given or shots_around(made.trained.surfels, VIEWS, math.isqrt(pixels), ELEVATION)
         _require_object(made, shots, path)
         with run.alone():
+            own_folder(views, owner)
             _write_views(made, shots, views, progress is not False)
-    elif not views.owned(TRANSFORMS):
-        raise InputError(f"{views.path} has no views of this file", path, "--resume", "choose another -o")
-    return fit(views.path, method, preset=preset, output=output, resume=resume, progress=progress)
+    elif owner_of(views) != owner or not (views / TRANSFORMS).is_file():
+        raise InputError(f"{views} has no views of this file", path, "--resume", "choose another -o")
+    return fit(views, method, preset=preset, output=output, resume=resume, progress=progress)
 
 
 def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> None:
@@ -94,12 +95,11 @@ def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> 
         raise InputError(what, path, "surfels", "crop the object with --box")
 
 
-def _write_views(made: Reconstruction, shots: Sequence[Shot], output: OutputFolder, bar: bool) -> None:
+def _write_views(made: Reconstruction, shots: Sequence[Shot], folder: Path, bar: bool) -> None:
     """Render the views, and write them and then their cameras."""
-    output.claim(*(f"{shot.name}.png" for shot in shots), TRANSFORMS)
     try:
         for shot in with_bar(shots, "views", unit="view", disable=not bar):
-            write_png(output.path / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))
+            write_png(folder / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))
     except KeyboardInterrupt as error:
         raise type(error)("interrupted while views were rendered; give the same command again") from None
-    write_json(output.path / TRANSFORMS, transforms(shots))
+    write_json(folder / TRANSFORMS, transforms(shots))

@@ -23,7 +23,6 @@ from typing import Any
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import BusyError, make_folder, read_json, write_json
-from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import read_mesh, write_mesh
 from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
@@ -44,19 +43,12 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import write_ply
 
 
-def export(
-    fitted: TrainedScene,
-    folder: Path,
-    camera: Camera,
-    more: Sequence[Camera] = (),
-    output: OutputFolder | None = None,
-) -> list[Path]:
+def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera] = ()) -> list[Path]:
     """Write the artefacts into `folder`, each atomically; returns their paths.
 
-    `camera` and `more` become the sensors of scene.xml. `output` says whose artefacts they are, by default
-    those of a run in `folder`. Raises BusyError for a run that another process trains; InputError, with
-    nothing changed, where a file of another owner has the name of an artefact; and if a file cannot be
-    written or a value is not finite.
+    `camera` and `more` become the sensors of scene.xml. Artefacts that the scene does not have are removed.
+    Raises BusyError for a run that another process trains; InputError if a file cannot be written or a value
+    is not finite.
     """
     light = LIGHT_MAP if fitted.light is not None else None
     near = NEAR_FIELD if fitted.near is not None else None
@@ -67,10 +59,9 @@ def export(
         name for name in (SURFELS, light, near, mesh, around, behind, SCENE, MODEL) if name is not None
     ]
     with Run(folder).alone():
-        output = output or Run(folder).output
-        output.require_free(ARTEFACTS)
-        output.remove({*ARTEFACTS} - {*written})
-        output.claim(*written)
+        make_folder(folder)
+        for name in {*ARTEFACTS} - {*written}:
+            (folder / name).unlink(missing_ok=True)
         write_ply(folder / SURFELS, fitted.surfels)
         if fitted.light is not None:
             fitted.light.write(folder / LIGHT_MAP)
@@ -158,17 +149,11 @@ def save(
     It has no checkpoints, logs and previews. Returns its artefacts. `camera` and `more` become the sensors of
     scene.xml; `data` is the data set of its test views, `region` the region of interest; `records` are JSON
     files by name. config.toml is written last: if it is there, the folder is complete. Raises InputError for
-    a folder that contains a run, has a foreign file in the way or cannot be written, and for a value that is
-    not finite.
+    a folder that contains a run or other files or cannot be written, and for a value that is not finite.
     """
     run = Run(folder)
-    if run.exists():
-        raise InputError(
-            "contains a run already, which nothing is written into", folder, remedy="choose another folder"
-        )
-    make_folder(folder)
+    run.require_none()
     with run.alone():
-        run.output.require_free()
         written = export(trained, folder, camera, more)
         if data is not None:
             run.write_dataset(str(data.resolve()), region)

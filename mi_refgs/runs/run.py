@@ -24,7 +24,7 @@ from mi_refgs.data.poses import rigid
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
-from mi_refgs.io.ownership import RUN, OutputFolder
+from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
 from mi_refgs.runs import checkpoint
@@ -34,15 +34,6 @@ CAMERAS = "cameras.json"  # the decision about camera corrections, and the corre
 LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
 LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
-RUN_FILES = (
-    *(CONFIG, DATASET, LOG, "curve.jsonl", "checkpoints/*.npz", "previews/*.png"),
-    *("surfels.ply", "envmap.exr", "near_field.npz", "mesh.ply", "surroundings.ply", "background.exr"),
-    *("scene.xml", "model.json"),
-    *("exposure.json", CAMERAS, "decisions.json", "edit.json", "preview.png"),
-    *("metrics.json", "contact_sheet.png", "eval/*.png"),
-    *("job.json", "failed.json", "job.log"),
-)
-"""Patterns of all files that commands write into a run folder, relative to it."""
 CHECKPOINTS_KEPT = 2
 """One could be enough, since checkpoints are written atomically; two survive a disk that loses writes."""
 
@@ -52,21 +43,20 @@ class Run:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.output = OutputFolder(self.path, RUN, RUN_FILES, marker=CONFIG)
 
     def exists(self) -> bool:
         """Whether the folder contains a run."""
         return (self.path / CONFIG).is_file()
 
     def require_none(self) -> None:
-        """Raise InputError if the folder contains a run, or a foreign file of the same name as one of its."""
+        """Make the folder of a new run; raises InputError if it contains a run or other files."""
         if (self.path / CONFIG).exists():
             raise InputError(
                 "contains a run already",
                 self.path,
                 remedy="add --resume to go on with it, or choose another -o",
             )
-        self.output.require_free()
+        own_folder(self.path, RUN)
 
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Lock the run for changes; raises BusyError if another process keeps it locked for `wait` seconds.
@@ -93,11 +83,11 @@ class Run:
     def write_dataset(self, dataset: str, region: Region | None) -> None:
         """Write the folder of the data set, and its region of interest if there is one."""
         record = {"path": dataset} | ({} if region is None else {"region": region.content})
-        write_bytes(self.output.own(DATASET), json.dumps(record).encode())
+        write_bytes(self.path / DATASET, json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
         """Write the resolved method to config.toml."""
-        write_bytes(self.output.own(CONFIG), dump(method).encode())
+        write_bytes(self.path / CONFIG, dump(method).encode())
 
     def method(self) -> Method:
         """The resolved method; raises InputError if this is no run folder."""
@@ -154,9 +144,8 @@ class Run:
 
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
         """Save a state, then remove all but the newest CHECKPOINTS_KEPT; raises InputError on failure."""
-        write_bytes(self.output.own(f"checkpoints/{iteration:07d}.npz"), checkpoint.encode(state))
-        own = self.output.owned("checkpoints/*.npz")
-        for old in [path for path in self.checkpoints() if path in own][:-CHECKPOINTS_KEPT]:
+        write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", checkpoint.encode(state))
+        for old in self.checkpoints()[:-CHECKPOINTS_KEPT]:
             old.unlink(missing_ok=True)
 
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:
@@ -190,12 +179,11 @@ class Run:
         self._make_folders()
         for folder in (self.path, self.path / "checkpoints", self.path / "previews"):
             remove_temporaries(folder)
-        own = self.output.owned("checkpoints/*.npz")
         for path in self.checkpoints():
-            if int(path.stem) > iteration and path in own:
+            if int(path.stem) > iteration:
                 path.unlink()
-        for log in {self.output.own(LOG), *self.output.owned("*.jsonl")}:
-            text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+        for log in self.path.glob("*.jsonl"):
+            text = log.read_text(encoding="utf-8", errors="replace")
             kept = [line for line in text.splitlines() if _logged(line) <= iteration]
             write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
 
@@ -206,7 +194,7 @@ class Run:
 
         Raises InputError if it cannot be written.
         """
-        path = self.output.own(name)
+        path = self.path / name
         line = {k: None if isinstance(x, float) and not math.isfinite(x) else x for k, x in line.items()}
         try:
             with path.open("a", encoding="utf-8") as file:
@@ -215,8 +203,8 @@ class Run:
             raise cannot_write(path, error) from error
 
     def write_json(self, name: str, content: Any) -> None:
-        """Write a JSON file of the run; raises InputError for a foreign file of this name."""
-        write_json(self.output.own(name), content, indent=2)
+        """Write a JSON file of the run; raises InputError if it cannot be written."""
+        write_json(self.path / name, content, indent=2)
 
     def _make_folders(self) -> None:
         try:

@@ -12,11 +12,10 @@ import trimesh
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import REGION_FILE, Plane, Region
+from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_json
-from mi_refgs.io.ownership import OutputFolder
 from mi_refgs.viewer.page import Page
 
-OWNER = "view"
 """Owner of the region.json that a page writes into a data set."""
 RADII = (0.1, 3.0)
 """Smallest and largest radius of the slider, in the first radius."""
@@ -85,17 +84,20 @@ class RegionPanel:
 
     def save(self) -> None:
         """Write the region; raises InputError as `save_region` does."""
-        self.note.content = save_region(self.region, self.data)
+        self.note.content = save_region(self.region, self.data, self.saved)
+        self.saved = True
 
 
-def save_region(region: Region, data: Dataset) -> str:
+def save_region(region: Region, data: Dataset, again: bool = False) -> str:
     """Write a region in the coordinates of a data set's files; return what the user does next.
 
-    Raises InputError for a region.json that no page wrote, unless it is an estimate, and one that cannot be
-    written.
+    Raises InputError for a region.json that is there, unless it is an estimate or this page saves it `again`,
+    and one that cannot be written.
     """
     estimated = data.region is not None and data.region.estimated
-    OutputFolder(data.path, OWNER, overwrite=estimated).claim(REGION_FILE)
+    if (data.path / REGION_FILE).exists() and not (estimated or again):
+        remedy = "move it away, or correct it by hand"
+        raise InputError("exists, and is no estimate", data.path / REGION_FILE, "output", remedy)
     moved = replace(region, estimated=False).moved(np.array(data.offset))
     write_json(data.path / REGION_FILE, moved.content)
     return f"saved `{data.path / REGION_FILE}`; next: `refgs train {shlex.quote(str(data.path))} -o RUN`"

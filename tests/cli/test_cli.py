@@ -20,7 +20,7 @@ from mi_refgs.fitting.runner import load_method
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png, srgb_from_linear
-from mi_refgs.io.ownership import RECORD
+from mi_refgs.io.ownership import MARK
 from mi_refgs.methods.read import PRESETS, load_resolved, names
 from mi_refgs.runs.views import sized
 from tests.helpers import ROOT, command_names, command_options, refused
@@ -101,7 +101,7 @@ def test_train_writes_a_run_folder(finished: Path) -> None:
     lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4, 6]
     left_over = [path.name for path in finished.rglob("*") if path.name.startswith(".")]
-    assert left_over == [RECORD]
+    assert left_over == [MARK]
 
 
 def test_train_warns_about_few_views(

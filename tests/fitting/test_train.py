@@ -286,7 +286,7 @@ def test_full_disk_leaves_what_was_saved(
 
 def test_log_that_cannot_be_written_is_one_sentence(method: Method, tmp_path: Path) -> None:
     run = run_folder(tmp_path / "run", method)
-    run.output.own("metrics.jsonl").mkdir()
+    (run.path / "metrics.jsonl").mkdir(parents=True)
     with pytest.raises(InputError, match=r"metrics\.jsonl: output: cannot be written \(.*\); choose"):
         Trainer(method, ball(), run).train()
 

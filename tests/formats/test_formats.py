@@ -16,7 +16,7 @@ import pytest
 from mi_refgs.cli import main
 from mi_refgs.formats import FORMATS, Format, Option
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
-from mi_refgs.io.ownership import RECORD
+from mi_refgs.io.ownership import MARK
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.run import Run
@@ -68,7 +68,7 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
     names = "plain,cameras, exr, 3dgs-ply, gltf-splats,"
     assert main(["export", str(finished), "--to", names, "-o", str(tmp_path / "out")]) == 0
     files = {path.name for path in (tmp_path / "out").iterdir()}
-    assert files == {RECORD, "plain.txt", "cameras", "exr.exr", "3dgs-ply.ply", "gltf-splats.glb"}
+    assert files == {MARK, "plain.txt", "cameras", "exr.exr", "3dgs-ply.ply", "gltf-splats.glb"}
     assert (tmp_path / "out" / "plain.txt").read_text() == "3"
     assert (tmp_path / "out" / "cameras" / "transforms.json").is_file()
 
