@@ -34,7 +34,7 @@ class RegionPanel:
 
     def __init__(self, page: Page, data: Dataset, region: Region) -> None:
         """Add the controls, which begin with a region of a data set."""
-        self.page, self.data, self.first = page, data, region
+        self.page, self.data, self.first, self.saved = page, data, region, False
         gui, radius = page.server.gui, region.radius
         with gui.add_folder("Region of interest", expand_by_default=False):
             self.show = gui.add_checkbox("Border", False, hint="Display it, and arrows that move its centre.")
