@@ -165,4 +165,4 @@ def test_relight_refuses_another_map_of_the_same_name(place: Path, tmp_path: Pat
     first, second = (NewLight(tmp_path / name / "studio.exr") for name in ("first", "second"))
     for _ in range(2):
         assert Path(relight(Run(tmp_path / "run"), first, turntable=1)["output"]).name == "studio"
-    refused(lambda: relight(Run(tmp_path / "run"), second, turntable=1), "choose another -o")
+    refused(lambda: relight(Run(tmp_path / "run"), second, turntable=1), "studio: output: has other files")

@@ -49,16 +49,6 @@ def test_a_loss_that_a_run_lacks_stays_absent(losses: dict[str, methods.LossWeig
     assert methods.load_resolved(path) == method
 
 
-def test_presets_scale_the_whole_schedule() -> None:
-    quick, standard = methods.load("ref_gaussian", "quick"), methods.load("ref_gaussian", "standard")
-    factor = standard.iterations / quick.iterations
-    for name, stage in quick.stage.items():
-        assert standard.stage[name].until == pytest.approx(stage.until * factor, abs=factor)
-    long, short = (method.event["densify"] for method in (standard, quick))
-    assert isinstance(long, Densify) and isinstance(short, Densify)
-    assert long.when.until == pytest.approx(short.when.until * factor, abs=factor)
-
-
 def test_a_preset_of_numbers_scales_as_a_named_one() -> None:
     """With the numbers of `quick`, the method is that of `quick`; other ones survive a reload by its name."""
     quick = methods.PRESETS["quick"]
@@ -248,13 +238,6 @@ def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> Non
     path = tmp_path / "own.toml"
     path.write_text(text)
     refused(lambda: methods.load(str(path)), "own.toml", *words)
-
-
-def test_unknown_names_list_the_known_ones() -> None:
-    with pytest.raises(InputError, match="ref_gaussian"):
-        methods.load("no_such_method")
-    with pytest.raises(InputError, match="standard"):
-        methods.load("ref_gaussian", "slow")
 
 
 def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
