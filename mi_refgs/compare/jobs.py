@@ -19,7 +19,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.decide import differences
 from mi_refgs.io.files import read_json, write_json
-from mi_refgs.io.ownership import own_folder
+from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
@@ -68,8 +68,7 @@ class Job:
 
     def write(self) -> None:
         """Write the job into its run folder; raises InputError where that is impossible."""
-        if not self.run.exists():
-            self.run.require_none()
+        own_folder(self.run.path, RUN)
         self.run.write_json(JOB, dataclasses.asdict(self))
 
     @staticmethod

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import cannot_write, make_folder
+from mi_refgs.io.files import cannot_write, write_bytes
 
 MARK = ".refgs"  # file of an output folder, with its owner
 RUN = "run"  # owner of a run folder, in which every command writes
@@ -19,22 +19,25 @@ def owner_of(folder: Path) -> str | None:
         return None
 
 
-def own_folder(folder: Path, owner: str) -> None:
-    """Make an output folder and write its owner there.
-
-    Raises InputError, with nothing changed, for a folder that names another owner, or that has files besides
-    hidden ones and names none; and for one that cannot be written.
-    """
-    if (found := owner_of(folder)) == owner:
-        return
-    make_folder(folder)
+def require_own(folder: Path, owner: str) -> None:
+    """Raise InputError for a folder that names another owner, or that has files besides hidden ones and names
+    none."""
     try:
-        if found is not None or any(not path.name.startswith(".") for path in folder.iterdir()):
-            other = "belongs to a run, which is never overwritten" if found == RUN else "has other files"
-            raise InputError(other, folder, "output", "choose an empty folder, or a new one")
-        (folder / MARK).write_text(owner, encoding="utf-8")
+        if (found := owner_of(folder)) == owner or not folder.exists():
+            return
+        if found is None and all(path.name.startswith(".") for path in folder.iterdir()):
+            return
     except OSError as error:
         raise cannot_write(folder, error) from error
+    what = "belongs to a run, which is never overwritten" if found == RUN else "has other files"
+    raise InputError(what, folder, "output", "choose an empty folder, or a new one")
+
+
+def own_folder(folder: Path, owner: str) -> None:
+    """Make an output folder and write its owner there; raises InputError as `require_own` does, with nothing
+    changed, and if it cannot be written."""
+    require_own(folder, owner)
+    write_bytes(folder / MARK, owner.encode())
 
 
 def require_no_run(path: Path) -> None:

@@ -18,7 +18,7 @@ from mi_refgs.formats.cameras import TRANSFORMS, transforms
 from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
-from mi_refgs.io.ownership import own_folder, owner_of
+from mi_refgs.io.ownership import RUN, own_folder, owner_of
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.fit import fit
@@ -76,6 +76,7 @@ def import_relightable(
         shots = given or shots_around(made.trained.surfels, VIEWS, math.isqrt(pixels), ELEVATION)
         _require_object(made, shots, path)
         with run.alone():
+            own_folder(run.path, RUN)
             own_folder(views, owner)
             _write_views(made, shots, views, progress is not False)
     elif owner_of(views) != owner or not (views / TRANSFORMS).is_file():

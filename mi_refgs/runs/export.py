@@ -23,6 +23,7 @@ from typing import Any
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import BusyError, make_folder, read_json, write_json
+from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import read_mesh, write_mesh
 from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
@@ -153,6 +154,7 @@ def save(
     """
     run = Run(folder)
     run.require_none()
+    own_folder(folder, RUN)
     with run.alone():
         written = export(trained, folder, camera, more)
         if data is not None:

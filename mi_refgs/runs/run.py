@@ -24,7 +24,7 @@ from mi_refgs.data.poses import rigid
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
-from mi_refgs.io.ownership import RUN, own_folder
+from mi_refgs.io.ownership import RUN, own_folder, require_own
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
 from mi_refgs.runs import checkpoint
@@ -49,14 +49,14 @@ class Run:
         return (self.path / CONFIG).is_file()
 
     def require_none(self) -> None:
-        """Make the folder of a new run; raises InputError if it contains a run or other files."""
+        """Raise InputError if the folder contains a run or other files."""
         if (self.path / CONFIG).exists():
             raise InputError(
                 "contains a run already",
                 self.path,
                 remedy="add --resume to go on with it, or choose another -o",
             )
-        own_folder(self.path, RUN)
+        require_own(self.path, RUN)
 
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Lock the run for changes; raises BusyError if another process keeps it locked for `wait` seconds.
@@ -76,6 +76,7 @@ class Run:
         Raises InputError as `require_none` does, and if the folder cannot be written.
         """
         self.require_none()
+        own_folder(self.path, RUN)
         self._make_folders()
         self.write_dataset(dataset, region)
         self.write_method(method)
