@@ -36,10 +36,10 @@ class Edit:
         from mi_refgs.editing.change import assignments
         from mi_refgs.editing.selection import parse_condition
         from mi_refgs.io.images import write_png
+        from mi_refgs.io.ownership import require_own
         from mi_refgs.reconstruction.reconstruction import load
-        from mi_refgs.runs.run import Run
 
-        Run(self.output).require_none()
+        require_own(self.output, "")
         options = vars(self.selection) | vars(self.change)
         options["set"] = joined(options["set"])
         # Both are checked before the run is read, which takes seconds.

@@ -59,7 +59,7 @@ def test_a_saved_region_is_that_of_the_next_fit(data: Dataset) -> None:
     assert f"refgs train {data.path} -o RUN" in save_region(replace(FITTED, estimated=True), far)
     found = read_region(data.path)
     assert found is not None and not found.estimated and found.is_close(FITTED.moved(np.array(far.offset)))
-    save_region(REGION, data)
+    save_region(REGION, data, again=True)
     assert read_dataset(data.path, "test").region == REGION
 
 
