@@ -34,7 +34,7 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "Use": {
         "relight": ("relight:Relight", "render a run under another environment map, with scores if possible"),
-        "edit": ("edit:Edit", "write a new run with surfels changed, cut, moved, duplicated or joined"),
+        "edit": ("edit:Edit", "write a new run with surfels changed or cut"),
         "export": ("export:command", "write the files of a run anew, or files of other programs"),
         "import": ("import_splats:Import", "convert a 3DGS or 2DGS PLY to a run folder"),
     },
