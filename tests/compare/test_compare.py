@@ -23,6 +23,7 @@ from mi_refgs.compare import execute, jobs, page
 from mi_refgs.compare.jobs import Job, Shared
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import decide
+from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.runs.run import Run
 from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS, write_data, write_method
@@ -69,7 +70,8 @@ def compared(
     """A comparison in which one of four jobs failed, and its exit code; do not change it."""
     folder = tmp_path_factory.mktemp("compared")
     broken = folder / "runs" / "ball" / "tiny" / "seed1"
-    broken.mkdir(parents=True)
+    own_folder(folder, "compare")
+    own_folder(broken, RUN)
     (broken / "checkpoints").write_text("in the way")
     code = main(command(ball, folder, *variants, more=("--seeds", "0,1", "--workers", "2")))
     return folder, code
