@@ -136,6 +136,7 @@ def test_interrupted_job_resumes_from_checkpoint(
     """With one thread the resumed run is the straight one; what came after the checkpoint is done again."""
     done = compared[0] / "runs" / "ball" / "other" / "seed0"
     run = tmp_path / "runs" / "ball" / "other" / "seed0"
+    own_folder(tmp_path, "compare")
     shutil.copytree(done, run)
     (run / "checkpoints" / "0000006.npz").unlink()
     for name in ("metrics.json", "surfels.ply", "model.json"):
