@@ -63,7 +63,7 @@ class Relight:
         )
         if result["warning"]:
             warn(f"{self.run_folder}: {result['warning']}")
-        lines = [f"{len(result['pictures'])} images, scene.xml and {result['sheet']} in {result['output']}"]
+        lines = [f"{len(result['images'])} images, scene.xml and {result['sheet']} in {result['output']}"]
         if result["psnr"] is None:
             lines.append(f"score: none: {result['score_reason']}")
         else:

@@ -48,5 +48,5 @@ class View:
         finally:
             page.close()
         shown = page.loop.delivered
-        data = {"url": page.url, "pictures": shown}  # name of this key in version 0.1
+        data = {"url": page.url, "images": shown}
         return Result(data, f"{shown} images displayed")

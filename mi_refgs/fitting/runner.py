@@ -307,29 +307,20 @@ def method_for(
 
 def _require_same(run: Run, made: Method, choice: Choice) -> None:
     """Raise InputError if what is given for a resumed run would have made another method of it."""
-    wanted, preset, file = choice.method, choice.preset, made.file
-    changes = methods.assignments(choice.settings)
-    if isinstance(wanted, Method):
-        _require(run, "method", wanted)
-    elif wanted is not None:
-        file = wanted
-        now = methods.load(file, made.preset or DEFAULT_PRESET, made.assignments)
-        _require(run, "--method (--for)", now)
-    if preset is not None and preset != made.preset:
+    now = choice.method
+    if not isinstance(now, Method):
+        if not (now or choice.preset or choice.settings):
+            return
+        settings = methods.assignments(choice.settings) or made.assignments
+        now = methods.load(now or made.file, choice.preset or made.preset or DEFAULT_PRESET, settings)
+    for key, (before, after) in sorted(
+        differences(run, now).items(), key=lambda item: item[0] not in ("name", "preset")
+    ):
         raise InputError(
-            f"{run.path / 'config.toml'}: --preset: the run was started with '{made.preset}', not "
-            f"'{preset}'; drop --preset or choose another -o"
-        )
-    if changes and tuple(changes) != made.assignments:
-        _require(run, "--set", methods.load(file, made.preset, changes))
-
-
-def _require(run: Run, option: str, now: Method) -> None:
-    """Raise InputError if the method of a run is not that of an option."""
-    for key, (before, after) in sorted(differences(run, now).items(), key=lambda item: item[0] != "name"):
-        raise InputError(
-            f"{run.path / 'config.toml'}: {option}: {key}: the run was started with {before}, and "
-            f"would now have {after}; drop {option} or choose another -o"
+            f"the run was started with {before}, and would now have {after}",
+            run.path / "config.toml",
+            key,
+            "drop what says so, or choose another -o",
         )
 
 

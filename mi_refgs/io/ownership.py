@@ -9,6 +9,12 @@ from mi_refgs.io.files import cannot_write, write_bytes
 
 MARK = ".refgs"  # file of an output folder, with its owner
 RUN = "run"  # owner of a run folder, in which every command writes
+RUN_FILES = {
+    *("config.toml", "dataset.json", "metrics.jsonl", "decisions.json", "exposure.json", "cameras.json"),
+    *("surfels.ply", "mesh.ply", "surroundings.ply", "envmap.exr", "background.exr", "near_field.npz"),
+    *("scene.xml", "model.json", "metrics.json", "contact_sheet.png", "edit.json", "preview.png"),
+}
+"""What commands write in a run folder; a user's images and exports there have other names."""
 
 
 def owner_of(folder: Path) -> str | None:
@@ -41,8 +47,8 @@ def own_folder(folder: Path, owner: str) -> None:
 
 
 def require_no_run(path: Path) -> None:
-    """Raise InputError if a file that the user names as output is one of a run folder."""
-    if path.exists() and owner_of(path.parent) == RUN:
+    """Raise InputError if a file that the user names as output is one that a run consists of."""
+    if path.name in RUN_FILES and path.exists() and owner_of(path.parent) == RUN:
         raise InputError(
             "belongs to a run, which is never overwritten", path, "output", "choose another output"
         )

@@ -123,7 +123,7 @@ def relight(
         "light": str(requested.path),
         "rotate": light.rotate,
         "exposure": light.exposure,
-        "pictures": images,
+        "images": images,
         "samples": samples_per_axis(samples) ** 2,
         "warning": FITTED_COLOUR if fitted.trained.shading.diffuse == "sh" else None,
     } | {"psnr": None, "psnr_scaled": None, "score_reason": reason}

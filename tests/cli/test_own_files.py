@@ -14,7 +14,7 @@ from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.formats import FORMATS, options_of
 from mi_refgs.io.exr import write_exr
-from mi_refgs.io.ownership import own_folder, owner_of
+from mi_refgs.io.ownership import MARK, RUN_FILES, own_folder, owner_of
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.relight import relight
 from mi_refgs.runs.run import Run
@@ -111,10 +111,17 @@ def test_a_file_that_the_user_names_is_replaced_unless_a_run_has_it(
     command = [command[0], str(place / "run"), *command[2:]]
     assert main([*command, "-o", str(tmp_path / f"own{suffix}")]) == 0
     assert (tmp_path / f"own{suffix}").read_bytes() != FOREIGN
-    before = contents(place / "run")
-    file = place / "run" / ("envmap.exr" if suffix == ".exr" else "surfels.ply")
+    run = Path(shutil.copytree(place / "run", tmp_path / "copy"))
+    for _ in range(2):  # also in the run's folder, where it is no file of the run
+        assert main([*command, "-o", str(run / f"own{suffix}")]) == 0
+    before = contents(run)
+    file = run / ("envmap.exr" if suffix == ".exr" else "surfels.ply")
     refused([*command, "-o", file], f"{file}: output: belongs to a run, which is never overwritten")
-    assert contents(place / "run") == before
+    assert contents(run) == before
+
+
+def test_files_of_a_run_are_known(finished: Path) -> None:
+    assert {path.name for path in finished.iterdir() if path.is_file()} - {MARK} <= RUN_FILES
 
 
 # ---------------- what is a command's own ----------------

@@ -45,12 +45,16 @@ def test_a_fit_resumes_with_its_own_options_only(
     other = tmp_path / "twin" / method.name  # of the same name
     other.parent.mkdir()
     other.write_text(f"{METHOD}[rates]\ndecay = 0.25\n")
-    changes = {"--method": other, "--for": "relighting", "--preset": "standard", "--set": "loss.ssim=0.4"}
-    for option, value in changes.items():
-        refused([*argv, option, value], option)
+    changes = {
+        "--method": (other, "rates.decay"),
+        "--preset": ("standard", "preset"),
+        "--set": ("loss.ssim=0.4", "loss.ssim.weight"),
+    }
+    for option, (value, key) in changes.items():
+        refused([*argv, option, value], f"config.toml: {key}: the run was started with")
     longer = dataclasses.replace(config, iterations=500)
     again = lambda: reconstruct.fit(data, longer, output=run, resume=True, progress=Progress())  # noqa: E731
-    refused(again, "method: iterations: the run was started with 6", " 500")
+    refused(again, "iterations: the run was started with 6", " 500")
     assert tree(run / "checkpoints") == state
     moved = shutil.copytree(data, tmp_path / "moved")
     assert main(["train", str(moved), "-o", str(run), "--resume"]) == 0

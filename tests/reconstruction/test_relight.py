@@ -97,7 +97,7 @@ def test_relit_files_have_the_encoding_of_a_data_set(known: Path, dusk: dict[str
     out = known / "dusk"
     assert Path(dusk["light"]) == known / "dusk.exr"
     assert json.loads((out / "relight.json").read_text()) == json.loads(json.dumps(dusk))
-    for name in dusk["pictures"]:
+    for name in dusk["images"]:
         linear, displayed = read_exr_image((out / name).with_suffix(".exr")), read_png(out / name)
         assert linear.shape == displayed.shape == (SIZE, SIZE, 4)
         straight = displayed[..., :3] * displayed[..., 3:] + 1 - displayed[..., 3:]
@@ -133,8 +133,8 @@ def test_common_scale_is_fitted_per_channel(rng: np.random.Generator) -> None:
 
 def test_turntable_surrounds_the_object(known: Path) -> None:
     relit = relight(Run(known / "run"), NewLight(known / "dusk.exr"), known / "turn", turntable=3)
-    assert len(relit["pictures"]) == 3 and relit["psnr"] is None and "turntable" in relit["score_reason"]
-    frames = [read_png(known / "turn" / name)[..., 3] for name in relit["pictures"]]
+    assert len(relit["images"]) == 3 and relit["psnr"] is None and "turntable" in relit["score_reason"]
+    frames = [read_png(known / "turn" / name)[..., 3] for name in relit["images"]]
     assert all(0.05 < frame.mean() < 0.9 and frame[0].max() == 0 for frame in frames)
     assert not (known / "turn" / "test").exists() and (known / "turn" / "scene.xml").is_file()
     fitted, views = TrainedScene.read(known / "run"), read_dataset(known / "data", "test").views
@@ -169,8 +169,8 @@ def test_run_without_data_is_relit_around_the_object(
     assert "cameras are around the object" in result["score_reason"] and result["psnr"] is None
     relit = load(run).relight(light)
     cameras = relit.turntable(turntable) if turntable else relit.cameras()
-    assert len(result["pictures"]) == len(cameras) and (folder / "sheet.png").is_file()
-    for name, camera in zip(result["pictures"], cameras, strict=True):
+    assert len(result["images"]) == len(cameras) and (folder / "sheet.png").is_file()
+    for name, camera in zip(result["images"], cameras, strict=True):
         shown = read_exr_image((out / name).with_suffix(".exr"))
         np.testing.assert_allclose(shown, relit.render(camera), atol=1e-4)
         assert 0.05 < shown[..., 3].mean() < 0.9
