@@ -59,12 +59,8 @@ EXIT_CODES = {
 
 def overview() -> str:
     """Return what `refgs --help` prints."""
-    lines = [
-        "usage: refgs COMMAND …",
-        "",
-        "Reconstruct shiny objects from images as relightable Mitsuba scenes.",
-        "",
-    ]
+    lines = ["usage: refgs COMMAND …", ""]
+    lines += ["Reconstruct shiny objects from images as relightable Mitsuba scenes.", ""]
     for group, commands in COMMANDS.items():
         lines += [f"{group}:", *(f"  {name:<12}{summary}" for name, (_, summary) in commands.items()), ""]
     lines += ["refgs COMMAND --help: options, defaults and an example; refgs --version: the version.", ""]
@@ -75,7 +71,7 @@ def command_class(name: str) -> tuple[type[Any], str]:
     """Import a command; returns its class and summary. Raises InputError for an unknown name."""
     known = {name: entry for group in COMMANDS.values() for name, entry in group.items()}
     if name not in known:
-        raise InputError(f"{name}: no such command; give one of {', '.join(known)}")
+        raise InputError("no such command", name, remedy=f"give one of {', '.join(known)}")
     module, _, attribute = known[name][0].partition(":")
     found = getattr(importlib.import_module(f"mi_refgs.cli.{module}"), attribute)
     return found if isinstance(found, type) else found(), known[name][1]
@@ -84,8 +80,7 @@ def command_class(name: str) -> tuple[type[Any], str]:
 def parse(argv: Sequence[str]) -> Any:
     """Parse a command line without `refgs`; returns an object of its class (command.py).
 
-    Raises InputError for an unknown command, SystemExit after `COMMAND --help`, and with code 2 for bad
-    options, of which tyro prints what is wrong.
+    Raises InputError for an unknown command, SystemExit after `--help` and for bad options, as tyro does.
     """
     import tyro
     from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
@@ -116,6 +111,12 @@ def _run(argv: list[str]) -> int:
     from mi_refgs.cli.command import UnusableError, finite
     from mi_refgs.runs.interrupt import TerminatedError
 
+    codes: dict[type[BaseException], int] = {
+        InputError: 2,
+        UnusableError: 1,
+        TerminatedError: 143,
+        KeyboardInterrupt: 130,
+    }
     try:
         command = parse(argv)
         with _standard_output_to_error():
@@ -123,30 +124,17 @@ def _run(argv: list[str]) -> int:
             result = command.run()
     except SystemExit as error:  # of tyro: after --help, or what is wrong with the options
         return int(error.code or 0)
-    except InputError as error:
-        return _failed(str(error), 2)
-    except UnusableError as error:
-        return _failed(str(error), 1)
-    except TerminatedError as error:
-        return _failed(str(error) or "terminated", 143)
-    except KeyboardInterrupt as error:
-        return _failed(str(error) or "interrupted", 130)
-    text = json.dumps(finite(result.data), allow_nan=False) if command.common.json else result.text
-    print(text)
+    except tuple(codes) as error:
+        code = next(code for kind, code in codes.items() if isinstance(error, kind))
+        print(f"refgs: {str(error) or EXIT_CODES[code]}", file=sys.stderr)
+        return code
+    print(json.dumps(finite(result.data), allow_nan=False) if command.common.json else result.text)
     return int(result.code)
-
-
-def _failed(message: str, code: int) -> int:
-    print(f"refgs: {message}", file=sys.stderr)
-    return code
 
 
 @contextlib.contextmanager
 def _standard_output_to_error() -> Iterator[None]:
-    """Redirect what libraries print on standard output, Mitsuba's C++ logger included, to standard error.
-
-    Only the result of a command goes to standard output, so that `--json` can be piped.
-    """
+    """Redirect what libraries print, C++ included, so that only the result goes to standard output."""
     sys.stdout.flush()
     saved = os.dup(1)
     try:

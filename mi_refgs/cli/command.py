@@ -35,29 +35,17 @@ Output = Annotated[Path, arg(aliases=("-o",), metavar="PATH")]
 OptionalOutput = Annotated[Path | None, optional("PATH", aliases=("-o",))]
 OtherData = Annotated[Path | None, optional("DATA", help="data set (default: that of the fit)")]
 Cameras = Annotated[Path | None, optional("FILE.json")]
-Samples = Annotated[
-    int,
-    arg(metavar="N", help="samples per pixel, box filter: 4 are 2 × 2; 1 is the pixel centre, as in a fit"),
-]
+_SAMPLES_HELP = "samples per pixel, box filter: 4 are 2 × 2; 1 is the pixel centre, as in a fit"
+Samples = Annotated[int, arg(metavar="N", help=_SAMPLES_HELP)]
 Settings = Annotated[
     UseAppendAction[tuple[tuple[str, ...], ...]],
     optional("KEY=VALUE …", help="changes of the method, such as loss.ssim=0.1"),
 ]
 METHODS = ", ".join(sorted(path.stem for path in resource_dir("variants").glob("*.toml")))
-MethodName = Annotated[
-    str | None,
-    optional(
-        "NAME|FILE.toml",
-        help=f"method (default: auto, what the scene needs of the full method): {METHODS}, or a file",
-    ),
-]
-Preset = Annotated[
-    str | None,
-    optional(
-        "{quick,standard,paper}|N:N",
-        help=f"length of the fit, or its ITERATIONS:SURFELS (default: {DEFAULT_PRESET})",
-    ),
-]
+_METHOD_HELP = f"method (default: auto, what the scene needs of the full method): {METHODS}, or a file"
+MethodName = Annotated[str | None, optional("NAME|FILE.toml", help=_METHOD_HELP)]
+_PRESET_HELP = f"length of the fit, or its ITERATIONS:SURFELS (default: {DEFAULT_PRESET})"
+Preset = Annotated[str | None, optional("{quick,standard,paper}|N:N", help=_PRESET_HELP)]
 Words = Annotated[tuple[str, ...], optional("NAME …")]
 """A list, separated by spaces or commas."""
 
@@ -93,20 +81,19 @@ class Rendering(Common):
     """worker threads; with 1, training is reproducible bit for bit"""
 
     def prepare(self) -> None:
-        """Set the number of threads and the Mitsuba variant.
-
-        Raises InputError for a variant that the renderer cannot use, UnusableError if it cannot be loaded.
-        """
+        """Set threads and variant; raises InputError for unusable ones, UnusableError for a missing LLVM."""
         import drjit as dr
         import mitsuba as mi
 
         variant, most = self.mitsuba_variant, 4 * (os.cpu_count() or 1)
         usable = [name for name in mi.variants() if name.endswith("_ad_rgb")]
         if variant not in usable:
-            raise InputError(f"--mitsuba-variant: {variant}: cannot be used; give one of {', '.join(usable)}")
+            what, remedy = f"{variant}: cannot be used", f"give one of {', '.join(usable)}"
+            raise InputError(what, "--mitsuba-variant", remedy=remedy)
         if self.threads is not None:
             if not 1 <= self.threads <= most:
-                raise InputError(f"--threads: {self.threads} is out of range; give 1 to {most}")
+                what = f"{self.threads} is out of range"
+                raise InputError(what, "--threads", remedy=f"give 1 to {most}")
             dr.set_thread_count(self.threads)
         try:
             mi.set_variant(variant)

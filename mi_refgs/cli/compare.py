@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import sys
 import time
 from dataclasses import dataclass
@@ -29,9 +30,6 @@ from mi_refgs.progress import say
 if TYPE_CHECKING:
     from mi_refgs.compare.jobs import Job
 
-EXIT_INCOMPLETE = 3
-"""Exit code if a job failed: its row states why; the others are complete."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Compare:
@@ -45,10 +43,7 @@ class Compare:
     """data sets"""
     output: Output
     """folder of the comparison"""
-    methods: Annotated[
-        tuple[str, ...],
-        optional("NAME|FILE.toml …", help=f"methods: {METHODS}, or files"),
-    ] = ()
+    methods: Annotated[tuple[str, ...], optional("NAME|FILE.toml …", help=f"{METHODS}, or files")] = ()
     seeds: Annotated[tuple[str, ...], optional("K …")] = ()
     """seeds of the fits (default: 0)"""
     preset: Preset = None
@@ -69,7 +64,14 @@ class Compare:
             planned = self._plan(workers, execute.threads_each(workers, self.common.threads))
             wanted = [job for job in planned if not jobs.finished(job)]
             say(f"{self.output}: {len(wanted)} of {len(planned)} jobs to do, {workers} at once")
-            report = Report(len(wanted))
+            begin, numbers = time.perf_counter(), itertools.count(1)
+
+            def report(job: Job, reason: str | None) -> None:
+                outcome = "done" if reason is None else f"failed: {reason}"
+                minutes = (time.perf_counter() - begin) / 60
+                number = f"[{next(numbers)}/{len(wanted)}]"
+                say(f"{number} after {minutes:.1f} min: {job.title}: {outcome}")
+
             try:
                 if self.cluster is None:
                     execute.execute_all(wanted, workers, report)
@@ -81,13 +83,12 @@ class Compare:
             given = vars(self) | {"threads": self.common.threads}
             for name in ("methods", "seeds", "preset", "set", "workers", "cluster", "threads"):
                 if given[name] not in (None, ()):
-                    raise InputError(
-                        f"--{name}: DATA: none given; name the data sets to which to fit the methods"
-                    )
+                    remedy = "name the data sets to which to fit the methods"
+                    raise InputError("none given", f"--{name}", "DATA", remedy)
         table = page.write(self.output)
         files = ", ".join(str(self.output / name) for name in (jobs.PAGE, jobs.TABLE_TEXT, jobs.TABLE))
         text = f"{markdown(table)}\n{files}"
-        return Result(dataclasses.asdict(table), text, 0 if table.complete else EXIT_INCOMPLETE)
+        return Result(dataclasses.asdict(table), text, 0 if table.complete else 3)
 
     def _plan(self, workers: int, threads: int | None) -> list[Job]:
         """Return the checked jobs, after writing them into their run folders."""
@@ -100,22 +101,8 @@ class Compare:
             seeds = [int(seed) for seed in separated(self.seeds) or ["0"]]
         except ValueError as error:
             raise InputError(f"--seeds: {' '.join(self.seeds)}: not integers; write them as 0 1") from error
-        shared = jobs.Shared(
-            self.preset or DEFAULT_PRESET, (*joined(self.set),), self.common.mitsuba_variant, threads
-        )
+        preset, settings = self.preset or DEFAULT_PRESET, tuple(joined(self.set))
+        shared = jobs.Shared(preset, settings, self.common.mitsuba_variant, threads)
         planned = jobs.plan(self.output, self.data, methods, seeds, shared)
         jobs.begin(self.output, planned, workers, sys.argv[1:])
         return planned
-
-
-class Report:
-    """Prints a line on standard error for each finished job."""
-
-    def __init__(self, count: int) -> None:
-        self.count, self.done, self.begin = count, 0, time.perf_counter()
-
-    def __call__(self, job: Job, reason: str | None) -> None:
-        self.done += 1
-        minutes = (time.perf_counter() - self.begin) / 60
-        outcome = "done" if reason is None else f"failed: {reason}"
-        say(f"[{self.done}/{self.count}] after {minutes:.1f} min: {job.title}: {outcome}")

@@ -43,25 +43,14 @@ class Dataset:
             raise InputError(f"--size: {self.size!r}: give pixels per side, or WIDTHxHEIGHT; such as 160")
         resolution = (size[0], size[1]) if len(size) == 2 else size[0]
         image = vars(self.image) | {"size": resolution, "objects": separated(self.image.objects)}
-        folder = make_dataset(
-            self.scene,
-            self.output,
-            relight=self.relight,
-            overwrite=self.overwrite,
-            **image,
-        )
-        counts = {split: len(list((folder / split).glob("r_*.png"))) for split in ("train", "test")}
+        image |= {"relight": self.relight, "overwrite": self.overwrite}
+        folder = make_dataset(self.scene, self.output, **image)
+        train, test = (len(list((folder / split).glob("r_*.png"))) for split in ("train", "test"))
         lights = sorted(path.parent.name for path in folder.glob("relight/*/transforms_test.json"))
-        data = {
-            "dataset": str(folder),
-            "train_views": counts["train"],
-            "test_views": counts["test"],
-            "size": resolution,
-            "relight": lights,
-        }
+        data = {"dataset": str(folder), "train_views": train, "test_views": test, "size": resolution}
         text = (
-            f"{folder}: {counts['train']} training and {counts['test']} test views"
+            f"{folder}: {train} training and {test} test views"
             f"{', the latter also under ' if lights else ''}{', '.join(lights)}; "
             f"next: refgs train {folder} -o runs/{folder.name}"
         )
-        return Result(data, text)
+        return Result({**data, "relight": lights}, text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from mi_refgs.cli.command import Output, Preset, Rendering, Result, Settings, joined
 from mi_refgs.cli.evaluate import table
@@ -44,15 +45,8 @@ class Demo:
             folder.require_none()
 
         say(f"1 of 3: tracing {VIEWS + TEST_VIEWS} views of {SCENE} into {data}")
-        make_dataset(
-            resource_dir("scenes") / SCENE,
-            data,
-            views=VIEWS,
-            test_views=TEST_VIEWS,
-            size=SIZE,
-            spp=SAMPLES,
-            environment_height=64,
-        )
+        images: dict[str, Any] = {"views": VIEWS, "test_views": TEST_VIEWS, "size": SIZE, "spp": SAMPLES}
+        make_dataset(resource_dir("scenes") / SCENE, data, environment_height=64, **images)
         say(f"2 of 3: fitting into {output}")
         found = fit(data, preset=self.preset, settings=joined(self.set), output=output, resume=True)
         say("3 of 3: evaluating")
@@ -60,6 +54,5 @@ class Demo:
         if result is None or result.get("iterations") != found.trained.iteration or not sheet.is_file():
             result = found.evaluate(progress=True)
         text = f"{table(result)}\ncontact sheet: {sheet}; next: refgs view {output}"
-        return Result(
-            {"contact_sheet": str(sheet), "run": str(output), "data": str(data), "metrics": result}, text
-        )
+        paths = {"contact_sheet": str(sheet), "run": str(output), "data": str(data)}
+        return Result({**paths, "metrics": result}, text)

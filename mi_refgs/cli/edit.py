@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 from mi_refgs.cli.command import Flag, OtherData, Output, Rendering, Result, RunFolder, joined
 from mi_refgs.editing.options import Change, Selection
 from mi_refgs.errors import InputError
 from mi_refgs.progress import say
-
-PREVIEW = "preview.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +31,7 @@ class Edit:
     def run(self) -> Result:
         """Edit the run."""
         from mi_refgs.editing.change import assignments
+        from mi_refgs.editing.edit import before_and_after
         from mi_refgs.editing.selection import parse_condition
         from mi_refgs.io.images import write_png
         from mi_refgs.io.ownership import require_own
@@ -47,32 +45,21 @@ class Edit:
         if self.selection.where is not None:
             parse_condition(self.selection.where)
 
-        whole = load(self.run_folder, write=False)
-        whole = replace(whole, provenance=whole.provenance.with_data(self.data))
+        before = load(self.run_folder, write=False)
+        before = replace(before, provenance=before.provenance.with_data(self.data))
         try:
-            edited = whole.edit(**options)
+            after = before.edit(**options)
         except InputError as error:
             raise error.at(self.run_folder) from None
-        entry = edited.provenance.edits[-1]
+        entry = after.provenance.edits[-1]
         for note in entry["notes"]:
             say(f"note: {note}")
-        sheet = _preview(whole, edited) if self.preview else None
-        edited.save(self.output)
-        if sheet is not None:
-            write_png(self.output / PREVIEW, sheet)
+        after.save(self.output)
+        if self.preview:
+            views = before.views() if before.provenance.has_data else None
+            colours = () if views is None else (views.background, views.is_linear_radiance)
+            sheet = before_and_after(before.trained, after.trained, before.cameras(), *colours)
+            write_png(self.output / "preview.png", sheet)
         selected = f"{entry['selected']} of {entry['of']} surfels selected"
         text = f"{self.output}: {selected}; the new run has {entry['surfels']}"
         return Result({"output": str(self.output), **entry}, text)
-
-
-def _preview(before: Any, after: Any) -> Any:
-    """Render test views before and after, or cameras around the object without the data set."""
-    from mi_refgs.editing.edit import before_and_after
-
-    cameras = before.cameras()
-    if not before.provenance.has_data:
-        return before_and_after(before.trained, after.trained, cameras)
-    views = before.views()
-    return before_and_after(
-        before.trained, after.trained, cameras, views.background, views.is_linear_radiance
-    )

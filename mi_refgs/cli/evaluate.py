@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from mi_refgs.cli.command import OtherData, Rendering, Result, RunFolder, Samples
-from mi_refgs.evaluation.scores import PIXEL_CLASSES, SCORES, Score, caption_lines
+from mi_refgs.evaluation.scores import PIXEL_CLASSES, SCORES, caption_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,17 +34,8 @@ class Eval:
 
 def table(result: dict[str, Any]) -> str:
     """Return the numbers of metrics.json as text."""
-    lines = [*caption_lines(result["caption"]), *rows(SCORES, result)]
-    if result["error_budget"]:
-        lines += budget_table(result["error_budget"])
-    return "\n".join(lines)
-
-
-def rows(scores: Sequence[Score], result: dict[str, Any]) -> list[str]:
-    """Return the lines of a table of scores: those that were measured, then the others by reason."""
-    lines: list[str] = []
-    absent: dict[str, list[str]] = {}
-    for score in scores:
+    lines, absent = caption_lines(result["caption"]), dict[str, list[str]]()
+    for score in SCORES:
         if (value := result[score.key]) is not None:
             form = score.form + score.unit
             concave = result[f"{score.key}_concave"] if score.concave else None
@@ -53,13 +43,10 @@ def rows(scores: Sequence[Score], result: dict[str, Any]) -> list[str]:
             lines.append(f"{score.title:<27}{form.format(value)}{suffix}")
         elif score.reason:
             absent.setdefault(result[f"{score.reason}_reason"], []).append(score.title)
-    return lines + [f"not measured: {'; '.join(titles)} ({reason})" for reason, titles in absent.items()]
-
-
-def budget_table(budget: dict[str, dict[str, Any]]) -> list[str]:
-    """Return the lines of a table of `error_budget`: share of the pixels and of the error per class."""
-    lines = [f"{'error budget':<30}{'pixels':>8}{'squared error':>16}{'normal error':>15}"]
-    for name, row in budget.items():
+    lines += [f"not measured: {'; '.join(titles)} ({reason})" for reason, titles in absent.items()]
+    if budget := result["error_budget"]:
+        lines.append(f"{'error budget':<30}{'pixels':>8}{'squared error':>16}{'normal error':>15}")
+    for name, row in (budget or {}).items():
         angle = "" if row["normal_mae_deg"] is None else f"{row['normal_mae_deg']:>14.1f}°"
         lines.append(f"  {PIXEL_CLASSES[name]:<28}{row['pixels']:>8.1%}{row['squared_error']:>16.1%}{angle}")
-    return lines
+    return "\n".join(lines)

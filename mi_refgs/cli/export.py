@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 from mi_refgs.cli.command import (
@@ -21,7 +18,8 @@ from mi_refgs.cli.command import (
 from mi_refgs.errors import InputError, SceneError
 from mi_refgs.progress import say
 
-MOST_LISTED = 12  # files of a folder that are named one by one; the default export writes 10
+MOST_LISTED = 12
+"""Files that are named one by one; the default export writes 10."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +43,6 @@ class Export:
         from mi_refgs.runs.run import Run
         from mi_refgs.runs.trained_scene import TrainedScene
 
-        # Refuse options that do not belong together.
         names = separated(self.to)
         options = {name: value for name, value in vars(self.format).items() if value not in (None, False)}
         if options and not names:
@@ -55,7 +52,6 @@ class Export:
         if names and self.output is None:
             raise InputError("--to: names no file; say with -o which file or folder to write")
 
-        # Load the newest state and the cameras.
         folder = Run(self.run_folder)
         method = folder.method()
         state = folder.load_checkpoint()
@@ -70,24 +66,15 @@ class Export:
             try:
                 written = write(fitted, names, target, shots, options, folder.path)
             except SceneError as error:
-                raise InputError(f"{folder.path}: {error}") from error
+                raise error.at(folder.path) from error
             files = [str(path) for paths in written.values() for path in paths]
         else:
             if target.resolve() != folder.path.resolve():
                 own_folder(target, f"export of {folder.path.resolve()}")
             files = [str(path) for path in export(fitted, target, shots[0].camera)]
         data = {"files": files, "iteration": fitted.iteration, "surfels": fitted.surfels.count}
-        return Result(data, "\n".join(_listed(files)))
-
-
-def _listed(files: Sequence[str]) -> list[str]:
-    """A line for each file, or one for a folder of more than MOST_LISTED."""
-    folders = Counter(str(Path(file).parent) for file in files)
-    lines = []
-    for file in files:
-        folder = str(Path(file).parent)
-        lines.append(file if folders[folder] <= MOST_LISTED else f"{folder}: {folders[folder]} files")
-    return list(dict.fromkeys(lines))
+        listed = files if len(files) <= MOST_LISTED else [f"{target}: {len(files)} files"]
+        return Result(data, "\n".join(listed))
 
 
 def command() -> type[Export]:
@@ -97,19 +84,14 @@ def command() -> type[Export]:
     fields: list[Any] = []
     for option in options_of(FORMATS).values():
         users = ", ".join(name for name, made in FORMATS.items() if option in made.options)
-        if option.default is False:
-            kind: Any = Annotated[bool, optional(help=f"{option.help} ({users})")]
-            fields.append((option.name, kind, False))
-        else:
-            kind = type(option.default) | None
-            text = f"{option.help} ({users}; default: {option.default})"
-            metavar = option.name[0].upper()
-            fields.append((option.name, Annotated[kind, optional(metavar, help=text)], None))
+        switch = option.default is False
+        text = f"{option.help} ({users}{'' if switch else f'; default: {option.default}'})"
+        declared = optional(None if switch else option.name[0].upper(), help=text)
+        kind = bool if switch else type(option.default) | None
+        fields.append((option.name, Annotated[kind, declared], False if switch else None))
     options = make_dataclass("FormatOptions", fields, frozen=True, kw_only=True)
-    formats = Annotated[
-        tuple[str, ...],
-        optional("NAME …", help=f"formats of other programs: {', '.join(FORMATS)}"),
-    ]
+    listed = f"formats of other programs: {', '.join(FORMATS)}"
+    formats = Annotated[tuple[str, ...], optional("NAME …", help=listed)]
     lines = [f"  {made.name:<14}{made.summary}" for made in FORMATS.values()]
     export = make_dataclass(
         "Export",

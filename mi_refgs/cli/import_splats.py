@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from mi_refgs.cli.command import Cameras, Flag, Output, Preset, Rendering, Result, optional
 from mi_refgs.editing.options import Six
 from mi_refgs.errors import InputError, counted
+
+if TYPE_CHECKING:
+    from mi_refgs.splat.camera import Camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,33 +50,30 @@ class Import:
         """Import the file."""
         given = {"--for": self.purpose, "--preset": self.preset, "--resume": self.resume}
         for option in (name for name, value in given.items() if value and not self.relightable):
-            raise InputError(f"{option}: only a relightable import is fitted; add --relightable")
-        return self._fitted() if self.relightable else self._as_it_is()
-
-    def _as_it_is(self) -> Result:
+            raise InputError("only a relightable import is fitted", option, remedy="add --relightable")
         from mi_refgs.formats.cameras import read_cameras
+
+        cameras = None if self.camera is None else read_cameras(self.camera)
+        return self._fitted(cameras) if self.relightable else self._as_it_is(cameras)
+
+    def _as_it_is(self, cameras: Sequence[Camera] | None) -> Result:
         from mi_refgs.reconstruction.reconstruction import import_splats
         from mi_refgs.runs.export import save
         from mi_refgs.runs.run import Run
 
         Run(self.output).require_none()
         made = import_splats(self.file, linear=self.linear, box=self.box)
-        cameras = made.cameras() if self.camera is None else read_cameras(self.camera)
+        cameras = made.cameras() if cameras is None else cameras
         files = save(made.trained, self.output, made.method, cameras[0], more=cameras[1:])
         surfels = made.trained.surfels
-        data = {
-            "files": [str(path) for path in files],
-            "surfels": surfels.count,
-            "primitive": surfels.primitive.name,
-            "degree": surfels.sh_degree(),
-            "cameras": len(cameras),
-        }
-        what = f"{counted(surfels.count, surfels.primitive.name)} of SH degree {surfels.sh_degree()}"
+        kind, degree = surfels.primitive.name, surfels.sh_degree()
+        data = {"files": [str(path) for path in files], "surfels": surfels.count, "primitive": kind}
+        data |= {"degree": degree, "cameras": len(cameras)}
+        what = f"{counted(surfels.count, kind)} of SH degree {degree}"
         return Result(data, f"{self.output}: {what}, {counted(len(cameras), 'camera')} in scene.xml")
 
-    def _fitted(self) -> Result:
+    def _fitted(self, cameras: Sequence[Camera] | None) -> Result:
         from mi_refgs import methods
-        from mi_refgs.formats.cameras import read_cameras
         from mi_refgs.reconstruction.relightable_import import import_relightable
 
         found = import_relightable(
@@ -81,7 +81,7 @@ class Import:
             self.output,
             linear=self.linear,
             box=self.box,
-            cameras=None if self.camera is None else read_cameras(self.camera),
+            cameras=cameras,
             method=None if self.purpose is None else methods.for_purpose(self.purpose),
             preset=self.preset,
             resume=self.resume,

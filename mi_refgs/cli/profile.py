@@ -52,7 +52,6 @@ class Profile:
         rows = phases_of(stepper(trainer, stage), self.steps)
         lines = [f"{'phase':<20}{'ms':>10}{'launches':>10}{'share':>8}"]
         lines += [f"{row.phase:<20}{row.ms:>10.2f}{row.launches:>10}{row.share:>8.0%}" for row in rows]
-        lines.append(
-            f"{'sum':<20}{sum(row.ms for row in rows):>10.2f}{sum(row.launches for row in rows):>10}"
-        )
+        ms, launches = (sum(getattr(row, name) for row in rows) for name in ("ms", "launches"))
+        lines.append(f"{'sum':<20}{ms:>10.2f}{launches:>10}")
         return Result({"phases": [asdict(row) for row in rows]}, "\n".join(lines))

@@ -8,15 +8,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from mi_refgs.cli.command import (
-    Flag,
-    OptionalOutput,
-    OtherData,
-    Rendering,
-    Result,
-    RunFolder,
-    Samples,
-)
+from mi_refgs.cli.command import Flag, OptionalOutput, OtherData, Rendering, Result, RunFolder, Samples
 from mi_refgs.evaluation.scores import caption_lines
 from mi_refgs.progress import warn
 

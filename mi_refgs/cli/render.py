@@ -34,10 +34,7 @@ class Render:
     """render the object without its background, on transparency"""
     samples: Annotated[int | None, optional("N")] = None
     """samples per pixel (default: those of the scene's sampler)"""
-    aov: Annotated[
-        tuple[str, ...],
-        optional("NAME …", help=f"more channels of the EXR: {AOVS}"),
-    ] = ()
+    aov: Annotated[tuple[str, ...], optional("NAME …", help=f"more channels of the EXR: {AOVS}")] = ()
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -47,37 +44,31 @@ class Render:
         from mi_refgs.render.load_scene import load_scene
         from mi_refgs.render.scene_xml import sensors_of
 
-        # Refuse the output before the scene is read.
-        out = self.output
+        out = self.output  # refused before the scene is read
         if out.suffix.lower() not in (".exr", ".png"):
-            raise InputError(f"{out}: suffix: '{out.suffix}': no known image format; use .exr or .png")
+            raise InputError(f"'{out.suffix}': no known image format", out, "suffix", "use .exr or .png")
         if self.aov and out.suffix.lower() == ".png":
-            raise InputError(f"{out}: --aov: a PNG file has room for colour and alpha only; use .exr")
+            raise InputError("a PNG file has room for colour and alpha only", out, "--aov", "use .exr")
         if not out.parent.is_dir():
-            raise InputError(
-                f"{out}: output: its folder does not exist; create it or choose a writable folder"
-            )
+            remedy = "create it or choose a writable folder"
+            raise InputError("its folder does not exist", out, "output", remedy)
         require_no_run(out)
         if self.samples is not None and self.samples < 1:
-            raise InputError(f"--samples: {self.samples} is out of range; give a number from 1")
+            what = f"{self.samples} is out of range"
+            raise InputError(what, "--samples", remedy="give a number from 1")
 
-        # Choose the sensor.
         cameras = None if self.camera is None else read_cameras(self.camera)
         scene = load_scene(scene_file(self.scene), separated(self.aov), self.object)
         own = scene.sensors()
         sensors = own if cameras is None else sensors_of(cameras)
         if not sensors:
-            raise InputError(
-                f"{self.scene}: sensor: the scene has none; add one, or give a file with --camera"
-            )
+            remedy = "add one, or give a file with --camera"
+            raise InputError("the scene has none", self.scene, "sensor", remedy)
         if not 0 <= self.sensor < len(sensors):
-            found = f"the scene has {counted(len(sensors), 'sensor')}"
-            if cameras is not None:
-                found = f"the file has {counted(len(sensors), 'frame')}"
-            raise InputError(
-                f"{self.camera or self.scene}: --sensor: {self.sensor}: {found}; give 0 to {len(sensors) - 1}"
-            )
-
+            found = counted(len(sensors), "sensor" if cameras is None else "frame")
+            what = f"{self.sensor}: the {'scene' if cameras is None else 'file'} has {found}"
+            remedy = f"give 0 to {len(sensors) - 1}"
+            raise InputError(what, self.camera or self.scene, "--sensor", remedy)
         sensor, samples = sensors[self.sensor], self.samples or 0
         if not samples and cameras is not None and own:
             samples = own[0].sampler().sample_count()
@@ -88,13 +79,10 @@ class Render:
 
 
 def scene_file(path: Path) -> Path:
-    """Find the XML of a scene, or of a run.
-
-    The artefacts of a run are written first if a checkpoint is newer: this changes the run folder.
-    """
+    """Find the XML of a scene, or of a run, whose artefacts are first written if a checkpoint is newer."""
     if not path.is_dir():
         if not path.is_file():
-            raise InputError(f"{path}: scene: no such file; give a Mitsuba XML or a run folder")
+            raise InputError("no such file", path, "scene", "give a Mitsuba XML or a run folder")
         return path
     from mi_refgs.reconstruction.provenance import Provenance
     from mi_refgs.runs.export import write_if_stale
@@ -106,7 +94,7 @@ def scene_file(path: Path) -> Path:
         write_if_stale(run, provenance.method, provenance.first_camera)
     scene = path / "scene.xml"
     if not scene.is_file():
-        raise InputError(f"{scene}: scene: missing; write it with `refgs export {path}`")
+        raise InputError("missing", scene, "scene", f"write it with `refgs export {path}`")
     return scene
 
 
@@ -123,16 +111,14 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     try:
         image = mi.render(scene, sensor=sensor, spp=spp)
     except RuntimeError as error:
-        raise InputError(f"{path}: render: {reason(error)}") from error
+        raise InputError(reason(error), path, "render") from error
     bitmap = sensor.film().bitmap()
     names = [channel.name for channel in bitmap.struct_()]
     if path.suffix.lower() == ".exr":
         with mitsuba_exr():
             replace_file(path, lambda temporary: bitmap.write(str(temporary)))
         return names
-    pixels = np.array(image, dtype=np.float32)
-    if "A" in names:
-        write_png(path, straight_srgb(pixels[..., :4]))
-        return names[:4]
-    write_png(path, srgb_from_linear(pixels[..., :3]))
-    return names[:3]
+    count = 4 if "A" in names else 3
+    pixels = np.array(image, dtype=np.float32)[..., :count]
+    write_png(path, straight_srgb(pixels) if count == 4 else srgb_from_linear(pixels))
+    return names[:count]

@@ -65,15 +65,8 @@ class Train:
         begin, method, settings = time.monotonic(), self.method, joined(self.set)
         if self.purpose is not None:
             method = method_for(self.data, self.purpose, self.preset, settings, progress.say)
-        fit(
-            self.data,
-            method,
-            preset=self.preset,
-            settings=settings,
-            output=self.output,
-            resume=self.resume,
-            progress=progress,
-        )
+        given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
+        fit(self.data, method, settings=settings, progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None
 

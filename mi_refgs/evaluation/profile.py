@@ -21,28 +21,15 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.timing import listening
 
 PHASES = (
-    "prefilter forward",
-    "shade forward",
-    "project",
-    "tile lists",
-    "sort",
-    "splat forward",
-    "ssim forward",
-    "loss backward",
-    "shade backward",
-    "splat backward",
-    "surfels backward",
-    "prefilter backward",
-    "optimiser",
-    "rest",
+    *("prefilter forward", "shade forward", "project", "tile lists", "sort", "splat forward", "ssim forward"),
+    *("loss backward", "shade backward", "splat backward", "surfels backward", "prefilter backward"),
+    *("optimiser", "rest"),
 )
-"""Every phase, in the order of a step. `shade forward` and `shade backward` are those of deferred shading;
-the adjoint of forward shading is in `surfels backward`, with the projection. `rest`: all that no other
-covers."""
+"""Every phase, in the order of a step. The adjoint of forward shading is in `surfels backward`, with the
+projection. `rest`: all that no other covers."""
 
 WARM_UP = 4
 """Steps with barriers before the first measured one: a kernel that ends at a barrier is compiled anew."""
-
 NEAR_END = 100
 """Steps before the end of a stage, where every SH degree is in use."""
 
@@ -73,14 +60,11 @@ class PhaseClock:
         leaves: list[Any] = []
 
         def collect(leaf: Any) -> Any:
-            if dr.grad_enabled(leaf):
-                leaves.append(leaf)
+            leaves.extend([leaf] if dr.grad_enabled(leaf) else [])
             return leaf
 
         _map(value, collect)
-        if not leaves:
-            return value
-        passed = iter(dr.custom(_Boundary, leaves, lambda: self._enter(phase)))
+        passed = iter(dr.custom(_Boundary, leaves, lambda: self._enter(phase)) if leaves else ())
         return _map(value, lambda leaf: next(passed) if dr.grad_enabled(leaf) else leaf)
 
     def _enter(self, phase: str | None) -> None:
@@ -107,9 +91,6 @@ class _Boundary(dr.CustomOp):
         self.reached()
         self.set_grad_in("values", δvalues)
 
-    def name(self) -> str:
-        return "boundary"
-
 
 def _map(value: Any, change: Callable[[Any], Any]) -> Any:
     """Apply a function to every Dr.Jit array in a value."""
@@ -127,8 +108,6 @@ def _map(value: Any, change: Callable[[Any], Any]) -> Any:
 
 @dataclass(frozen=True)
 class Phase:
-    """A row of the table."""
-
     phase: str
     ms: float  # median over steps
     launches: int  # kernels
@@ -140,13 +119,11 @@ def phases_of(step: Callable[[], Any], steps: int) -> list[Phase]:
 
     The sum exceeds the time of a step if kernels fuse across phases, since there are barriers in between.
     """
-    clocks = []
-    for _ in range(WARM_UP + steps):
-        clock = PhaseClock()
+    clocks = [PhaseClock() for _ in range(WARM_UP + steps)]
+    for clock in clocks:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory), listening(clock):
             dr.kernel_history_clear()
             clock.call("rest", step)
-        clocks.append(clock)
     clocks = clocks[WARM_UP:]
     named = [phase for phase in PHASES if any(phase in clock.seconds for clock in clocks)]
     ms = {name: 1e3 * float(np.median([clock.seconds[name] for clock in clocks])) for name in named}
@@ -155,10 +132,7 @@ def phases_of(step: Callable[[], Any], steps: int) -> list[Phase]:
 
 
 def stepper(trainer: Trainer, name: str) -> Callable[[], None]:
-    """A function that takes a step near the end of a stage, as often as it is called; no event happens.
-
-    Each step filters its light, so that all are alike.
-    """
+    """A function that takes steps near the end of a stage, without events; each filters its light."""
     method, end = trainer.method, trainer.method.stage[name].until
     begin = max((stage.until for _, stage in method.stages() if stage.until < end), default=0)
     if method.light is not None:

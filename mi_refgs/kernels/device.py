@@ -40,14 +40,6 @@ def machine() -> dict[str, Any]:
     }
 
 
-def simd_width() -> int:
-    """Floats per SIMD vector, read from a kernel's code, since Dr.Jit has no query; 1 for other devices."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.eval(dr.minimum(dr.arange(mi.Float, LOOK_AHEAD), dr.opaque(mi.Float, 2)))
-        code = "".join(kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel)
-    return max(map(int, re.findall(r"<(\d+) x float>", code)), default=1)
-
-
 def is_supported(variant: str | None) -> bool:
     """Whether the renderer supports a variant: it requires arrays with derivatives and RGB colour."""
     return variant is not None and variant.endswith("_ad_rgb")

@@ -31,8 +31,6 @@ FAR = 160.0
 
 @dataclass(frozen=True, eq=False)
 class DeliveredImage:
-    """An image for a page."""
-
     image: np.ndarray  # (H, W, 3) uint8
     progress: int  # from resolution.COARSE to resolution.DONE
     seconds: float  # of its last sample
@@ -58,22 +56,16 @@ class RenderLoop:
 
     def __init__(self, scene: ViewerScene, clock: Callable[[], float] = time.monotonic) -> None:
         self.scene, self.clock = scene, clock
-        self.clients: dict[int, Client] = {}
+        self.clients: dict[int, Client] = {}  # changed by any thread
         self.look = DisplayOptions(backdrop=scene.backdrops[0])
         self.report: Callable[[str], None] = lambda message: None  # called with a sentence about a failure
         self.delivered = 0  # images
-        self.smooth = True  # whether images at rest are supersampled
+        self.smooth = True  # images at rest are supersampled
         self._tasks: dict[Any, Callable[[], None]] = {}
         self._wake = threading.Condition()
-        self._stopped = False
-
-    # ---------------- from any thread ----------------
 
     def submit(self, key: Any, task: Callable[[], None], *, changes: bool = True) -> None:
-        """Queue a task for the render thread; it replaces a waiting task with the same key.
-
-        `changes`: whether images have to be drawn again.
-        """
+        """Queue a task in place of a waiting one of this key; if it `changes`, all images are outdated."""
 
         def run() -> None:
             task()
@@ -87,7 +79,7 @@ class RenderLoop:
     def change(self, number: int | None = None, **fields: Any) -> None:
         """Outdate the image of a client, or of all, and set fields of it."""
         with self._wake:
-            for client in (c for n, c in self.clients.items() if number in (None, n)):
+            for client in (c for n, c in tuple(self.clients.items()) if number in (None, n)):
                 for name, value in fields.items():
                     setattr(client, name, value)
                 client.changed, client.progress, client.sums = self.clock(), NOTHING, []
@@ -100,55 +92,32 @@ class RenderLoop:
             self.look = replace(self.look, **fields)
             self.change()
 
-    def enter(self, number: int, client: Client) -> None:
-        """Add the client of an opened page."""
-        with self._wake:
-            self.clients[number] = client
-
-    def leave(self, number: int) -> None:
-        """Remove the client of a closed page."""
-        with self._wake:
-            self.clients.pop(number, None)
-
-    def stop(self) -> None:
-        """Let `run` return."""
-        with self._wake:
-            self._stopped = True
-            self._wake.notify()
-
-    # ---------------- on the render thread ----------------
-
     def run(self) -> None:
-        """Draw until `stop`."""
-        while not self._stopped:
+        """Draw until KeyboardInterrupt."""
+        while True:
             wait = self.step()
             if wait == math.inf:
                 dr.flush_malloc_cache()  # buffers of other image sizes
             with self._wake:
-                if wait > 0 and not self._tasks and not self._stopped:
+                if wait > 0 and not self._tasks:
                     self._wake.wait(None if wait == math.inf else wait)
 
     def step(self) -> float:
-        """Run the tasks, then draw the sample that is due; returns the seconds until the next one is.
-
-        0 after a sample was drawn; inf while there is nothing to do.
-        """
+        """Run the tasks, then draw the sample that is due; returns the seconds until the next one, or inf."""
         with self._wake:
             tasks, self._tasks = self._tasks, {}
         for task in tasks.values():
             self._succeeds(task)
 
-        # The client with the least progress goes first.
-        waiting = []
-        for client in tuple(self.clients.values()):
-            if client.pose is not None:
-                progress = client.progress if self.smooth or client.progress < LARGE else DONE
-                wait = resolution.due(progress, self.clock() - client.changed)
-                waiting.append((wait, client.progress, client))
+        def wait_of(client: Client) -> float:
+            progress = client.progress if self.smooth or client.progress < LARGE else DONE
+            return resolution.due(progress, self.clock() - client.changed)
+
+        waiting = [client for client in tuple(self.clients.values()) if client.pose is not None]
         if not waiting:
             return math.inf
-        wait, _, client = min(waiting, key=lambda entry: entry[:2])
-        if wait > 0:
+        client = min(waiting, key=lambda each: (wait_of(each), each.progress))
+        if (wait := wait_of(client)) > 0:
             return wait
         version = client.version
         if not self._succeeds(lambda: self._advance(client)):
@@ -165,9 +134,8 @@ class RenderLoop:
             self.report(str(error))
         except Exception as error:
             traceback.print_exc()
-            self.report(
-                f"{type(error).__name__}: the image stays as it was; the terminal shows where it failed"
-            )
+            where = "the image stays as it was; the terminal shows where it failed"
+            self.report(f"{type(error).__name__}: {where}")
         else:
             return True
         return False
@@ -193,8 +161,7 @@ class RenderLoop:
         sums = [a + b for a, b in zip(sums, planes, strict=True)] if sums else planes
         dr.eval(sums)
 
-        # The mean as an image, if it is to be sent.
-        shown = None
+        shown = None  # the mean as an image
         if progress in SHOWN_AT:
             share = dr.opaque(type(sums[0]), 1 / max(progress - COARSE, 1))
             mean = [plane * share for plane in sums]

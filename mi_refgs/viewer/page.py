@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
@@ -26,16 +27,12 @@ MOVING_JPEG, STILL_JPEG = 70, 92
 """JPEG qualities during motion, and at rest until the supersampled image, a PNG."""
 STATUS_INTERVAL = 0.5
 """Seconds between updates of the status line."""
-START_DISTANCE = 2.5
-"""Distance of the first camera without a data set, in radii of the object."""
-START_FOV = math.radians(40)
-"""Its vertical field of view."""
-ERROR_SECONDS = 8.0
-"""Duration of an error message."""
+START_DISTANCE, START_FOV = 2.5, math.radians(40)
+"""Of the first camera without a data set: in radii of the object, vertical field of view."""
 
 
 def require_viser() -> Any:
-    """Import viser; raises InputError that says how to install it."""
+    """Import viser; raises InputError if it is not installed."""
     try:
         import viser
     except ImportError:
@@ -79,7 +76,7 @@ class Page:
         self.views = [view for split in ("test", "train") if split in data for view in data[split].views]
         self.up = up_of(self.views)
         self.loop = RenderLoop(scene)
-        self.loop.report = self.complain
+        self.loop.report = lambda message: self.notify("Not done", message, "red")
         self.moving_side = COARSEST  # first resolution level of a client during motion
         self.status: Callable[[str], None] = lambda text: None  # set by a panel
         self._overlays: set[str] = set()  # that are displayed and need depth
@@ -95,16 +92,15 @@ class Page:
         self.server.gui.main_panel.dock_right()
         self._set_start()
 
-    # ---------------- cameras ----------------
-
     def start(self) -> Pose:
         """Return the initial pose: the first test view, or one a little from above."""
         if self.views:
             return Pose.of_view(self.views[0])
-        outward = np.array([math.cos(0.6), math.sin(0.6), 0.5])
-        outward /= np.linalg.norm(outward)
+        outward, centre = np.array([math.cos(0.6), math.sin(0.6), 0.5]), self.scene.centre
         distance = START_DISTANCE * self.scene.radius / math.tan(START_FOV / 2) / 2
-        return Pose.looking_at(self.scene.centre, self.scene.centre + distance * outward, START_FOV)
+        origin = centre + distance * outward / np.linalg.norm(outward)
+        look_at = mi.ScalarTransform4f().look_at(origin, centre, [0, 0, 1])
+        return Pose(np.array(look_at.matrix, np.float64), START_FOV, 1.0)
 
     def _set_start(self) -> None:
         pose, camera, up = self.start(), self.server.initial_camera, self.up
@@ -124,8 +120,6 @@ class Page:
             client.camera.fov = pose.fov
         client.flush()
 
-    # ---------------- pages ----------------
-
     def listen(self) -> None:
         """Accept pages."""
         self.server.on_client_connect(self._connected)
@@ -133,7 +127,7 @@ class Page:
 
     async def _connected(self, client: Any) -> None:
         new = Client(lambda shown: self._deliver(client, shown), side=self.moving_side)
-        self.loop.enter(client.client_id, new)
+        self.loop.clients[client.client_id] = new
         near = self.views[0].near if self.views else 0.0
 
         async def moved(camera: Any) -> None:
@@ -144,7 +138,7 @@ class Page:
         await moved(client.camera)
 
     async def _left(self, client: Any) -> None:
-        self.loop.leave(client.client_id)
+        self.loop.clients.pop(client.client_id, None)
 
     def _deliver(self, client: Any, shown: DeliveredImage) -> None:
         client.scene.set_background_image(
@@ -166,19 +160,13 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
-    # ---------------- for panels ----------------
-
     def overlay(self, name: str, visible: bool) -> None:
         """Say whether an overlay, which the image occludes, is displayed."""
         if visible != (name in self._overlays):
             self._overlays ^= {name}
             self.loop.display(overlays=bool(self._overlays))
 
-    def complain(self, message: str) -> None:
-        """Display a sentence about bad input, or about a failure."""
-        self.notify("Not done", message, "red")
-
     def notify(self, title: str, body: str, colour: str | None = None) -> None:
-        """Display a message on every open page."""
+        """Display a message on every open page for 8 seconds."""
         for client in self.server.get_clients().values():
-            client.add_notification(title, body, auto_close_seconds=ERROR_SECONDS, color=colour)
+            client.add_notification(title, body, auto_close_seconds=8.0, color=colour)

@@ -17,6 +17,7 @@ from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import make_folder, write_json
 from mi_refgs.io.images import straight_srgb, write_png
+from mi_refgs.plugins.aovs import values_of_planes
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.attributes import sigmoid
@@ -24,16 +25,12 @@ from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import FINEST, SAMPLES, SIDES
-from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, displayed_planes, planes_of, values_of
+from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, displayed_planes, planes_of
 
 STOPS = 6.0
 """Largest exposure either way."""
-IMAGES = ".exr,.hdr"
-"""File name endings that the page offers; PNG and JPEG files are read, too."""
-FRUSTUM = 0.08
-"""Size of a camera's frustum, in radii of the object."""
-THICKNESS = 1.5
-"""Thickness of its lines, pixels."""
+FRUSTUM, THICKNESS = 0.08, 1.5
+"""Size of a camera's frustum, in radii of the object, and thickness of its lines, pixels."""
 COLOURS = {"train": (90, 160, 255), "test": (255, 160, 60)}
 """Colours of the frusta by split."""
 
@@ -63,7 +60,7 @@ def add_light(page: Page, scene: ReconstructionView) -> None:
     with gui.add_folder("Light"):
         turn = gui.add_slider("Turn", 0.0, 360.0, 1.0, 0.0, hint="Degrees about the vertical axis.")
         hint = "A lat-long image (EXR, HDR) whose first row is straight up."
-        upload = gui.add_upload_button("Upload an HDRI", mime_type=IMAGES, hint=hint)
+        upload = gui.add_upload_button("Upload an HDRI", mime_type=".exr,.hdr", hint=hint)
         hint = "Like environment.exr and envmap.exr."
         world = gui.add_checkbox("Map has world directions", False, hint=hint)
         own = gui.add_button("Estimated environment map")
@@ -182,7 +179,7 @@ def add_cameras(page: Page) -> None:
 
 
 def add_saving(page: Page, scene: ReconstructionView) -> None:
-    """Add the button."""
+    """Add the button that writes a view."""
     gui, folder = page.server.gui, page.views_folder
     hint = f"PNG as displayed, linear EXR, and camera, {SAMPLES} samples per pixel, into {folder}."
     button = gui.add_button("Save view", hint=hint)
@@ -209,7 +206,8 @@ def write_view(
     """
     (width, height), camera = size, pose.camera(*size)
     planes = planes_of(scene.fine(camera, look), camera, look, scene.light)
-    values = image_array(values_of(planes, look.what), height, width)
+    channels = planes if look.what == IMAGE else values_of_planes(look.what, planes)
+    values = image_array(channels, height, width)
     if look.what == IMAGE:
         shown = straight_srgb(values * np.array([2.0**look.exposure] * 3 + [1], np.float32))
     else:

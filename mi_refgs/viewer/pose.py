@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -41,12 +40,6 @@ class Pose:
         """Convert an image's camera, without its principal point, which a page cannot represent."""
         fov = 2 * math.atan(view.height / 2 / view.fy)
         return Pose(view.to_world, fov, view.width / view.fx / (view.height / view.fy), view.near)
-
-    @staticmethod
-    def looking_at(centre: np.ndarray, position: np.ndarray, fov: float) -> Pose:
-        """Return the pose at a position (3,) that looks at a centre (3,), z up."""
-        look_at = mi.ScalarTransform4f().look_at(position, centre, [0, 0, 1])
-        return Pose(np.array(look_at.matrix, np.float64), fov, 1.0)
 
     @property
     def position(self) -> np.ndarray:

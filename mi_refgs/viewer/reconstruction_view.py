@@ -20,7 +20,6 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight
-from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
@@ -73,8 +72,6 @@ class ReconstructionView(ViewerScene):
         self._relightable: TrainedScene | None = None
         self.set_relit(False)
 
-    # ---------------- changes ----------------
-
     def set_light(self, light: EnvironmentLight | None) -> None:
         """Replace the scene's light; None restores it."""
         self.environment = self.original.light if light is None else light
@@ -86,10 +83,7 @@ class ReconstructionView(ViewerScene):
         self._stale = True
 
     def set_relit(self, relit: bool) -> None:
-        """Display materials only, as `refgs relight` does, or the scene as fitted.
-
-        Raises InputError as `runs.relightable` does.
-        """
+        """Display materials only, as `refgs relight` does, or the scene as fitted."""
         if relit and self._relightable is None:
             self._relightable = relightable(self.original)
         self._base = self._relightable if relit and self._relightable is not None else self.original
@@ -119,24 +113,21 @@ class ReconstructionView(ViewerScene):
         cos, sin = dr.opaque(mi.Float, math.cos(angle)), dr.opaque(mi.Float, math.sin(angle))
         return RotatedLight(self._filtered, mi.Matrix3f([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
 
-    @property
-    def _near(self) -> NearField | None:
-        """Distances of what the scene's own light shows, unless it is rotated."""
-        return self.scene.near if self.environment is self.original.light and not self.turn else None
-
-    # ---------------- images ----------------
-
     def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
         """See `ViewerScene`; with ambient shadows that may be outdated unless it is `settled`."""
         light, scene = self.light, self.scene
         with dr.suspend_grad():
-            if self._stale and (settled or self._lacks_caches):
-                update_occluder_caches(self._occluder, scene.surfels, light, scene.shading)
+            shading, occluder = scene.shading, self._occluder
+            ambient = bool(shading.ambient_rays) and occluder.ambient is None
+            traced = bool(shading.traced_bounces) and occluder.vertex_surfels is None
+            lacks_caches = not occluder.empty and (ambient or traced)
+            if self._stale and (settled or lacks_caches):
+                update_occluder_caches(occluder, scene.surfels, light, shading)
                 self._stale = False
             background = None if look.object_only else scene.surroundings
-            rendered = SurfelScene(
-                scene.surfels, scene.shading, light, self._occluder, background, self._near
-            )
+            own = self.environment is self.original.light and not self.turn
+            given = (light, occluder, background, scene.near if own else None)
+            rendered = SurfelScene(scene.surfels, shading, *given)
             return render(rendered, camera, Request(look.aovs, forward_only=True))
 
     def fine(self, camera: Camera, look: DisplayOptions, samples: int = SAMPLES) -> Frame:
@@ -148,11 +139,3 @@ class ReconstructionView(ViewerScene):
         factor = samples_per_axis(samples)
         with dr.suspend_grad():
             return in_passes(averaged, camera, factor, self.scene.shading.neighbours, self.scene.count)
-
-    @property
-    def _lacks_caches(self) -> bool:
-        """Whether the occluder has no ambient visibility, or no vertex materials, that the shading needs."""
-        shading, occluder = self.scene.shading, self._occluder
-        ambient = bool(shading.ambient_rays) and occluder.ambient is None
-        traced = bool(shading.traced_bounces) and occluder.vertex_surfels is None
-        return not occluder.empty and (ambient or traced)

@@ -16,16 +16,10 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_json
 from mi_refgs.viewer.page import Page
 
-"""Owner of the region.json that a page writes into a data set."""
-RADII = (0.1, 3.0)
-"""Smallest and largest radius of the slider, in the first radius."""
-STEPS = 100
-"""Steps per radius of the sliders."""
+RADII, STEPS = (0.1, 3.0), 100
+"""Smallest and largest radius of the slider, in the first radius, and steps of a slider per radius."""
 OPPOSITE = 1e-6
 """Difference of unit normals up to which planes are opposite sides of a box."""
-
-SUBDIVISIONS = 3
-"""Of the icosahedron that displays the sphere: 642 points."""
 COLOUR = (120, 230, 120)
 
 
@@ -63,7 +57,7 @@ class RegionPanel:
 
     @property
     def region(self) -> Region:
-        """The region that is displayed."""
+        """The displayed one."""
         heights = [float(slider.value) for slider in self.heights]
         return adjusted(self.first, self.arrows.position, float(self.radius.value), heights)
 
@@ -83,7 +77,7 @@ class RegionPanel:
         self.page.overlay("region", self.show.value)
 
     def save(self) -> None:
-        """Write the region; raises InputError as `save_region` does."""
+        """Write the region, as `save_region` does."""
         self.note.content = save_region(self.region, self.data, self.saved)
         self.saved = True
 
@@ -91,8 +85,7 @@ class RegionPanel:
 def save_region(region: Region, data: Dataset, again: bool = False) -> str:
     """Write a region in the coordinates of a data set's files; return what the user does next.
 
-    Raises InputError for a region.json that is there, unless it is an estimate or this page saves it `again`,
-    and one that cannot be written.
+    Raises InputError for a region.json that is there, unless it is an estimate or this page saves it `again`.
     """
     estimated = data.region is not None and data.region.estimated
     if (data.path / REGION_FILE).exists() and not (estimated or again):
@@ -125,7 +118,7 @@ def adjusted(region: Region, centre: np.ndarray, radius: float, heights: Sequenc
 
 def border(region: Region) -> trimesh.Trimesh:
     """Return the border of a region, which is convex: its sphere, cut by its planes."""
-    sphere = trimesh.creation.icosphere(SUBDIVISIONS, region.radius)
+    sphere = trimesh.creation.icosphere(3, region.radius)
     vertices, faces = np.add(sphere.vertices, region.centre), sphere.faces
     for *normal, distance in region.planes:
         at = np.multiply(normal, distance)

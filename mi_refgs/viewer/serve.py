@@ -20,11 +20,8 @@ from mi_refgs.viewer.panels import MaterialsPanel, add_cameras, add_display, add
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.region_panel import RegionPanel
 
-USUAL_SHAPES = (1.0, 1.6)
-"""Aspect ratios of the images that are compiled beforehand: of small and of large desktop windows, less the
-panel at their side."""
-WARM = 4
-"""Number of resolution levels that are compiled beforehand; finer ones are when they are first displayed."""
+USUAL_SHAPES, WARM = (1.0, 1.6), 4
+"""Aspect ratios of desktop windows less the panel, and number of levels, that are compiled beforehand."""
 
 Tell = Callable[[str], None]
 
@@ -36,32 +33,25 @@ def serve(
     data: Path | None = None,
     tell: Tell = print,
 ) -> Page:
-    """Return the page of a run, with the views of its data set, or of that in `data`.
+    """Return the page of a run, with the views of its data set, or of that in `data`; writes nothing.
 
-    Nothing is written into the run. Raises InputError for a folder that is no run or has no fit, for a port
-    that is taken, and without viser.
+    Raises InputError for a folder that is no run or has no fit, for a port that is taken, and without viser.
     """
     found = splits_of(run, data, tell)
-    some = found.get("test") or found.get("train")
+    some = found.get("train") or found.get("test")
     scene = ReconstructionView(newest(run, run.method()), None if some is None else some.region)
     page = Page(scene, found, run.path.resolve().name, address, output or run.path / "views")
     warm_up(page, tell)
-    add_panels(page, scene)
-    return page
-
-
-def add_panels(page: Page, scene: ReconstructionView) -> None:
-    """Add all panels that a scene has something for, and accept pages."""
     add_display(page)
     add_light(page, scene)
     if scene.materials:
         MaterialsPanel(page, scene)
     add_cameras(page)
-    views = page.data.get("train") or page.data.get("test")
-    if views is not None and views.region is not None:
-        RegionPanel(page, views, views.region)
+    if some is not None and some.region is not None:
+        RegionPanel(page, some, some.region)
     add_saving(page, scene)
     page.listen()
+    return page
 
 
 def splits_of(run: Run, data: Path | None, tell: Tell) -> dict[str, Dataset]:

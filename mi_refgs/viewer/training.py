@@ -52,7 +52,7 @@ class TrainingViewer(ProgressBar):
     """The progress bar of a fit, and its page."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Raises InputError if the port is taken, and without viser."""
+        """Raises InputError if the port is taken."""
         require_viser()
         require_free(host, port)
         self.address = host, port
@@ -85,7 +85,7 @@ class TrainingPage(Page):
         address: tuple[str, int],  # host and port
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Serve the page; raises InputError if the port is taken, and without viser."""
+        """Serve the page."""
         data = {"train": trainer.data}
         super().__init__(Training(trainer), data, run.path.resolve().name, address, run.path / "views")
         self.loop.display(largest=LARGEST)

@@ -23,10 +23,8 @@ IMAGE = "image"
 """What is displayed unless an AOV is chosen."""
 BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
 """Display-encoded brightness behind the object, by name."""
-ENVIRONMENT = "environment map"
-"""The environment map as backdrop."""
-BACKGROUND = "background"
-"""The photographed background as backdrop; with all others the object only is displayed."""
+ENVIRONMENT, BACKGROUND = "environment map", "background"
+"""More backdrops: with all but the photographed background the object only is displayed."""
 
 
 def backdrops_of(background: bool, light: bool) -> tuple[str, ...]:
@@ -83,7 +81,7 @@ class ViewerScene(ABC):
 def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Float]:
     """Return what is averaged over samples, (H*W,) each: the premultiplied image or AOV, and alpha.
 
-    For an image with background or environment map, that is included, and alpha is 1.
+    An image with background or environment map includes it; its alpha is 1.
     """
     if look.what != IMAGE:
         return aov_planes(look.what, frame, camera)
@@ -95,18 +93,13 @@ def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light |
     return [*(frame.radiance + (1 - frame.alpha) * mi.Color3f(behind)), mi.Float(1)]
 
 
-def values_of(planes: list[Float], what: str) -> list[Float]:
-    """Return linear premultiplied RGBA, or the channels of the AOV, of the mean of `planes_of`."""
-    return planes if what == IMAGE else values_of_planes(what, planes)
-
-
 def displayed_planes(planes: list[Float], look: DisplayOptions, depths: tuple[float, float]) -> list[Float]:
     """Return display-encoded RGB planes, not clipped, of the mean of `planes_of`.
 
     The first of the two `depths` is displayed as white, the second as black.
     """
     what, alpha, behind = look.what, planes[-1], BACKDROPS.get(look.backdrop, 1.0)
-    values = values_of(planes, what)
+    values = planes if what == IMAGE else values_of_planes(what, planes)
     if what == IMAGE or what in TERMS:
         gain = dr.opaque(mi.Float, 2.0**look.exposure)
         radiance = [value * gain for value in values[:3]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any
 
 import pytest
@@ -20,17 +19,14 @@ def report() -> dict[str, Any]:
 
 def test_doctor_finds_this_machine_usable(report: dict[str, Any]) -> None:
     assert report["usable"] is True and report["problems"] == []
-    assert int(report["llvm_version"].split(".")[0]) >= llvm.MINIMUM_MAJOR
-    assert report["simd_width"] in (1, 4, 8, 16) and report["threads"] >= 1
-    assert sys.platform != "linux" or "libLLVM" in report["llvm_path"]
+    assert int(report["llvm"].split(".")[0]) >= llvm.MINIMUM_MAJOR and report["threads"] >= 1
     assert json.loads(json.dumps(report)) == report
     assert "Everything that is needed is here" in doctor.text(report)
 
 
 def test_text_states_each_problem_with_its_remedy(report: dict[str, Any]) -> None:
     problem = {"what": "no LLVM was found", "remedy": "install one"}
-    broken = {"usable": False, "llvm_version": None, "llvm_path": None, "problems": [problem]}
-    text = doctor.text(report | broken)
+    text = doctor.text(report | {"usable": False, "llvm": None, "problems": [problem]})
     assert "no LLVM was found" in text and "install one" in text
     assert "Everything that is needed is here" not in text
 
