@@ -24,18 +24,11 @@ def test_doctor_finds_this_machine_usable(report: dict[str, Any]) -> None:
     assert "Everything that is needed is here" in doctor.text(report)
 
 
-def test_text_states_each_problem_with_its_remedy(report: dict[str, Any]) -> None:
-    problem = {"what": "no LLVM was found", "remedy": "install one"}
-    text = doctor.text(report | {"usable": False, "llvm": None, "problems": [problem]})
-    assert "no LLVM was found" in text and "install one" in text
-    assert "Everything that is needed is here" not in text
-
-
 def test_unusable_llvm_is_a_problem_without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(llvm, "problem", lambda: llvm.Problem("no LLVM was found", "install one"))
     report = doctor.examine()
-    what = [problem["what"] for problem in report["problems"]]
-    assert what == ([] if report["cuda"] else ["no LLVM was found"])
+    said = ("no LLVM was found\n  type:  install one" in doctor.text(report), len(report["problems"]))
+    assert said == ((False, 0) if report["cuda"] else (True, 1))
 
 
 @pytest.mark.parametrize(
@@ -53,9 +46,8 @@ def test_failing_or_hanging_kernel_is_a_problem(
 
 
 def test_doctor_reports_missing_library() -> None:
-    done = run_process(
-        "-m", "mi_refgs", "doctor", environment={llvm.ENVIRONMENT_VARIABLE: "/none/libLLVM.so"}
-    )
+    environment = {llvm.ENVIRONMENT_VARIABLE: "/none/libLLVM.so"}
+    done = run_process("-m", "mi_refgs", "doctor", environment=environment)
     assert done.returncode == 1
     assert "PROBLEM: DRJIT_LIBLLVM_PATH=/none/libLLVM.so does not exist" in done.stdout
     assert f"unset {llvm.ENVIRONMENT_VARIABLE}" in done.stdout

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ OPTIONS = {"faces": ("--faces", "100", "--texture", "64"), "where": ("--where", 
 """Options by which a format takes little time, and takes this run."""
 TRACED = ("--views", "1", "--test-views", "1", "--size", "4", "--samples", "1")
 
-Arguments = Callable[[Path], list[object]]  # of a command, on the folder with its inputs
+Arguments = Callable[[Path], Sequence[object]]  # of a command, on the folder with its inputs
 FILLS: dict[str, Arguments] = {
     "demo": lambda at: ["-o", at / "out"],
     "capture": lambda at: [at / "data/train", "-o", at / "out"],
@@ -124,9 +124,6 @@ def test_files_of_a_run_are_known(finished: Path) -> None:
     assert {path.name for path in finished.iterdir() if path.is_file()} - {MARK} <= RUN_FILES
 
 
-# ---------------- what is a command's own ----------------
-
-
 def test_a_folder_belongs_to_one_owner(tmp_path: Path) -> None:
     """An empty one, or one with hidden files, to whoever comes first."""
     (tmp_path / ".lock").write_bytes(b"")
@@ -165,11 +162,10 @@ def test_run_is_never_overwritten(place: Path, tmp_path: Path) -> None:
 
 
 def test_relight_refuses_another_map_of_the_same_name(place: Path, tmp_path: Path) -> None:
-    shutil.copytree(place / "run", tmp_path / "run")
-    for name, value in (("first", 1.0), ("second", 0.2)):
-        (tmp_path / name).mkdir()
-        write_exr(tmp_path / name / "studio.exr", np.full((4, 8, 3), value, np.float32))
-    first, second = (NewLight(tmp_path / name / "studio.exr") for name in ("first", "second"))
+    run, file = Run(Path(shutil.copytree(place / "run", tmp_path / "run"))), tmp_path / "studio.exr"
+    write_exr(file, np.ones((4, 8, 3), np.float32))
     for _ in range(2):
-        assert Path(relight(Run(tmp_path / "run"), first, turntable=1)["output"]).name == "studio"
-    refused(lambda: relight(Run(tmp_path / "run"), second, turntable=1), "studio: output: has other files")
+        assert Path(relight(run, NewLight(file), turntable=1)["output"]).name == "studio"
+    (tmp_path / "other").mkdir()
+    other = NewLight(file.rename(tmp_path / "other" / file.name))
+    refused(lambda: relight(run, other, turntable=1), "studio: output: has other files")

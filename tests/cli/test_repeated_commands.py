@@ -61,21 +61,16 @@ def test_a_fit_resumes_with_its_own_options_only(
     assert str(moved) in (run / "dataset.json").read_text()
 
 
-def test_a_data_set_is_completed_or_replaced(tmp_path: Path) -> None:
+def test_a_data_set_is_completed_or_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, out = tmp_path / "scene.xml", tmp_path / "out"
     scene.write_text(SCENE)
     argv = [*TRACE, "-o", str(out), str(scene)]
-    assert main(argv) == 0
+    assert main([*argv, "--json"]) == 0 and json.loads(capsys.readouterr().out)["train_views"] == 2
     before = tree(out)
     for option in (["--views", "3"], ["--seed", "1"], ["--fov", "30"]):
         refused([*argv, *option], option[0])
     assert main(argv) == 0 and tree(out) == before
     assert main([*argv, "--overwrite", "--views", "3"]) == 0 and (out / "train/r_002.png").is_file()
-
-
-@pytest.mark.parametrize("option", ["--methods=a", "--seeds=1", "--preset=quick", "--set=a=1", "--workers=1"])
-def test_table_without_data_refuses_options_of_a_fit(option: str, tmp_path: Path) -> None:
-    refused(["compare", "-o", tmp_path, option], option.split("=")[0], "DATA")
 
 
 def test_eval_and_render_do_not_depend_on_earlier_ones(finished: Path, tmp_path: Path) -> None:
@@ -88,17 +83,6 @@ def test_eval_and_render_do_not_depend_on_earlier_ones(finished: Path, tmp_path:
         results.append((found["psnr"], found["samples"], (run / "a.exr").read_bytes()))
     assert results[0] != results[1] == results[2]
 
-
-def test_existing_output_is_refused(finished: Path, tmp_path: Path) -> None:
-    """By the commands that make a new run."""
-    out = Path(shutil.copytree(finished, tmp_path / "out"))
-    before = tree(out)
-    for argv in (["edit", str(finished), "--set", "roughness=0.5"], ["import", "any.ply"]):
-        refused([*argv, "-o", out], out)
-        assert tree(out) == before
-
-
-# ---------------- two processes on one run ----------------
 
 HOLD = """
 import fcntl, sys

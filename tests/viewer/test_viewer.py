@@ -8,6 +8,7 @@ import socket
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -352,7 +353,7 @@ def test_the_name_of_an_uploaded_light_is_not_used_as_a_path() -> None:
     content = (ROOT / "scenes" / "lights" / "sky.exr").read_bytes()
     for name in ("../light.exr", f"light.{'x' * 300}", "light.\0"):
         assert light_of(name, content, world=False).height == 128
-        refused(lambda name=name: light_of(name, b"nothing", world=False), "not a readable image")
+        refused(partial(light_of, name, b"nothing", world=False), "not a readable image")
 
 
 def test_relit_materials_are_those_of_relight_and_edits_stay(scene: TrainedScene) -> None:

@@ -62,7 +62,9 @@ def test_a_request_needs_host_and_origin_of_the_page(page: Page, upgrade: tuple[
         assert status(page, own, *upgrade) == answered, own
     assert status(page, OWN[0], OWN_ORIGIN, *upgrade) == answered
     assert status(page, ADDRESS, *upgrade) == (403 if local else answered)
-    refused = [(foreign,) for foreign in FOREIGN] + [(OWN[0], origin) for origin in FOREIGN_ORIGINS]
+    refused: list[tuple[str, ...]] = [(foreign,) for foreign in FOREIGN] + [
+        (OWN[0], origin) for origin in FOREIGN_ORIGINS
+    ]
     refused += [(OWN[0], OWN_ORIGIN, FOREIGN_ORIGINS[0]), *itertools.permutations((OWN[0], FOREIGN[0])), ()]
     for headers in refused:
         assert status(page, *headers, *upgrade) == 403, headers
@@ -70,9 +72,8 @@ def test_a_request_needs_host_and_origin_of_the_page(page: Page, upgrade: tuple[
 
 def test_a_message_beyond_the_largest_ends_its_connection(page: Page) -> None:
     protocols = [f"viser-v{viser.__version__}"]
-    with connect(
-        f"ws://127.0.0.1:{page.server.get_port()}", subprotocols=protocols, max_queue=None
-    ) as client:  # type: ignore[list-item]
+    url = f"ws://127.0.0.1:{page.server.get_port()}"
+    with connect(url, subprotocols=protocols, max_queue=None) as client:  # type: ignore[arg-type]
         with pytest.raises(ConnectionClosed) as closed:
             client.send(b"x" * (MESSAGE_BYTES + 1))
             while True:
