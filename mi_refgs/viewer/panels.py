@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +74,11 @@ def add_light(page: Page, scene: ReconstructionView) -> None:
     @upload.on_upload
     def _(_: Any) -> None:
         name, content = upload.value.name, upload.value.content
-
-        def replace_light() -> None:
-            scene.set_light(light_of(name, content, world.value))
-            page.notify("Light", name)
-
-        submit("light", replace_light)
+        submit("light", lambda: scene.set_light(light_of(name, content, world.value)))
 
     @own.on_click
     def _(_: Any) -> None:
-        turn.value = 0.0
-        submit("turn", lambda: scene.set_turn(0.0))
+        turn.value = 0.0  # its callback turns the light
         submit("light", lambda: scene.set_light(None))
 
 
@@ -104,7 +99,7 @@ class MaterialsPanel:
     def __init__(self, page: Page, scene: ReconstructionView) -> None:
         self.scene, self.mask = scene, np.ones(scene.original.surfels.count, bool)
         self.values: dict[str, float] = {}  # that replace those of the selection
-        gui, submit = page.server.gui, page.loop.submit
+        gui, self.submit = page.server.gui, page.loop.submit
         with gui.add_folder("Materials"):
             hint = "An expression such as `metallic > 0.5 and z < 0`; empty: all surfels."
             self.where = gui.add_text("Where", "", hint=hint)
@@ -114,19 +109,19 @@ class MaterialsPanel:
             }
             reset = gui.add_button("As fitted")
         for name, slider in self.sliders.items():
-            key = ("material", name)
-            slider.on_update(
-                lambda event, name=name, key=key: event.client and submit(key, lambda: self.set(name))
-            )
-        self.where.on_update(lambda _: submit("where", self.select))
-        reset.on_click(lambda _: submit("where", self.select))
+            slider.on_update(partial(self._moved, name))
+        self.where.on_update(lambda _: self.submit("where", self.select))
+        reset.on_click(lambda _: self.submit("where", self.select))
         self.select()
 
-    def set(self, name: str) -> None:
-        """Set a material of the selection to its slider's value."""
-        self.values[name] = float(self.sliders[name].value)
-        mask, change = self.mask, Change(set=dict(self.values))
-        self.scene.set_change(lambda scene: apply(scene, mask, change))
+    def _moved(self, name: str, event: Any) -> None:
+        def change_material() -> None:
+            self.values[name] = float(self.sliders[name].value)
+            mask, change = self.mask, Change(set=dict(self.values))
+            self.scene.set_change(lambda scene: apply(scene, mask, change))
+
+        if event.client:  # by a user
+            self.submit(("material", name), change_material)
 
     def select(self) -> None:
         """Select by the expression, as fitted; an error is displayed below it, as it may be half typed."""
@@ -151,21 +146,13 @@ def add_cameras(page: Page) -> None:
         return
     hint = "Blue: training, orange: test; click one to look from there."
     box, nodes = page.server.gui.add_checkbox("Cameras", False, hint=hint), list[Any]()
+    lines = {"scale": FRUSTUM * page.scene.radius, "thickness": THICKNESS, "thickness_units": "screen"}
 
     def add(split: str, index: int, pose: Pose) -> None:
-        node = page.server.scene.add_camera_frustum(
-            f"/cameras/{split}/{index}",
-            pose.fov,
-            pose.aspect,
-            scale=FRUSTUM * page.scene.radius,
-            thickness=THICKNESS,
-            thickness_units="screen",
-            color=COLOURS[split],
-            wxyz=pose.page_rotation,
-            position=pose.position,
-        )
-        node.on_click(lambda event: page.go(event.client, pose))
-        nodes.append(node)
+        name, more = f"/cameras/{split}/{index}", {"wxyz": pose.page_rotation, "position": pose.position}
+        add_frustum = page.server.scene.add_camera_frustum
+        nodes.append(add_frustum(name, pose.fov, pose.aspect, color=COLOURS[split], **lines, **more))
+        nodes[-1].on_click(lambda event: page.go(event.client, pose))
 
     @box.on_update
     def _(_: Any) -> None:
@@ -180,9 +167,9 @@ def add_cameras(page: Page) -> None:
 
 def add_saving(page: Page, scene: ReconstructionView) -> None:
     """Add the button that writes a view."""
-    gui, folder = page.server.gui, page.views_folder
+    folder = page.views_folder
     hint = f"PNG as displayed, linear EXR, and camera, {SAMPLES} samples per pixel, into {folder}."
-    button = gui.add_button("Save view", hint=hint)
+    button = page.server.gui.add_button("Save view", hint=hint)
 
     @button.on_click
     def _(event: Any) -> None:

@@ -20,7 +20,6 @@ RADII, STEPS = (0.1, 3.0), 100
 """Smallest and largest radius of the slider, in the first radius, and steps of a slider per radius."""
 OPPOSITE = 1e-6
 """Difference of unit normals up to which planes are opposite sides of a box."""
-COLOUR = (120, 230, 120)
 
 
 class RegionPanel:
@@ -35,20 +34,14 @@ class RegionPanel:
             low, high = (factor * radius for factor in RADII)
             self.radius = gui.add_slider("Radius", low, high, radius / STEPS, radius, hint="Scene units.")
             hint = "Raises the plane that supports the object, scene units."
-            self.heights = [
-                gui.add_slider(f"Plane {i}", -radius, radius, radius / STEPS, 0.0, hint=hint)
-                for i in range(1, 1 + len(support_planes(region.planes)))
-            ]
+            names = [f"Plane {i + 1}" for i in range(len(support_planes(region.planes)))]
+            bounds = (-radius, radius, radius / STEPS, 0.0)
+            self.heights = [gui.add_slider(name, *bounds, hint=hint) for name in names]
             save = gui.add_button("Save region", hint=f"As {REGION_FILE} of the data set, for the next fit.")
             self.note = gui.add_markdown("")
-        self.arrows = page.server.scene.add_transform_controls(
-            "/region/centre",
-            scale=0.5 * radius,
-            disable_rotations=True,
-            depth_test=False,
-            position=np.array(region.centre),
-            visible=False,
-        )
+        arrows = {"scale": 0.5 * radius, "disable_rotations": True, "depth_test": False, "visible": False}
+        add_arrows, centre = page.server.scene.add_transform_controls, np.array(region.centre)
+        self.arrows = add_arrows("/region/centre", position=centre, **arrows)
         self.lines: Any = None
         for control in (self.show, self.radius, *self.heights, self.arrows):
             control.on_update(lambda _: page.loop.submit("region", self.update, changes=False))
@@ -68,10 +61,9 @@ class RegionPanel:
         self.note.content = f"centre ({centre}), radius {region.radius:.4g}"
         self.arrows.visible = self.show.value
         if self.show.value:
-            mesh = border(region)
-            self.lines = self.page.server.scene.add_mesh_simple(
-                "/region/border", mesh.vertices, mesh.faces, color=COLOUR, wireframe=True
-            )
+            mesh, add_mesh = border(region), self.page.server.scene.add_mesh_simple
+            shape = (mesh.vertices, mesh.faces)
+            self.lines = add_mesh("/region/border", *shape, color=(120, 230, 120), wireframe=True)
         elif self.lines is not None:
             self.lines.visible = False
         self.page.overlay("region", self.show.value)

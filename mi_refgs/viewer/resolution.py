@@ -1,7 +1,6 @@
 """Sizes of displayed images, and when they are due: coarse during motion, fine at rest, then supersampled.
 
-A kernel is compiled per image size. So there are few sizes: resolution levels whose areas double, in a few
-aspect ratios. A window of another aspect ratio gets pixels that are not square.
+A kernel is compiled per size. So there are few: levels whose areas double, in a few aspect ratios.
 """
 
 from __future__ import annotations
@@ -20,11 +19,10 @@ MULTIPLE = 4
 STILL_AFTER, SMOOTH_AFTER = 0.15, 0.4
 """Seconds without a change after which an image is drawn large, and after which it is supersampled."""
 GRID = 4
-"""A supersampled image has a raster of GRID × GRID samples per pixel, as in `render.samples`."""
 SAMPLES = GRID * GRID
+"""Of a supersampled image: a raster of GRID × GRID per pixel, as in `render.samples`."""
 SLOW, FAST = 1 / 22, 1 / 60
-"""Seconds per image during motion: above the first the next image is a level coarser, below the second a
-level finer. Twice the area takes less than twice the time, so the level does not oscillate."""
+"""Seconds per image during motion above and below which the next image is a level coarser, or finer."""
 
 NOTHING, COARSE, LARGE = 0, 1, 2
 """Progress of a display: no image of the present state, a coarse one, a large one of 1 sample, of 2, …"""

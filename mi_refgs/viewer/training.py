@@ -82,7 +82,7 @@ class TrainingPage(Page):
         self,
         trainer: Trainer,
         run: Run,
-        address: tuple[str, int],  # host and port
+        address: tuple[str, int],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Serve the page."""
@@ -105,7 +105,9 @@ class TrainingPage(Page):
             return
         if now - self.refreshed > REFRESH:
             self.refreshed = now
-            self._update_curves()
+            lines = read_log(self.log, ("iteration", *CURVES))
+            for name, plot in self.curves.items() if len(lines) > 1 else ():
+                plot.data = tuple(np.array([line[key] for line in lines]) for key in ("iteration", name))
             self.loop.change()
         if self.spent <= SHARE * (now - self.since):
             self.loop.step()
@@ -122,9 +124,3 @@ class TrainingPage(Page):
                 series = (iteration, uplot.Series(label=name, stroke=colour, width=2))
                 curves[name] = gui.add_uplot((empty, empty), series, scales=scales, title=name, aspect=2.0)
         return curves
-
-    def _update_curves(self) -> None:
-        lines = read_log(self.log, ("iteration", *CURVES))
-        if len(lines) > 1:
-            for name, plot in self.curves.items():
-                plot.data = tuple(np.array([line[key] for line in lines]) for key in ("iteration", name))
