@@ -20,11 +20,9 @@ from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
 
-# ---------- Options that commands share ----------
-
 
 def optional(metavar: str | None = None, hint: str = "", **more: Any) -> Any:
-    """Declare an option whose help, or `hint`, states what happens without it."""
+    """An option whose help, or `hint`, states what happens without it."""
     return arg(metavar=metavar, help_behavior_hint=hint, **more)
 
 
@@ -101,9 +99,6 @@ class Rendering(Common):
             problem = llvm.problem() if variant.startswith("llvm") else None
             raise UnusableError(f"{problem or error} (`refgs doctor` says more)") from error
         mi.set_log_level(mi.LogLevel.Warn)
-
-
-# ---------- Results ----------
 
 
 @dataclass(frozen=True)

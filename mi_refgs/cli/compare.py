@@ -96,11 +96,12 @@ class Compare:
 
         methods = separated(self.methods)
         if not methods:
-            raise InputError(f"--methods: none given; name some of {METHODS}")
+            raise InputError("none given", "--methods", remedy=f"name some of {METHODS}")
         try:
             seeds = [int(seed) for seed in separated(self.seeds) or ["0"]]
         except ValueError as error:
-            raise InputError(f"--seeds: {' '.join(self.seeds)}: not integers; write them as 0 1") from error
+            what = f"{' '.join(self.seeds)}: not integers"
+            raise InputError(what, "--seeds", remedy="write them as 0 1") from error
         preset, settings = self.preset or DEFAULT_PRESET, tuple(joined(self.set))
         shared = jobs.Shared(preset, settings, self.common.mitsuba_variant, threads)
         planned = jobs.plan(self.output, self.data, methods, seeds, shared)

@@ -40,7 +40,8 @@ class Dataset:
 
         size = [int(part) if part.isdecimal() else 0 for part in self.size.lower().split("x")]
         if len(size) > 2 or not all(size):
-            raise InputError(f"--size: {self.size!r}: give pixels per side, or WIDTHxHEIGHT; such as 160")
+            what = f"{self.size!r}: give pixels per side, or WIDTHxHEIGHT"
+            raise InputError(what, "--size", remedy="such as 160")
         resolution = (size[0], size[1]) if len(size) == 2 else size[0]
         image = vars(self.image) | {"size": resolution, "objects": separated(self.image.objects)}
         image |= {"relight": self.relight, "overwrite": self.overwrite}

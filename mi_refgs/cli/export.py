@@ -46,11 +46,11 @@ class Export:
         names = separated(self.to)
         options = {name: value for name, value in vars(self.format).items() if value not in (None, False)}
         if options and not names:
-            raise InputError(
-                f"--{next(iter(options)).replace('_', '-')}: belongs to a format; name it with --to"
-            )
+            option = f"--{next(iter(options)).replace('_', '-')}"
+            raise InputError("belongs to a format", option, remedy="name it with --to")
         if names and self.output is None:
-            raise InputError("--to: names no file; say with -o which file or folder to write")
+            remedy = "say with -o which file or folder to write"
+            raise InputError("names no file", "--to", remedy=remedy)
 
         folder = Run(self.run_folder)
         method = folder.method()

@@ -55,7 +55,8 @@ class Train:
         from mi_refgs.reconstruction.fit import ProgressBar, fit
 
         if self.purpose is not None and self.method is not None:
-            raise InputError(f"--for: {self.purpose}: --method {self.method} is given; give one of the two")
+            what = f"{self.purpose}: --method {self.method} is given"
+            raise InputError(what, "--for", remedy="give one of the two")
         progress = ProgressBar()
         if self.watch:
             from mi_refgs.viewer.training import TrainingViewer
