@@ -20,7 +20,7 @@ FLAT = {"flat": True}  # metadata of a dataclass's field that is one too, with k
 
 
 def by_name(registry: Registry[Any]) -> Metadata:
-    """Metadata of a field `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME."""
+    """Metadata of a `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME."""
     return {"by_name": registry}
 
 
@@ -60,46 +60,41 @@ def build(
 
 
 def _converted(kind: Any, value: Any, key: str) -> Any:
-    def wrong(wanted: str, remedy: str) -> InputError:
-        return InputError(f"expected {wanted}, found {abbreviated(value)}", field=key or None, remedy=remedy)
-
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind):
-        if not isinstance(value, dict):
-            raise wrong("a table", "the files of variants/ show the form")
-        return _build_dataclass(kind, value, key)
     if origin in (types.UnionType, typing.Union):
         return _converted(next(option for option in arguments if option is not type(None)), value, key)
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise wrong("a table", "write it as [name]")
-        return {name: _converted(arguments[1], inner, f"{key}.{name}") for name, inner in value.items()}
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise wrong("a list", "write it in brackets")
-        return tuple(_converted(arguments[0], inner, key) for inner in value)
     if origin is Literal:
-        if not isinstance(value, str) or value not in arguments:
-            known = " or ".join(map(str, arguments))
-            raise InputError(f"{abbreviated(value)} is not allowed", field=key, remedy=f"use {known}")
+        if value not in arguments:
+            remedy = f"use {' or '.join(arguments)}"
+            raise InputError(f"{abbreviated(value)} is not allowed", field=key, remedy=remedy)
         return value
     if type(value) in (int, float) and not abs(value) <= MAX_NUMBER:
         raise InputError(f"{abbreviated(value)} is out of range", field=key, remedy="correct the value")
     if kind is float and type(value) is int:
         return float(value)
-    if kind is not Any and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
-        raise wrong(kind.__name__, "correct the value")
-    return value
+    form: Any = object if kind is Any else kind
+    wanted = getattr(kind, "__name__", "")
+    if origin is dict or dataclasses.is_dataclass(kind):
+        form, wanted = dict, "a table"
+    elif origin is tuple:
+        form, wanted = list, "a list"
+    if not isinstance(value, form) or (kind is int and isinstance(value, bool)):
+        found = f"expected {wanted}, found {abbreviated(value)}"
+        raise InputError(found, field=key or None, remedy="correct the value")
+    if dataclasses.is_dataclass(kind):
+        return _build_dataclass(kind, value, key)
+    if origin is dict:
+        return {name: _converted(arguments[1], inner, f"{key}.{name}") for name, inner in value.items()}
+    return tuple(_converted(arguments[0], inner, key) for inner in value) if origin is tuple else value
 
 
 def _build_dataclass(kind: Any, table: dict[str, Any], key: str) -> Any:
-    known = settings(kind)
+    known, fields = settings(kind), dataclasses.fields(kind)
     for name in table:
         if name not in known:
-            raise InputError(
-                f"unknown key '{name}'", field=key or None, remedy=f"use one of {', '.join(known)}"
-            )
-    for field in dataclasses.fields(kind):
+            remedy = f"use one of {', '.join(known)}"
+            raise InputError(f"unknown key '{name}'", field=key or None, remedy=remedy)
+    for field in fields:
         if field.default is field.default_factory is MISSING and field.name not in table:
             raise InputError(f"missing key '{field.name}'", field=key or None, remedy="add it")
     below = f"{key}." if key else ""
@@ -107,12 +102,11 @@ def _build_dataclass(kind: Any, table: dict[str, Any], key: str) -> Any:
         name: build(known[name][0], inner, f"{below}{name}", known[name][1]) for name, inner in table.items()
     }
     try:
-        for field in dataclasses.fields(kind):
+        for field in fields:
             if field.metadata == FLAT:
                 inner = typing.get_type_hints(kind)[field.name]
-                built[field.name] = inner(
-                    **{name: built.pop(name) for name in settings(inner) if name in built}
-                )
+                own = {name: built.pop(name) for name in settings(inner) if name in built}
+                built[field.name] = inner(**own)
         return kind(**built)
     except InputError as error:
         raise error.at(field=key or None) from error

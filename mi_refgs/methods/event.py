@@ -13,7 +13,7 @@ Fit = TypeVar("Fit")
 class Event(Generic[Fit]):
     """What happens to a fit beside its gradient steps; subclasses are frozen dataclasses of their settings.
 
-    `Fit` is `mi_refgs.Trainer`. After each step, the events of a method that are due happen in the order of
+    `Fit` is `mi_refgs.Trainer`. After each step, the events that are due happen in the order of
     `fitting.events`. What they change belongs to the fit, which is saved; an event has no state.
     """
 

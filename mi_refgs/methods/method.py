@@ -1,7 +1,6 @@
 """A method as data: the contents of a file of `variants/`, in frozen dataclasses.
 
-Iteration numbers in a file are written for the file's own `iterations`; a preset gives the number to run, and
-every window, stage and interval is scaled with it (`methods.read`).
+Iteration numbers in a file count in its own `iterations`, and are scaled to those of a preset.
 """
 
 from __future__ import annotations
@@ -72,7 +71,6 @@ class SurfelOptions:
     from_images: tuple[Literal["albedo"], ...] = ()  # attributes that start with the hue of the images
 
     def degree_of(self, name: str) -> int:
-        """SH degree of an attribute."""
         return self.degree.get(name, MAX_SH_DEGREE)
 
     @property
@@ -123,7 +121,6 @@ class SurroundingsOptions:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All attributes of background Gaussians."""
         return (*PRIMITIVES.find(self.primitive, "primitive").widths, "radiance_sh")
 
 
@@ -152,11 +149,9 @@ class Rates:
     position_final: ClassVar = 1.6e-6  # of positions, at 0.6 of the iterations
 
     def of(self, name: str) -> float:
-        """Learning rate of an attribute."""
         return self.attribute.get(name, attribute(name).rate)
 
     def rest_of(self, name: str) -> float:
-        """Factor of that for SH degrees of 1 and above."""
         return self.rest.get(name, attribute(name).rest_rate)
 
 
@@ -166,8 +161,7 @@ class LossWeight:
     L = (1 - `ssim`) L1 + `ssim` (1 - SSIM) + `normal` L_n + `smooth` L_s + `alpha` L_α, and priors:
     `half_metal` prefers metallic near 0 or 1, `materials` equal roughness and metallic of neighbouring pixels
     of similar colour, `light_colour` a grey light over a grey albedo, `photographed` a light that is the
-    background of the photographs. Any other NAME is one of
-    `register_loss`.
+    background of the photographs. Any other NAME is one of `register_loss`.
 
     Losses on material maps apply to deferred stages only: forward shading blends no materials.
     """
@@ -203,7 +197,6 @@ class CoarseImages:
     least: int = 0  # pixels that are left at least: smaller images are not averaged
 
     def applies(self, pixels: int) -> bool:
-        """Whether images of so many pixels are averaged."""
         return pixels // self.block**2 >= self.least
 
 
@@ -220,8 +213,7 @@ class DataOptions:
     crop: int | None = field(default=None, metadata=at_least(LEAST_CROP))
 
     def block_at(self, iteration: int, pixels: int) -> int:
-        """Pixels along a side that a (1-based) iteration averages into one, in an image of so many pixels; 1:
-        full resolution."""
+        """Pixels along a side that a (1-based) iteration averages into one, in an image of so many."""
         due = [images for images in self.coarse if iteration <= images.until and images.applies(pixels)]
         return min(due, key=lambda images: images.until).block if due else 1
 
@@ -232,10 +224,8 @@ class DataOptions:
         """
         if self.crop is None or self.crop >= width * height:
             return width, height
-        share = math.sqrt(self.crop / (width * height))
-        wide, high = (
-            size - PATCH_EDGE * math.ceil((1 - share) * size / PATCH_EDGE) for size in (width, height)
-        )
+        left_out = 1 - math.sqrt(self.crop / (width * height))
+        wide, high = (size - PATCH_EDGE * math.ceil(left_out * size / PATCH_EDGE) for size in (width, height))
         return max(wide, 1), max(high, 1)
 
 
@@ -270,15 +260,13 @@ class Method:
 
     def check(self) -> None:
         """Raise InputError for an unknown name, and for a stage or an event without what it needs."""
-        surfels, stages, losses = self.surfels, self.stages(), self.loss
-        if "ssim" in losses and losses["ssim"].weight > 1:  # the rest, 1 - ssim, is the weight of L1
-            what = f"{losses['ssim'].weight} is out of range"
+        surfels, ssim = self.surfels, self.loss.get("ssim")
+        if ssim is not None and ssim.weight > 1:  # the rest, 1 - ssim, is the weight of L1
+            what = f"{ssim.weight} is out of range"
             raise InputError(what, field="loss.ssim.weight", remedy="give a number from 0 to 1")
-        for key, table in (("surfels", surfels), ("surroundings", self.surroundings)):
-            if table is not None:
-                PRIMITIVES.find(table.primitive, f"{key}.primitive")
-
-        # Names of attributes, and of other parameters.
+        PRIMITIVES.find(surfels.primitive, "surfels.primitive")
+        if self.surroundings is not None:
+            PRIMITIVES.find(self.surroundings.primitive, "surroundings.primitive")
         attributes = {*surfels.names}
         others = {LIGHT} if self.light is not None else set()
         harmonics = {name for name, one in ATTRIBUTES.items() if one.harmonics}
@@ -289,12 +277,12 @@ class Method:
         _require_known("surfels.from_images", surfels.from_images, {*surfels.attributes})
         _require_known("rates.attribute", self.rates.attribute, {*ATTRIBUTES})
         _require_known("rates.rest", self.rates.rest, harmonics)
-        for name, stage in stages:
+        for name, stage in self.stages():
             _require_known(f"stage.{name}.restart", stage.restart, {*surfels.attributes} | others)
             _require_known(f"stage.{name}.rates", stage.rates, attributes | others)
             try:
-                shading = Shading.resolve(stage.shading, self.has_mesh)
-                shading.require_inputs(attributes, self.light is not None)
+                resolved = Shading.resolve(stage.shading, self.has_mesh)
+                resolved.require_inputs(attributes, self.light is not None)
             except InputError as error:
                 raise error.at(field=f"stage.{name}") from error
         for name in surfels.start:
@@ -307,7 +295,6 @@ class Method:
 
     @property
     def has_mesh(self) -> bool:
-        """Whether fits extract a mesh, which occludes."""
         return "mesh" in self.event
 
     def downscaled(self, factor: int | None) -> Method:
@@ -324,7 +311,6 @@ class Method:
 
 
 def _require_known(key: str, names: Iterable[str], known: set[str]) -> None:
-    """Raise InputError for the first name that is not known."""
     if unknown := [name for name in names if name not in known]:
         some = ", ".join(name for name in (*ATTRIBUTES, *{*known} - {*ATTRIBUTES}) if name in known)
         raise InputError(f"'{unknown[0]}' is unknown", field=key, remedy=f"use some of {some or 'none'}")

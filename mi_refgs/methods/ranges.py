@@ -3,37 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from mi_refgs.errors import InputError
 
-Metadata = dict[str, Any]  # of a dataclass's field
-
-
-def allowed(allows: Callable[[Any], bool], wanted: str) -> Metadata:
-    """Metadata of a field whose value must pass a test, or be None; `wanted` completes "give …"."""
-    return {"allowed": (allows, wanted)}
+Metadata = dict[str, Any]
+"""Of a field. "allowed": a test of values that are not None, and a text that completes "give …"."""
 
 
 def at_least(low: float) -> Metadata:
     """Metadata of a finite number that is at least `low`."""
-    return allowed(lambda value: low <= value < math.inf, f"{low:,} or more")
+    return {"allowed": (lambda value: low <= value < math.inf, f"{low:,} or more")}
 
 
 def more_than(low: float) -> Metadata:
     """Metadata of a finite number above `low`."""
-    return allowed(lambda value: low < value < math.inf, f"more than {low:g}")
+    return {"allowed": (lambda value: low < value < math.inf, f"more than {low:g}")}
 
 
 def between(low: float, high: float) -> Metadata:
     """Metadata of a number from `low` to `high`, both included."""
-    return allowed(lambda value: low <= value <= high, f"a number from {low:g} to {high:g}")
+    return {"allowed": (lambda value: low <= value <= high, f"a number from {low:g} to {high:g}")}
 
 
 def inside(low: float, high: float) -> Metadata:
     """Metadata of a number between `low` and `high`, both excluded."""
-    return allowed(lambda value: low < value < high, f"a number between {low:g} and {high:g}")
+    return {"allowed": (lambda value: low < value < high, f"a number between {low:g} and {high:g}")}
 
 
 def require_allowed(value: Any, metadata: Mapping[str, Any], key: str) -> None:

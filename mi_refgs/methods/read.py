@@ -31,45 +31,36 @@ MAX_TEXT, MAX_LINE = 2**16, 2000
 
 @dataclass(frozen=True)
 class Preset:
-    """How long to run, and how large to grow."""
-
     iterations: int
     surfels: int
     max_surfels: int
     pixels: int  # per image at most; larger ones are downscaled by the smallest whole factor
 
 
-# A step of 256² pixels takes 1.14 times as long as one of 200², one of 400² 1.9 times; the paper's images
-# have 800². None is below 256².
 PRESETS = {
     "quick": Preset(2_000, 15_000, 20_000, 256 * 256),
     "standard": Preset(4_000, 25_000, 40_000, 400 * 400),
-    "paper": Preset(50_000, 30_000, 100_000, 800 * 800),
+    "paper": Preset(50_000, 30_000, 100_000, 800 * 800),  # the size of the paper's images
 }
-START_FRACTION = 0.75
-"""Initial surfels over the largest number of surfels where a preset is ITERATIONS:SURFELS, as in `quick`."""
+START_FRACTION = 0.75  # of the largest number of surfels, where a preset is ITERATIONS:SURFELS; as in `quick`
 
 
 def preset_of(text: str) -> Preset:
-    """Return the preset of a name, or of ITERATIONS:SURFELS, the largest number of surfels: "1000:20000".
-
-    The latter has no limit of pixels. Raises InputError for any other text.
-    """
+    """The preset of a name, or of ITERATIONS:SURFELS, without limit of pixels; else raises InputError."""
     if text in PRESETS:
         return PRESETS[text]
     counts = [int(part) if re.fullmatch(r"[1-9]\d{0,8}", part) else 0 for part in text.split(":")]
     if len(counts) != 2 or not all(counts):
-        names = ", ".join(PRESETS)
-        raise InputError(f"--preset: {text}: unknown; use one of {names}, or ITERATIONS:SURFELS")
+        remedy = f"use one of {', '.join(PRESETS)}, or ITERATIONS:SURFELS"
+        raise InputError(f"{text}: unknown", "--preset", remedy=remedy)
     iterations, surfels = counts
     return Preset(iterations, max(round(START_FRACTION * surfels), 1), surfels, sys.maxsize)
 
 
 def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | None = None) -> Method:
-    """Read a method by name or TOML path, scaled to a preset (see `preset_of`).
+    """Read a method by name or TOML path, scaled to a preset; `assignments`, key=value, apply unscaled.
 
-    `assignments` are `key=value`, applied last and not scaled. Raises InputError that names the file and the
-    key for anything unknown or of the wrong type.
+    Raises InputError that names the file and the key for anything unknown or of the wrong type.
     """
     path, chosen = _find(name, "--method", Path()), preset_of(preset)
     method = _built(_extended(path, []), path)
@@ -96,7 +87,6 @@ def load_resolved(path: Path) -> Method:
 
 
 def _built(table: dict[str, Any], where: str | Path, losses: dict[str, Any] = DEFAULT_LOSSES) -> Method:
-    """The method of a table, with default weights for `losses` that it does not name."""
     try:
         return typing.cast(Method, build(Method, _merge({"loss": losses}, table)))
     except InputError as error:
@@ -110,12 +100,13 @@ def dump(method: Method) -> str:
 
 def names() -> list[str]:
     """The methods that ship with the package."""
-    return [path.stem for path in _shipped()]
+    return sorted(path.stem for path in resource_dir("variants").glob("*.toml"))
 
 
 def for_purpose(purpose: str) -> str:
     """The shipped method with this `about.purpose`; raises InputError if there is none."""
-    found = {_read(path).get("about", {}).get("purpose"): path.stem for path in _shipped()}
+    files = resource_dir("variants").glob("*.toml")
+    found = {_read(path).get("about", {}).get("purpose"): path.stem for path in files}
     if not purpose or purpose not in found:
         known = ", ".join(sorted(filter(None, found)))
         raise InputError(f"--for: {purpose}: no method is for that; use one of {known}, or choose a --method")
@@ -134,18 +125,10 @@ def differences(before: Method, now: Method) -> dict[str, tuple[Any, Any]]:
 
 
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted keys → values of nested dictionaries."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return flat
-
-
-# ---------------- files ----------------
-
-
-def _shipped() -> list[Path]:
-    return sorted(resource_dir("variants").glob("*.toml"))
 
 
 def _find(name: str, where: str, folder: Path) -> Path:
@@ -172,7 +155,6 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _with_tables_of_losses(table: dict[str, Any]) -> dict[str, Any]:
-    """A table of a method in which each number in `loss` is a table with this weight."""
     if not isinstance(losses := table.get("loss"), dict):
         return table
     return table | {"loss": {name: {"weight": x} if _is_number(x) else x for name, x in losses.items()}}
@@ -183,14 +165,9 @@ def _is_number(value: object) -> bool:
 
 
 def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
-    """The table of a file merged over the one that it `extends`; paths are relative to the file.
-
-    `above` are the files that extend this one, resolved.
-    """
+    """The table of a file merged over the one that it `extends`; `above` are the files that extend it."""
     if path.resolve() in above:
-        raise InputError(
-            "the file extends itself, through others or not", path, "extends", "break the circle"
-        )
+        raise InputError("the file extends itself", path, "extends", "break the circle")
     table = _read(path)
     base, dropped = table.pop("extends", None), table.pop("drop", [])
     if base is None and not dropped:
@@ -205,7 +182,13 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
         for key in ("deviations", "purpose", "without_alpha"):
             parent.get("about", {}).pop(key, None)
     for key in dropped:
-        _drop(parent, key, path)
+        *parents, last = key.split(".")
+        inner: Any = parent
+        for name in parents:
+            inner = inner.get(name) if isinstance(inner, dict) else None
+        if not isinstance(inner, dict) or last not in inner:
+            raise InputError(f"no key '{key}' in the extended file", path, "drop", "remove it from `drop`")
+        del inner[last]
     return _merge(parent, table)
 
 
@@ -217,38 +200,18 @@ def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _keys(assignment: str) -> list[str]:
-    """The parts of a dotted key, or of that of an assignment."""
-    return assignment.partition("=")[0].strip().split(".")
-
-
-def _drop(table: dict[str, Any], key: str, path: Path) -> None:
-    *parents, last = key.split(".")
-    for parent in parents:
-        inner = table.get(parent)
-        table = inner if isinstance(inner, dict) else {}
-    if last not in table:
-        raise InputError(f"no key '{key}' in the extended file", path, "drop", "remove it from `drop`")
-    del table[last]
-
-
 def assignments(settings: Mapping[str, object] | Sequence[str]) -> list[str]:
-    """Changes of a method as `key=value` with TOML values; a list of such is returned as it is.
-
-    Raises InputError for a value that TOML does not have.
-    """
+    """Changes of a method as `key=value`; raises InputError for a value that TOML does not have."""
     if not isinstance(settings, Mapping):
         return [*settings]
     try:
         return [f"{key}={_inline(value)}" for key, value in settings.items()]
     except TypeError as error:
-        raise InputError(
-            f"settings: {error}; give numbers, texts, booleans, or lists and tables of them"
-        ) from error
+        remedy = "give numbers, texts, booleans, or lists and tables of them"
+        raise InputError(str(error), "settings", remedy=remedy) from error
 
 
 def _inline(value: object) -> str:
-    """A value as TOML in one line; raises TypeError for one that TOML does not have."""
     if isinstance(value, Mapping):
         pairs = [f"{json.dumps(str(key), ensure_ascii=False)} = {_inline(x)}" for key, x in value.items()]
         return f"{{{', '.join(pairs)}}}"
@@ -266,7 +229,7 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text
-    *parents, last = _keys(key)
+    *parents, last = key.strip().split(".")
     if parents == ["loss"] and _is_number(value):  # its weight; the rest of its table stays
         parents, last = ["loss", last], "weight"
     for parent in parents:

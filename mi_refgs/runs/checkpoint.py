@@ -1,7 +1,6 @@
 """A checkpoint: named arrays in an .npz file that NumPy reads, with a checksum of all its bytes.
 
-The comment of the archive is "sha256 " and the SHA-256 of every byte before the digest: the checksum is
-written with the content, and a change of any bit is found. A file without it does not count as a checkpoint.
+The comment of the archive is "sha256 " and the SHA-256 of every byte before the digest.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ def surroundings_of(params: Mapping[str, Any]) -> Surroundings | None:
 
 
 def near_field_of(state: Mapping[str, np.ndarray]) -> NearField | None:
-    """Distances of what the environment map of a checkpoint shows, if it was compared with photographs."""
+    """Distances of what the environment map shows, if it was compared with photographs."""
     arrays = part(state, PHOTOGRAPHED)
     return NearField(arrays["centre"], arrays["nearness"]) if arrays else None
 
@@ -59,11 +58,11 @@ _DIGITS = 64
 
 
 class DamagedError(Exception):
-    """The file is no checkpoint of ours, or not all of one; the message says what is wrong with it."""
+    """The file is no checkpoint of ours, or not all of one."""
 
 
 class UnregisteredError(DamagedError):
-    """The file is whole, but has an attribute that this process does not know; the message names it."""
+    """The file is whole, but has an attribute that this process does not know."""
 
 
 def encode(state: Mapping[str, np.ndarray]) -> bytes:
@@ -90,10 +89,8 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
         raise DamagedError(f"it has version {version}, not {VERSION}")
     names = [*channels_of(params := part(state, PARAMS)), *channels_of(params, AROUND)]
     if unknown := [name for name in names if name not in ATTRIBUTES]:
-        raise UnregisteredError(
-            f"surfels: {unknown[0]}: the attribute is not registered here; register it as when the run was "
-            "fitted, and repeat the command"
-        )
+        what = "the attribute is not registered; register it as when the run was fitted"
+        raise UnregisteredError(f"surfels: {unknown[0]}: {what}")
     return state
 
 
@@ -107,7 +104,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 
 def tensors(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:
-    """The tensors of a checkpoint whose names begin with a prefix, by the rest of their names."""
+    """`part`, uploaded."""
     return {name: upload_tensor(value) for name, value in part(state, prefix).items()}
 
 

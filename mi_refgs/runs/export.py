@@ -1,15 +1,13 @@
 """The artefacts of a run, which other programs can read.
 
-    surfels.ply       the object: raw attributes, with 2DGS's property names
-    envmap.exr        the environment map: lat-long radiance, Mitsuba's orientation
-    near_field.npz    distances of what the environment map shows, and its centre
-    mesh.ply          the occluder
-    surroundings.ply  the background Gaussians, like surfels.ply, with radiance_sh only
-    background.exr    the background map, lat-long radiance
-    scene.xml         the scene for `mi.load_file`
-    model.json        iteration and training seconds of these files, their names, and the shading options
-
-Files of what a method does not model are absent.
+surfels.ply       the object: raw attributes, with 2DGS's property names
+envmap.exr        the environment map: lat-long radiance, Mitsuba's orientation
+near_field.npz    distances of what the environment map shows, and its centre
+mesh.ply          the occluder
+surroundings.ply  the background Gaussians, like surfels.ply, with radiance_sh only
+background.exr    the background map, lat-long radiance
+scene.xml         the scene for `mi.load_file`
+model.json        iteration and training seconds of these files, their names, and the shading options
 """
 
 from __future__ import annotations
@@ -17,6 +15,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,29 +50,27 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Ca
     Raises BusyError for a run that another process trains; InputError if a file cannot be written or a value
     is not finite.
     """
-    light = LIGHT_MAP if fitted.light is not None else None
-    near = NEAR_FIELD if fitted.near is not None else None
-    mesh = MESH if fitted.mesh is not None else None
-    around = AROUND_FILE if fitted.surroundings is not None else None
-    behind = BACKGROUND_MAP if fitted.surroundings and fitted.surroundings.background else None
-    written = [
-        name for name in (SURFELS, light, near, mesh, around, behind, SCENE, MODEL) if name is not None
-    ]
+    write: dict[str, Callable[[Path], object]] = {SURFELS: partial(write_ply, surfels=fitted.surfels)}
+    if fitted.light is not None:
+        write[LIGHT_MAP] = fitted.light.write
+    if fitted.near is not None:
+        write[NEAR_FIELD] = fitted.near.write
+    if fitted.mesh is not None:
+        write[MESH] = partial(write_mesh, mesh=fitted.mesh)
+    if fitted.surroundings is not None:
+        write[AROUND_FILE] = partial(write_ply, surfels=fitted.surroundings.surfels)
+        if fitted.surroundings.background is not None:
+            write[BACKGROUND_MAP] = fitted.surroundings.background.write
+    written = [*write, SCENE, MODEL]
+    light, near, mesh, around, behind = (
+        name if name in write else None for name in (LIGHT_MAP, NEAR_FIELD, MESH, AROUND_FILE, BACKGROUND_MAP)
+    )
     with Run(folder).alone():
         make_folder(folder)
         for name in {*ARTEFACTS} - {*written}:
             (folder / name).unlink(missing_ok=True)
-        write_ply(folder / SURFELS, fitted.surfels)
-        if fitted.light is not None:
-            fitted.light.write(folder / LIGHT_MAP)
-        if fitted.near is not None:
-            fitted.near.write(folder / NEAR_FIELD)
-        if fitted.mesh is not None:
-            write_mesh(folder / MESH, fitted.mesh)
-        if fitted.surroundings is not None:
-            write_ply(folder / AROUND_FILE, fitted.surroundings.surfels)
-            if fitted.surroundings.background is not None:
-                fitted.surroundings.background.write(folder / BACKGROUND_MAP)
+        for name, write_file in write.items():
+            write_file(folder / name)
         # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
         # scene file cannot express. Without a background map it is black, as in `render`.
         black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
@@ -86,17 +83,20 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Ca
     return [folder / name for name in written]
 
 
-def load_if_newer(run: Run, method: Method) -> TrainedScene | None:
-    """The scene of the newest checkpoint, if it is newer than the artefacts."""
-    shown = -1
+def _fresh(run: Run, method: Method) -> TrainedScene | None:
+    """The scene of a checkpoint that is newer than the artefacts; raises InputError if there is neither."""
+    shown, model = -1, run.path / MODEL
     if (run.path / SURFELS).is_file():
         with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
-            shown = int(read_json(run.path / MODEL)["iteration"])
-    if not any(int(path.stem) > shown for path in run.checkpoints()):
-        return None
-    if (state := run.load_checkpoint()) is None or int(state["iteration"]) <= shown:
-        return None
-    return TrainedScene.from_state(method, state)
+            shown = int(read_json(model)["iteration"])
+    if any(int(path.stem) > shown for path in run.checkpoints()):
+        state = run.load_checkpoint()
+        if state is not None and int(state["iteration"]) > shown:
+            return TrainedScene.from_state(method, state)
+    if not model.is_file():
+        remedy = f"train it with `refgs train DATA -o {run.path} --resume`"
+        raise InputError("none yet", run.path, "checkpoints", remedy)
+    return None
 
 
 def newest(run: Run, method: Method) -> TrainedScene:
@@ -104,18 +104,10 @@ def newest(run: Run, method: Method) -> TrainedScene:
 
     It has the mesh even if shading does not use it. Raises InputError as `TrainedScene.read` does.
     """
-    if (fresh := load_if_newer(run, method)) is not None:
+    if (fresh := _fresh(run, method)) is not None:
         return fresh
-    if not (run.path / MODEL).is_file():
-        raise _no_artefacts(run)
     scene, mesh = TrainedScene.read(run.path), run.path / MESH
     return replace(scene, mesh=read_mesh(mesh)) if scene.mesh is None and mesh.is_file() else scene
-
-
-def _no_artefacts(run: Run) -> InputError:
-    return InputError(
-        "none yet", run.path, "checkpoints", f"train it with `refgs train DATA -o {run.path} --resume`"
-    )
 
 
 def write_if_stale(run: Run, method: Method, camera: Callable[[TrainedScene], Camera]) -> TrainedScene:
@@ -124,13 +116,11 @@ def write_if_stale(run: Run, method: Method, camera: Callable[[TrainedScene], Ca
     If another process trains the run, writes nothing and returns the newest checkpoint. `camera` chooses that
     of scene.xml. Raises InputError if there is neither artefact nor checkpoint.
     """
-    if (fresh := load_if_newer(run, method)) is not None:
+    if (fresh := _fresh(run, method)) is not None:
         try:
             export(fresh, run.path, camera(fresh))
         except BusyError:
             return fresh
-    elif not (run.path / MODEL).is_file():
-        raise _no_artefacts(run)
     return TrainedScene.read(run.path)
 
 
@@ -147,10 +137,9 @@ def save(
 ) -> list[Path]:
     """Write a scene that was not fitted here (edited, imported, relit, copied) as a run folder.
 
-    It has no checkpoints, logs and previews. Returns its artefacts. `camera` and `more` become the sensors of
-    scene.xml; `data` is the data set of its test views, `region` the region of interest; `records` are JSON
-    files by name. config.toml is written last: if it is there, the folder is complete. Raises InputError for
-    a folder that contains a run or other files or cannot be written, and for a value that is not finite.
+    Returns its artefacts. `camera` and `more` become the sensors of scene.xml; `data` is the data set of its
+    test views; `records` are JSON files by name. config.toml is written last: if it is there, the folder is
+    complete. Raises InputError for a folder with a run or other files, and as `export` does.
     """
     run = Run(folder)
     run.require_none()

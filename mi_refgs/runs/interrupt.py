@@ -17,24 +17,21 @@ class TerminatedError(KeyboardInterrupt):
 def held_interrupts() -> Iterator[Callable[[], None]]:
     """Delay the first Ctrl-C or SIGTERM, and yield a function that raises it; a second one is not delayed.
 
-    It raises KeyboardInterrupt or TerminatedError. A state that is saved in the middle of a step (parameters
-    moved, refinement or the mesh still due) could not be resumed to the same result. Nothing is delayed
-    outside the main thread, where Python delivers no signals; nor is a signal that the process ignores, or
-    that code outside Python handles.
+    A state of the middle of a step could not be resumed to the same result. Nothing is delayed outside the
+    main thread, which alone gets signals; nor is a signal that is ignored, or handled outside Python.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
     pending: list[KeyboardInterrupt] = []
 
-    def hold(number: int, frame: FrameType | None) -> None:
-        if pending:
-            raise pending[0]
-        pending.append(TerminatedError() if number == signal.SIGTERM else KeyboardInterrupt())
-
     def release() -> None:
         if pending:
             raise pending[0]
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        release()
+        pending.append(TerminatedError() if number == signal.SIGTERM else KeyboardInterrupt())
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}

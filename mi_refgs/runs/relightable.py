@@ -44,37 +44,31 @@ def lacking(scene: TrainedScene) -> str:
     if fitted.required_attributes != shading.required_attributes and not isinstance(fitted.model, SplitSum):
         return f"diffuse: no albedo follows from what {fitted.reflectance} fitted to the light"
     missing = [name for name in shading.required_attributes if not scene.surfels.has(name)]
-    what = ", ".join(missing) or ("light" if scene.light is None else "")
-    return f"{what}: the run has none" if what else ""
+    missing += ["light"] if scene.light is None else []
+    return f"{', '.join(missing)}: the run has none" if missing else ""
 
 
 def relightable(scene: TrainedScene) -> TrainedScene:
     """Reduce a scene to attributes that do not depend on its light, so that another can replace it.
 
-    The reflectance model stays, with the options of its `relit`. A diffuse part that `split_sum` fitted as an
-    SH colour becomes an albedo (`albedo_from_radiance`). Attributes that are fitted to the light (radiance,
-    indirect) are removed; interreflection is traced instead, if the scene has a mesh. The light stays,
-    infinitely far. The background is removed: its brightness is that of the photographs.
+    A diffuse part that `split_sum` fitted as an SH colour becomes an albedo (`albedo_from_radiance`).
+    Attributes that are fitted to the light (radiance, indirect) are removed; interreflection is traced
+    instead, if the scene has a mesh. The light stays, infinitely far; the background is removed.
 
-    Raises InputError for a scene without light, or whose model has no such attributes.
+    Raises SceneError for a scene without light, or whose model has no such attributes.
     """
     if why := lacking(scene):
         raise SceneError(why, remedy="fit one with materials and a light, as `--for relighting` does")
     shading = scene.shading.relit(scene.mesh is not None)
     assert scene.light is not None and shading is not None  # by `lacking`
     surfels, mesh = scene.surfels.detach(), scene.mesh
-    if mesh is not None and scene.surroundings is not None:
-        mesh = _near(mesh, surfels)
+    if mesh is not None and scene.surroundings is not None:  # which must not shadow another light
+        low, high = bounds_from_points(surfels.to_numpy()["position"])
+        mesh = mesh.of_vertices(np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1))
     if scene.shading.required_attributes != shading.required_attributes:
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in LIT}
     return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None, near=None)
-
-
-def _near(mesh: Mesh, surfels: Surfels) -> Mesh:
-    """The triangles in the box of the surfels: the background must not shadow another light."""
-    low, high = bounds_from_points(surfels.to_numpy()["position"])
-    return mesh.of_vertices(np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1))
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
@@ -114,9 +108,8 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         # Interreflection depends on the albedo of other parts: that without shadows is close enough.
         occluder = Occluder(mesh)
         occluder.set_materials(found)
-        ratios = ambient(
-            occluder, found, light, ShadingOptions(ambient_rays=RELIT_RAYS["ambient_rays"])
-        ).numpy()
+        options = ShadingOptions(ambient_rays=RELIT_RAYS["ambient_rays"])
+        ratios = ambient(occluder, found, light, options).numpy()
         return with_shadows(ratios[vertex])
 
 

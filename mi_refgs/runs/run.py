@@ -12,7 +12,6 @@ import json
 import math
 import os
 import sys
-import tempfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -23,7 +22,15 @@ import numpy as np
 from mi_refgs.data.poses import rigid
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import cannot_write, locked, read_json, remove_temporaries, write_bytes, write_json
+from mi_refgs.io.files import (
+    cannot_write,
+    locked,
+    make_folder,
+    read_json,
+    remove_temporaries,
+    write_bytes,
+    write_json,
+)
 from mi_refgs.io.ownership import RUN, own_folder, require_own
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
@@ -45,36 +52,22 @@ class Run:
         self.path = Path(path)
 
     def exists(self) -> bool:
-        """Whether the folder contains a run."""
         return (self.path / CONFIG).is_file()
 
     def require_none(self) -> None:
         """Raise InputError if the folder contains a run or other files."""
         if (self.path / CONFIG).exists():
-            raise InputError(
-                "contains a run already",
-                self.path,
-                remedy="add --resume to go on with it, or choose another -o",
-            )
+            remedy = "add --resume to go on with it, or choose another -o"
+            raise InputError("contains a run already", self.path, remedy=remedy)
         require_own(self.path, RUN)
 
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
-        """Lock the run for changes; raises BusyError if another process keeps it locked for `wait` seconds.
-
-        Training and writing artefacts lock it; the lock of a killed process is released.
-        """
-        return locked(
-            self.path / LOCK,
-            f"{self.path}: run folder: another process trains this run or writes it; wait until it ends, or "
-            "choose another folder",
-            wait,
-        )
+        """Lock the run for changes; raises BusyError if another process has it locked for `wait` seconds."""
+        busy = "another process trains this run or writes it; wait until it ends, or choose another folder"
+        return locked(self.path / LOCK, f"{self.path}: run folder: {busy}", wait)
 
     def create(self, method: Method, dataset: str, region: Region | None = None) -> None:
-        """Start a run on the data set in folder `dataset`, with this region of interest if there is one.
-
-        Raises InputError as `require_none` does, and if the folder cannot be written.
-        """
+        """Start a run on the data set in folder `dataset`; raises InputError as `require_none` does."""
         self.require_none()
         own_folder(self.path, RUN)
         self._make_folders()
@@ -82,62 +75,50 @@ class Run:
         self.write_method(method)
 
     def write_dataset(self, dataset: str, region: Region | None) -> None:
-        """Write the folder of the data set, and its region of interest if there is one."""
         record = {"path": dataset} | ({} if region is None else {"region": region.content})
         write_bytes(self.path / DATASET, json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
-        """Write the resolved method to config.toml."""
         write_bytes(self.path / CONFIG, dump(method).encode())
 
     def method(self) -> Method:
         """The resolved method; raises InputError if this is no run folder."""
         if not self.exists():
-            raise InputError(
-                "missing", self.path, "config.toml", "give the folder that `refgs train -o` wrote"
-            )
+            raise InputError("missing", self.path, CONFIG, "give the folder that `refgs train -o` wrote")
         return load_resolved(self.path / CONFIG)
 
-    def dataset(self) -> Path | None:
-        """Folder of the data set that the run was fitted to; None if it records none.
+    def _record(self, name: str) -> dict[str, Any]:
+        return read_json(self.path / name) if (self.path / name).is_file() else {}
 
-        Raises InputError for a record that cannot be used.
-        """
-        record = self.path / DATASET
-        path = read_json(record).get("path") if record.is_file() else None
-        if path is None:
+    def dataset(self) -> Path | None:
+        """Folder of the data set that the run was fitted to, if it records one; raises InputError if not."""
+        if (path := self._record(DATASET).get("path")) is None:
             return None
         try:
             os.path.realpath(path)
             return Path(path)
         except (OSError, TypeError, ValueError) as error:
-            raise InputError(
-                f"cannot be used ({error})", record, "path", "write the folder of the data set there"
-            ) from error
+            remedy = "write the folder of the data set there"
+            raise InputError(f"cannot be used ({error})", self.path / DATASET, "path", remedy) from error
 
     def region(self) -> Region | None:
         """The region of interest that the run was started with; raises InputError if it cannot be used."""
-        record = self.path / DATASET
-        found = read_json(record).get("region") if record.is_file() else None
-        return None if found is None else Region.of(found, record)
+        found = self._record(DATASET).get("region")
+        return None if found is None else Region.of(found, self.path / DATASET)
 
     def cameras(self) -> dict[str, Any]:
         """The decision about camera corrections, with the corrected poses by view; {} if nothing was decided.
 
         Raises InputError for a record that cannot be used.
         """
-        record = self.path / CAMERAS
-        found = read_json(record) if record.is_file() else {}
+        record, found = self.path / CAMERAS, self._record(CAMERAS)
         try:
             for name, pose in found.get("to_world", {}).items():
                 rigid(np.array(pose, dtype=np.float64).reshape(4, 4), f"{record}: to_world: {name}")
         except (AttributeError, TypeError, ValueError) as error:
-            raise InputError(
-                f"cannot be read ({error})", record, "to_world", "restore or remove the file"
-            ) from error
+            what, remedy = f"cannot be read ({error})", "restore or remove the file"
+            raise InputError(what, record, "to_world", remedy) from error
         return found
-
-    # ---------------- checkpoints ----------------
 
     def checkpoints(self) -> list[Path]:
         """Complete checkpoints, oldest first."""
@@ -152,8 +133,7 @@ class Run:
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:
         """The newest undamaged checkpoint, or None if there is none yet; names damaged ones on stderr.
 
-        Raises InputError if all are damaged: a fit is never restarted unasked; and for an attribute that is
-        not registered.
+        Raises InputError if all are damaged, and for an attribute that is not registered.
         """
         damaged = []
         for path in reversed(self.checkpoints()):
@@ -165,18 +145,12 @@ class Run:
                 damaged.append(f"{path}: damaged ({error})")
                 print(f"refgs: warning: {damaged[-1]}; trying the one before", file=sys.stderr)
         if damaged:
-            raise InputError(
-                f"{damaged[0]}, and no checkpoint before it is whole",
-                remedy=f"put a copy back, or remove {self.path / 'checkpoints'} to begin anew",
-            )
+            remedy = f"put a copy back, or remove {self.path / 'checkpoints'} to begin anew"
+            raise InputError(f"{damaged[0]}, and no checkpoint before it is whole", remedy=remedy)
         return None
 
     def rewind(self, iteration: int) -> None:
-        """Prepare the folder for continuing after `iteration`; raises InputError if it cannot be written.
-
-        Removes later checkpoints (which are damaged), later lines of the logs (*.jsonl), which a resumed run
-        writes again, and temporary files of killed processes.
-        """
+        """Remove checkpoints and lines of the logs of later iterations, and files of killed processes."""
         self._make_folders()
         for folder in (self.path, self.path / "checkpoints", self.path / "previews"):
             remove_temporaries(folder)
@@ -188,13 +162,8 @@ class Run:
             kept = [line for line in text.splitlines() if _logged(line) <= iteration]
             write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
 
-    # ---------------- logs ----------------
-
     def log(self, line: dict[str, Any], name: str = LOG) -> None:
-        """Append a JSON line with an `iteration` to a log, with null for numbers that are not finite.
-
-        Raises InputError if it cannot be written.
-        """
+        """Append a JSON line with an `iteration` to a log, with null for numbers that are not finite."""
         path = self.path / name
         line = {k: None if isinstance(x, float) and not math.isfinite(x) else x for k, x in line.items()}
         try:
@@ -204,21 +173,15 @@ class Run:
             raise cannot_write(path, error) from error
 
     def write_json(self, name: str, content: Any) -> None:
-        """Write a JSON file of the run; raises InputError if it cannot be written."""
         write_json(self.path / name, content, indent=2)
 
     def _make_folders(self) -> None:
-        try:
-            for folder in (self.path / "checkpoints", self.path / "previews"):
-                folder.mkdir(parents=True, exist_ok=True)
-                with tempfile.TemporaryFile(dir=folder):  # fails now, not at the first checkpoint
-                    pass
-        except OSError as error:
-            raise cannot_write(self.path, error) from error
+        for name in ("checkpoints", "previews"):
+            make_folder(self.path / name)
 
 
 def read_log(path: Path, names: Sequence[str]) -> list[dict[str, float]]:
-    """Return these numbers of the lines of a log that are complete and have all of them; [] without a log."""
+    """These numbers of the lines of a log that are complete and have all of them."""
     lines = []
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
         with contextlib.suppress(ValueError, KeyError, TypeError):  # being written, or of a killed process
@@ -228,7 +191,7 @@ def read_log(path: Path, names: Sequence[str]) -> list[dict[str, float]]:
 
 
 def _logged(line: str) -> float:
-    """The iteration of a line of the log; infinity for an incomplete line of a killed process."""
+    """The iteration of a line; infinity for an incomplete one of a killed process."""
     try:
         return float(json.loads(line)["iteration"])
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):

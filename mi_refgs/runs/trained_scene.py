@@ -36,11 +36,6 @@ AROUND_FILE, BACKGROUND_MAP, NEAR_FIELD = "surroundings.ply", "background.exr", 
 ARTEFACTS = (SURFELS, LIGHT_MAP, NEAR_FIELD, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL)
 
 
-def _remedy(folder: Path) -> str:
-    """What to do about a file of a run that cannot be used."""
-    return f"restore it, or write it again with `refgs export {folder}` if the run has checkpoints"
-
-
 @dataclass(frozen=True, eq=False)
 class TrainedScene:
     """A fitted scene: all that rendering requires, and nothing that only training requires."""
@@ -56,7 +51,7 @@ class TrainedScene:
 
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
-        """Convert the content of a checkpoint."""
+        """The scene of a checkpoint."""
         params, iteration, mesh = tensors(state, PARAMS), int(state["iteration"]), None
         if len(state.get("mesh/faces", ())):
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
@@ -82,6 +77,7 @@ class TrainedScene:
     def read(folder: Path) -> TrainedScene:
         """Read the artefacts in a run folder; raises InputError for a file that cannot be used."""
         note = folder / MODEL
+        remedy = f"restore it, or write it again with `refgs export {folder}` if the run has checkpoints"
         try:
             content = read_json(note)
             shading = Shading.from_json(content["shading"])
@@ -95,29 +91,29 @@ class TrainedScene:
             raise InputError(f"{error}", note, remedy="or register it, as when the run was fitted") from error
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
-            raise InputError(f"cannot be read ({reason})", note, remedy=_remedy(folder)) from error
-        light, mesh, near = folder / LIGHT_MAP, folder / MESH, folder / NEAR_FIELD
-        around, behind = folder / AROUND_FILE, folder / BACKGROUND_MAP
+            raise InputError(f"cannot be read ({reason})", note, remedy=remedy) from error
         needed = {LIGHT_MAP} if shading.model.light != "none" else set()
-        for name in sorted((needed | files) & {LIGHT_MAP, NEAR_FIELD, AROUND_FILE, BACKGROUND_MAP}):
-            if not (folder / name).is_file():
-                raise InputError("missing", folder / name, "file", _remedy(folder))
+        names = (LIGHT_MAP, NEAR_FIELD, AROUND_FILE, BACKGROUND_MAP)
+        for name in names:
+            if name in needed | files and not (folder / name).is_file():
+                raise InputError("missing", folder / name, "file", remedy)
+        light, near, around, behind = (folder / name if (folder / name).is_file() else None for name in names)
         fitted = TrainedScene(
             read_ply(folder / SURFELS),
-            EnvironmentLight.from_file(light) if light.is_file() else None,
-            read_mesh(mesh) if shading.occlusion else None,
+            None if light is None else EnvironmentLight.from_file(light),
+            read_mesh(folder / MESH) if shading.occlusion else None,
             shading,
             iteration,
             seconds,
-            Surroundings.read(around, behind if behind.is_file() else None) if around.is_file() else None,
-            NearField.read(near) if near.is_file() else None,
+            None if around is None else Surroundings.read(around, behind),
+            None if near is None else NearField.read(near),
         )
         try:
             shading.require_inputs(fitted.surfels.raw, fitted.light is not None)
             if fitted.surroundings is not None:
                 fitted.surroundings.check(fitted.surfels)
         except InputError as error:
-            raise InputError(f"{error}", folder, remedy=f"or {_remedy(folder)}") from error
+            raise InputError(f"{error}", folder, remedy=f"or {remedy}") from error
         return fitted
 
     def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:
@@ -125,25 +121,17 @@ class TrainedScene:
 
         `samples` per pixel, as in `render.samples`. Light and mesh are prepared once.
         """
-        draw = self.drawn()
-        return lambda camera: draw(camera, aovs, samples)
-
-    def drawn(self) -> Callable[..., Frame]:
-        """Like `renderer`, for calls with a camera, `aovs` and, by default 1, `samples`."""
         require_supported_variant("TrainedScene.renderer")
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
         update_occluder_caches(occluder, self.surfels, light, self.shading)
         scene = SurfelScene(self.surfels, self.shading, light, occluder, self.surroundings, self.near)
+        asked = aovs if not isinstance(aovs, bool) else scene.all_aovs if aovs else ()
+        once = partial(render, scene, request=Request(asked, forward_only=True))
+        averaged = partial(supersampled, once, samples=samples, details=bool(aovs))
 
-        def draw(camera: Camera, aovs: bool | Collection[str], samples: int = 1) -> Frame:
-            asked = aovs if not isinstance(aovs, bool) else scene.all_aovs if aovs else ()
-            once = partial(render, scene, request=Request(asked, forward_only=True))
-
-            def averaged(view: Camera) -> Frame:
-                return supersampled(once, view, samples, details=bool(aovs))
-
+        def draw(camera: Camera) -> Frame:
             with dr.suspend_grad():
                 factor = samples_per_axis(samples)
                 return in_passes(averaged, camera, factor, self.shading.neighbours, self.count)

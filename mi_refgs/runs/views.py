@@ -20,8 +20,7 @@ from mi_refgs.runs.run import DATASET, Run
 
 
 def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:
-    """The method with the size of images decided: its own `data.downscale`, or the smallest that brings them
-    to the pixels of its preset.
+    """The method with its own `data.downscale`, or the smallest that brings images to its preset's pixels.
 
     `tell` is called if images are downscaled. Raises InputError as `read_dataset` does.
     """
@@ -39,24 +38,17 @@ def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: No
 
 
 def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Dataset:
-    """Read a split of a data set with the image options of a method; raises InputError as `read_dataset`
-    does."""
-    options = method.data
+    """A split of a data set, read as a method says; raises InputError as `read_dataset` does."""
+    data = method.data
     return read_dataset(
-        path,
-        split,
-        downscale=options.downscale,
-        background=options.background,
-        images=options.images,
-        truth=truth,
+        path, split, downscale=data.downscale, background=data.background, images=data.images, truth=truth
     )
 
 
 def views_of_run(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
-    """Read a split of the data set of a run, or of the one at `path`, with the options of the method.
+    """A split of the data set of a run, or of the one at `path`, with the region of interest of the run.
 
-    Its region of interest is the run's. Raises InputError as `read_dataset` and `Run.region` do, and if the
-    run records no data set or the data set is gone.
+    Raises InputError as `read_dataset` and `Run.region` do, and if the run records no data set or it is gone.
     """
     if path is None:
         record, path = run.path / DATASET, run.dataset()
@@ -79,10 +71,7 @@ def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:
 def with_region(
     views: Dataset, region: Region | None, tell: Callable[[str], None] = lambda _: None
 ) -> Dataset:
-    """Replace the region of interest by the one that a run was started with, if it has one.
-
-    `tell` is called if the data set has another one.
-    """
+    """Replace the region of interest by a run's, if it has one; `tell` is called if they differ."""
     if region is None:
         return views
     now = views.region

@@ -214,8 +214,8 @@ def test_relight_warns_of_fitted_diffuse_colour(known: Path, tmp_path: Path) -> 
 def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
     run, light = Run(known / "run"), NewLight(known / "dusk.exr")
     (tmp_path / "bad.exr").write_text("no image")
-    refused(lambda: relight(run, light, known / "run"), "contains a run")
-    refused(lambda: relight(run, light, known / "data"), "a data set")
+    refused(lambda: relight(run, light, known / "run"), "belongs to a run")
+    refused(lambda: relight(run, light, known / "data"), "has other files")
     refused(lambda: relight(run, light, turntable=-1), "--turntable: -1")
     refused(lambda: relight(run, NewLight(tmp_path / "bad.exr"), tmp_path / "out"), "bad.exr")
     refused(lambda: NewLight(tmp_path / "none.exr"), "none.exr")
