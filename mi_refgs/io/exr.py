@@ -17,19 +17,14 @@ from mi_refgs.io.files import check_size, replace_file, require_file
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"  # first bytes of every EXR file
 SAMPLE_BYTES = 2  # bytes per sample at least: those of half floats; integers and floats have 4
-SRGB_CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 """x, y of red, green, blue and white (ITU-R BT.709); the default of EXR files."""
-CHROMATICITY_TOLERANCE = 1e-3
-"""Half the last digit in standards, and far below the difference between any two of them."""
-MITSUBA_EXR_THREADS = 2
-"""Mitsuba 3.9 reads and writes EXR files on a worker thread; with one thread in all, it never returns."""
+CHROMATICITY_TOLERANCE = 1e-3  # half the last digit in standards
+MITSUBA_EXR_THREADS = 2  # Mitsuba 3.9 uses a worker thread for EXR files: with one in all, it never returns
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """All channels of an EXR file by name, float32 (H, W) each.
-
-    Raises InputError if the file is missing, unreadable, or contains NaN or infinite values.
-    """
+    """All channels of an EXR file by name, float32 (H, W) each; raises InputError unless all are finite."""
     import OpenEXR
 
     path = Path(path)
@@ -37,15 +32,9 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     with _readable(path), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
     for name, pixels in channels.items():
-        bad = np.argwhere(~np.isfinite(pixels))
-        if len(bad):
-            row, column = bad[0]
-            raise InputError(
-                f"{len(bad)} NaN or infinite values, the first at row {row}, column {column}",
-                path,
-                f"channel {name}",
-                "render the image again",
-            )
+        if len(bad := np.argwhere(~np.isfinite(pixels))):
+            what = f"{len(bad)} NaN or infinite values, the first at row {bad[0, 0]}, column {bad[0, 1]}"
+            raise InputError(what, path, f"channel {name}", "render the image again")
     return channels
 
 
@@ -63,7 +52,8 @@ def read_exr_image(path: str | Path, vectors: bool = False) -> np.ndarray:
 def exr_has_alpha(path: Path) -> bool:
     """Whether `read_exr_image` returns colour with alpha, by the header; raises InputError as that does."""
     exr_size(path)
-    return len(_header_channels(path)) == 4
+    header = _header(path)
+    return len(_image_channels(path, [channel.name for channel in header["channels"]], header, False)) == 4
 
 
 def exr_size(path: Path) -> tuple[int, int]:
@@ -80,7 +70,6 @@ def exr_size(path: Path) -> tuple[int, int]:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    """Attributes of a file of one part of flat pixels; raises InputError for other files."""
     import OpenEXR
 
     with _readable(path, "header"), OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
@@ -93,28 +82,20 @@ def _header(path: Path) -> dict[str, Any]:
     return header
 
 
-def _header_channels(path: Path) -> list[str]:
-    """The channels that `read_exr_image` reads."""
-    header = _header(path)
-    return _image_channels(path, [channel.name for channel in header["channels"]], header, False)
-
-
 def _image_channels(
     path: Path, channels: Collection[str], header: Mapping[str, Any], vectors: bool
 ) -> list[str]:
     """The channels of an image, in order; raises InputError as `read_exr_image` does."""
-    primaries = header.get("chromaticities", SRGB_CHROMATICITIES)
-    if "R" in channels and not np.allclose(primaries, SRGB_CHROMATICITIES, atol=CHROMATICITY_TOLERANCE):
+    primaries = header.get("chromaticities", SRGB)
+    if "R" in channels and not np.allclose(primaries, SRGB, atol=CHROMATICITY_TOLERANCE):
         raise InputError("not those of sRGB", path, "chromaticities", "convert the image to linear sRGB")
     for names in ("RGBA", "RGB", *(("XYZ",) if vectors else ()), "YA"):
         if set(names) <= set(channels):
             return list(names)
     if len(channels) == 1:
         return list(channels)
-    found, wanted = ", ".join(sorted(channels)), "X, Y, Z, " if vectors else ""
-    raise InputError(
-        f"found {found}", path, "channels", f"export R, G, B (and A), {wanted}or one channel (and A)"
-    )
+    remedy = f"export R, G, B (and A), {'X, Y, Z, ' if vectors else ''}or one channel (and A)"
+    raise InputError(f"found {', '.join(sorted(channels))}", path, "channels", remedy)
 
 
 @contextlib.contextmanager
@@ -129,8 +110,7 @@ def _readable(path: Path, field: str = "pixels") -> Iterator[None]:
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
     """Write an (H, W, C) or (H, W) array as ZIP-compressed float32 (or float16) EXR, atomically.
 
-    `names` has one letter per channel; by default Y, RGB or RGBA by the number of channels. Raises InputError
-    if the path cannot be written.
+    `names` has one letter per channel; by default Y, RGB or RGBA. Raises InputError as `replace_file` does.
     """
     image = np.asarray(image)
     planes = image[..., None] if image.ndim == 2 else image
@@ -140,10 +120,7 @@ def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, hal
 
 
 def write_exr_layers(path: str | Path, layers: Mapping[str, np.ndarray]) -> None:
-    """Write (H, W) arrays of float32 or float16 by name of channel, ZIP-compressed, atomically.
-
-    Raises InputError if the path cannot be written.
-    """
+    """Write (H, W) arrays of float32 or float16 by name of channel, as `write_exr` does."""
     import OpenEXR
 
     channels = {name: np.ascontiguousarray(plane) for name, plane in layers.items()}

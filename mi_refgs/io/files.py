@@ -19,8 +19,7 @@ from mi_refgs.errors import InputError
 
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp(\.[^.]*)?")  # names of the temporary files of `replace_file`
 ANY_FILE = 2**24  # bytes of pixels that a header of any file may promise
-MAX_EXPANSION = 1100
-"""Bytes of pixels per byte of a larger file that its header may promise: DEFLATE expands by at most 1,032."""
+MAX_EXPANSION = 1100  # bytes of pixels per byte of a larger file: DEFLATE expands by at most 1,032
 MAX_PIXELS = 2**28  # largest number of pixels of an image file: twice those of a 16K panorama
 POLL = 0.1  # seconds between two tries to take a lock
 _OWN = threading.local()  # `held`: paths of the locks of this thread
@@ -40,18 +39,15 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"cannot be created ({error.strerror})", path, "output", "choose a writable folder with -o"
-        ) from error
+        what, remedy = f"cannot be created ({error.strerror})", "choose a writable folder with -o"
+        raise InputError(what, path, "output", remedy) from error
 
 
 def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Write a file atomically: `write(temporary)` makes a file beside `path`, which is then moved there. Its
-    folder is made if need be.
+    """Write a file atomically: `write(temporary)` makes a file beside `path`, which is then moved there.
 
-    The data is flushed to disk before the move, so that also a power cut leaves the old file or the new one.
-    The temporary name has the suffix of `path`; a killed process may leave it behind (`remove_temporaries`).
-    Raises InputError if that fails.
+    Its folder is made if need be. Data are flushed to disk before the move: also a power cut leaves the old
+    file or the new one. A killed process may leave the temporary file. Raises InputError if that fails.
     """
     path = Path(path)
     make_folder(path.parent)
@@ -69,12 +65,12 @@ def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file atomically; raises InputError as `replace_file` does."""
+    """Write a file as `replace_file` does."""
     replace_file(path, lambda temporary: temporary.write_bytes(data))
 
 
 def write_json(path: str | Path, content: Any, indent: int = 1) -> None:
-    """Write a JSON file atomically; raises InputError as `replace_file` does."""
+    """Write a JSON file as `replace_file` does."""
     write_bytes(path, f"{json.dumps(content, indent=indent)}\n".encode())
 
 
@@ -86,11 +82,8 @@ class BusyError(InputError):
 def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
     """Lock the file at `path`; the operating system releases the lock however this process ends.
 
-    The lock is re-entrant per thread. The file is removed afterwards; one that a killed process leaves is not
-    locked. Nothing is locked where the file system has no locks.
-
-    Raises BusyError with the message `busy` if it stays locked elsewhere for `wait` seconds, and InputError
-    as `make_folder` does.
+    The lock is re-entrant per thread. Nothing is locked where the file system has no locks. Raises BusyError
+    with the message `busy` if the file stays locked elsewhere for `wait` seconds.
     """
     key = path.parent.resolve() / path.name
     held: set[Path] = _OWN.__dict__.setdefault("held", set())
@@ -154,10 +147,7 @@ def is_file(path: Path) -> bool:
 
 
 def inside(folder: Path, name: object) -> Path | None:
-    """The path of a relative name in a folder; None if it leads out of the folder or is no name.
-
-    Symbolic links are followed: the user made them, not the untrusted file that contains the name.
-    """
+    """The path of a relative name in a folder; None if it leads out of the folder or is no name."""
     parts = os.path.normpath(name) if isinstance(name, str) else os.pardir
     if os.path.isabs(parts) or parts.split(os.sep)[0] in (os.pardir, os.curdir):
         return None
@@ -165,17 +155,13 @@ def inside(folder: Path, name: object) -> Path | None:
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Raises InputError for a file that is missing, no JSON, nested too deeply, or not an object.
-    """
+    """The object in a JSON file; raises InputError for anything else."""
     path = Path(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"cannot be read ({error})", path, "JSON", "correct it or export it again"
-        ) from error
+        what, remedy = f"cannot be read ({error})", "correct it or export it again"
+        raise InputError(what, path, "JSON", remedy) from error
     if not isinstance(content, dict):
         raise InputError("the outermost value is not an object", path, "JSON", "export the file again")
     return content
@@ -191,19 +177,9 @@ def require_file(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
-    """Raise InputError for a size beyond MAX_PIXELS, and for one that no file of this length can contain.
-
-    Readers call it with the size in the header before they allocate memory.
-    """
+    """Raise InputError for a size beyond MAX_PIXELS, and for one that no file of this length can contain."""
+    what = f"{width} × {height} pixels are more than"
     if width * height > MAX_PIXELS:
-        raise InputError(
-            f"{width} × {height} pixels are more than {MAX_PIXELS // 10**6} million",
-            path,
-            "size",
-            "save a smaller copy",
-        )
-    promised = width * height * bytes_per_pixel
-    if promised > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
-        raise InputError(
-            f"{width} × {height} pixels are more than the file can hold", path, "size", "export it again"
-        )
+        raise InputError(f"{what} {MAX_PIXELS // 10**6} million", path, "size", "save a smaller copy")
+    if width * height * bytes_per_pixel > max(ANY_FILE, MAX_EXPANSION * path.stat().st_size):
+        raise InputError(f"{what} the file can hold", path, "size", "export it again")

@@ -16,10 +16,9 @@ SCALES = np.append(0, np.ldexp(1.0, np.arange(1, 256) - 136)).astype(np.float32)
 
 
 def read_hdr(path: Path) -> np.ndarray:
-    """A Radiance image (.hdr) as linear float32 (H, W, 3).
+    """A Radiance image (Ward, "Real Pixels", 1991) as linear float32 (H, W, 3); raises InputError.
 
-    Mitsuba's reader is not used: it writes out of bounds where a run is longer than its row. Layout: Ward,
-    "Real Pixels", 1991. Raises InputError if the file is missing or no such image.
+    Mitsuba's reader is not used: it writes out of bounds where a run is longer than its row.
     """
     require_file(path)
     data = path.read_bytes()

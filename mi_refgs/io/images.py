@@ -19,11 +19,9 @@ SRGB_LINEAR_LIMIT = 0.0031308  # linear value below which the sRGB curve is a st
 SRGB_ENCODED_LIMIT = 0.04045  # the same point after encoding
 ALPHA_FLOOR = 1e-8  # alpha by which radiance is divided at least
 
-ENDINGS = (".png", ".jpg", ".jpeg")
-"""File name endings of 8-bit images, in lower case, in the order in which they are tried."""
+ENDINGS = (".png", ".jpg", ".jpeg")  # of 8-bit images, in the order in which they are tried
 EXIF_IFD = 0x8769  # tag of the table of camera settings (EXIF 2.3)
-PSNR_MAX = 100.0
-"""PSNR of identical images, dB: JSON has no infinity, and float32 images cannot differ by less."""
+PSNR_MAX = 100.0  # dB, of identical images: JSON has no infinity
 JPEG_SHRINK = 8  # JPEG blocks have 8 × 8 pixels; the decoder can return 8 × 8, 4 × 4, 2 × 2 or 1 for each
 
 
@@ -67,10 +65,7 @@ def psnr_of(error: float) -> float:
 
 
 def with_ending(stem: Path, endings: tuple[str, ...] = ENDINGS) -> Path | None:
-    """The file whose name is `stem` and an ending, in upper or lower case; None without one.
-
-    If there are several, the first in the order of `endings`.
-    """
+    """The file whose name is `stem` and an ending, in any case; of several, the first of `endings`."""
     for ending in endings:
         for suffix in (ending, ending.upper()):
             if is_file(file := stem.with_name(stem.name + suffix)):
@@ -84,10 +79,7 @@ def with_ending(stem: Path, endings: tuple[str, ...] = ENDINGS) -> Path | None:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height, pixels, of a PNG, JPEG or EXR file, from its header.
-
-    Raises InputError as the file's reader does.
-    """
+    """Width and height of a PNG, JPEG or EXR file, from its header; raises InputError as its reader does."""
     path = Path(path)
     if path.suffix.lower() == ".exr":
         return exr_size(path)
@@ -107,9 +99,8 @@ def read_png(path: str | Path) -> np.ndarray:
 def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
     """8-bit image file (PNG, JPEG) as uint8 (H, W, 3 or 4), and the factor by which both sides are smaller.
 
-    The factor is the largest divisor of `shrink` by which the decoder shrinks at lower cost than decoding the
-    whole file: 2, 4 or 8 for JPEG files, else 1. An incomplete last block counts as a pixel. Raises
-    InputError as `read_png` does.
+    The factor divides `shrink`: 2, 4 or 8 for JPEG files, which are so decoded at lower cost, else 1. An
+    incomplete last block counts as a pixel. Raises InputError as `read_png` does.
     """
     path = Path(path)
     with open_image(path) as image:
@@ -145,10 +136,7 @@ def read_mask(path: str | Path) -> np.ndarray:
 
 
 def read_tiff(path: str | Path) -> np.ndarray:
-    """Numbers (H, W) float32 of a TIFF file with one channel: floats, or 16 bits as 0 … 1.
-
-    Raises InputError if the file is missing, unreadable, or contains something else.
-    """
+    """Numbers (H, W) float32 of a TIFF file of one channel: floats, or 16 bits as 0 … 1."""
     path = Path(path)
     with open_image(path, "TIFF") as image:
         if image.mode != "F" and not image.mode.startswith("I;16"):
@@ -169,7 +157,7 @@ def _transparent(image: Any) -> bool:
 
 @contextlib.contextmanager
 def open_image(path: Path, *formats: str) -> Iterator[Any]:
-    """Open a PNG or JPEG file, or one of `formats`: the header is read and its size checked."""
+    """Open a PNG or JPEG file, or one of `formats`, and check its size."""
     from PIL import Image
 
     require_file(path)
@@ -205,10 +193,9 @@ def to_8_bits(image: np.ndarray) -> np.ndarray:
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write an (H, W), grey, or (H, W, 3 or 4) image, sRGB-encoded values in [0, 1] (clipped), as 8-bit PNG,
-    atomically.
+    """Write an (H, W), grey, or (H, W, 3 or 4) image, sRGB encoded in [0, 1] (clipped), as 8-bit PNG.
 
-    Raises InputError if the path cannot be written.
+    Raises InputError as `replace_file` does.
     """
     from PIL import Image
 

@@ -18,7 +18,7 @@ RUN_FILES = {
 
 
 def owner_of(folder: Path) -> str | None:
-    """The owner that a folder names; None if it names none."""
+    """The owner that a folder names."""
     try:
         return (folder / MARK).read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -26,8 +26,7 @@ def owner_of(folder: Path) -> str | None:
 
 
 def require_own(folder: Path, owner: str) -> None:
-    """Raise InputError for a folder that names another owner, or that has files besides hidden ones and names
-    none."""
+    """Raise InputError for a folder of another owner, or with files besides hidden ones and no owner."""
     try:
         if (found := owner_of(folder)) == owner or not folder.exists():
             return
@@ -40,8 +39,7 @@ def require_own(folder: Path, owner: str) -> None:
 
 
 def own_folder(folder: Path, owner: str) -> None:
-    """Make an output folder and write its owner there; raises InputError as `require_own` does, with nothing
-    changed, and if it cannot be written."""
+    """Make an output folder and write its owner there; raises InputError as `require_own` does."""
     require_own(folder, owner)
     write_bytes(folder / MARK, owner.encode())
 
@@ -49,6 +47,5 @@ def own_folder(folder: Path, owner: str) -> None:
 def require_no_run(path: Path) -> None:
     """Raise InputError if a file that the user names as output is one that a run consists of."""
     if path.name in RUN_FILES and path.exists() and owner_of(path.parent) == RUN:
-        raise InputError(
-            "belongs to a run, which is never overwritten", path, "output", "choose another output"
-        )
+        what = "belongs to a run, which is never overwritten"
+        raise InputError(what, path, "output", "choose another output")

@@ -25,12 +25,10 @@ ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "a"}
 
 @dataclass(frozen=True)
 class Element:
-    """One table of the file."""
-
     name: str
     count: int  # rows
-    fields: tuple[tuple[str, str], ...]  # name and TYPES code of the properties that are numbers
-    lists: tuple[tuple[str, str], ...]  # name and code of the length of the properties that are lists
+    fields: list[tuple[str, str]]  # name and TYPES code of the properties that are numbers
+    lists: list[tuple[str, str]]  # name and code of the length of the properties that are lists
 
     def row_bytes(self, text: bool) -> int:
         """Smallest size of a row: every list empty; as text, a digit and a space per property."""
@@ -41,8 +39,6 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """The lines before the data."""
-
     order: str  # "<", ">", or "a" for text
     elements: tuple[Element, ...]
     comments: tuple[str, ...]
@@ -51,14 +47,13 @@ class Header:
 def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or mesh.ply of a run") -> Header:
     """Read the header; the file position is then that of the data.
 
-    Raises InputError, naming `path`, for a file without PLY header (the message says to give `wanted`) and
-    for a header that promises more rows than the file contains.
+    Raises InputError for a file without PLY header (the remedy is to give `wanted`) and for a header that
+    promises more rows than the file contains.
     """
-    # Lines up to end_header.
     if file.readline(MAX_LINE).strip() != b"ply":
         raise InputError("not a PLY file", path, "header", f"give {wanted}")
     order, comments = "", []
-    found: list[tuple[str, int, list[tuple[str, str]], list[tuple[str, str]]]] = []
+    elements: list[Element] = []
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(MAX_LINE)
         words = line.decode("ascii", errors="replace").split()
@@ -70,11 +65,11 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
             case ["comment" | "obj_info", *rest]:
                 comments.append(" ".join(rest))
             case ["element", name, count] if count.isdigit() and len(count) < 19:
-                found.append((name, int(count), [], []))
-            case ["property", kind, name] if found and kind in TYPES:
-                found[-1][2].append((name, TYPES[kind]))
-            case ["property", "list", length, kind, name] if found and {length, kind} <= TYPES.keys():
-                found[-1][3].append((name, TYPES[length]))
+                elements.append(Element(name, int(count), [], []))
+            case ["property", kind, name] if elements and kind in TYPES:
+                elements[-1].fields.append((name, TYPES[kind]))
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= TYPES.keys():
+                elements[-1].lists.append((name, TYPES[length]))
             case ["end_header"]:
                 break
             case _:
@@ -82,10 +77,8 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
                 raise InputError(f"'{text}' is no line of a PLY header", path, "header", "export it again")
     else:
         raise InputError(f"no end_header in {MAX_HEADER_LINES} lines", path, "header", "export it again")
-    elements = tuple(Element(name, count, (*fields,), (*lists,)) for name, count, fields, lists in found)
     if not order or not elements:
         raise InputError("no format or no element", path, "header", "export it again")
-    # Properties, and the number of rows against the size of the file.
     left = os.fstat(file.fileno()).st_size - file.tell()
     for element in elements:
         names = [name for name, _ in (*element.fields, *element.lists)]
@@ -95,13 +88,9 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
             raise InputError(f"a property of {element.name} occurs twice", path, "header", "export it again")
         left -= element.count * element.row_bytes(order == "a")
         if left < (-1 if order == "a" else 0):  # text may end without a line break
-            raise InputError(
-                f"{element.count} rows are more than the file contains",
-                path,
-                element.name,
-                "the file is truncated, copy or export it again",
-            )
-    return Header(order, elements, (*comments,))
+            what, remedy = f"{element.count} rows are more than the file contains", "copy or export it again"
+            raise InputError(what, path, element.name, remedy)
+    return Header(order, (*elements,), (*comments,))
 
 
 def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
@@ -114,9 +103,8 @@ def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
     if vertex.name != "vertex":
         raise InputError("the vertices must come first", path, vertex.name, "export it as a surfel PLY")
     if vertex.lists:
-        raise InputError(
-            "not a number property", path, vertex.lists[0][0], "export the vertices without lists"
-        )
+        name, _ = vertex.lists[0]
+        raise InputError("not a number property", path, name, "export the vertices without lists")
     size = vertex.count * (8 if text else 1) * max(vertex.row_bytes(False), 1)
     require(PER_PLY_BYTE * size, f"{path}: vertex: {vertex.count:,} rows", "keep fewer of them")
     if not text:
@@ -127,8 +115,7 @@ def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
         try:
             values[row] = [float(word) for word in file.readline().split()]
         except ValueError as error:
-            raise InputError(
-                f"row {row} is broken or missing", path, "vertex", "copy or export the file again"
-            ) from error
+            what = f"row {row} is broken or missing"
+            raise InputError(what, path, "vertex", "copy or export the file again") from error
     dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
     return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)

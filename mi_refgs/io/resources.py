@@ -10,11 +10,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def resource_dir(name: str) -> Path:
-    """Folder of the resource `name` ("variants" or "scenes"), in an installed wheel as in a checkout.
-
-    A wheel has these folders inside the package; a checkout has them beside it. Raises InputError if neither
-    has the folder.
-    """
+    """Folder `name` ("variants" or "scenes"): inside an installed package, or beside that of a checkout."""
     checkout = [_PACKAGE.parent] if (_PACKAGE.parent / "pyproject.toml").is_file() else []
     for parent in (_PACKAGE, *checkout):
         if (parent / name).is_dir():

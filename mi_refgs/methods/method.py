@@ -80,7 +80,7 @@ class SurfelOptions:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All attributes, those of the primitive first; raises InputError for an unknown primitive."""
+        """All attributes, those of the primitive first."""
         return (*PRIMITIVES.find(self.primitive, "primitive").widths, *self.attributes)
 
     def columns(self, name: str) -> int:
@@ -95,9 +95,7 @@ class SurfelOptions:
 
 @dataclass(frozen=True)
 class SurroundingsOptions:
-    """The scene outside the region of interest, for images without alpha: background Gaussians with
-    radiance_sh only, and a lat-long environment behind everything.
-    """
+    """The scene outside the region of interest: background Gaussians and an environment behind everything."""
 
     primitive: str = "gaussian"  # what is splatted: needs no normals, and a surfel is a flat Gaussian
     count: int = field(default=20_000, metadata=at_least(1))  # initial surfels

@@ -30,10 +30,8 @@ from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
 COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)
-"""Factors by SH degree for the cosine-weighted mean over a hemisphere. [Ramamoorthi and Hanrahan 2001, eq. 8,
-over π]"""
-IRRADIANCE_FLOOR = 1e-4
-"""Fraction of the brightest irradiance below which a surfel is dark whatever its albedo."""
+"""Mean over a hemisphere, cosine-weighted, by SH degree. [Ramamoorthi and Hanrahan 2001, eq. 8, over π]"""
+IRRADIANCE_FLOOR = 1e-4  # of the brightest irradiance; darker surfels are dark whatever their albedo
 
 
 def lacking(scene: TrainedScene) -> str:
@@ -74,11 +72,9 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
     """Convert the diffuse radiance of each surfel to an albedo, under the light that it was fitted to.
 
-    R is the cosine-weighted mean of the radiance over the directions in front of a surfel, E the irradiance
-    there times the ambient visibility of the mesh (`shade.ambient`), S a dielectric's reflectance at normal
-    incidence. The diffuse albedo is R / ((1 - S) E), clipped to 0 … 1; the albedo becomes
-    metallic albedo + (1 - metallic) that. The front is the mesh's outside, or without a mesh the side away
-    from the centre of the surfels. Raises InputError without radiance_sh, albedo, metallic and roughness.
+    R is the cosine-weighted mean of the radiance in front of a surfel, E the irradiance there times the
+    ambient visibility of the mesh, S a dielectric's reflectance at normal incidence. The diffuse albedo is
+    R / ((1 - S) E), clipped to 0 … 1; the albedo becomes metallic albedo + (1 - metallic) that.
     """
     with dr.suspend_grad():
         surfels = surfels.cleaned()

@@ -8,8 +8,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
-from scipy.spatial import cKDTree
 
 from benchmarks.common.errors import compare
 from benchmarks.common.montecarlo import estimate
@@ -68,16 +66,6 @@ def test_setting_is_chosen_on_other_scenes_within_budget() -> None:
     assert (found["scene"], found["method"]) == ("here", "steady")
     assert found["gain"] == pytest.approx(2) and found["price"] == pytest.approx(2)
     assert found["best_gain"] == pytest.approx(4) and found["mirror_relmse"] == 1
-
-
-@pytest.mark.parametrize("name", ["bowl", "deep_bowl", "plates"])
-def test_scenes_are_closed_and_face_outwards(name: str) -> None:
-    mesh = cases.make_scene(name, 0).mesh
-    whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
-    assert whole.is_watertight
-    parts = whole.split()
-    assert len(parts) == 2 and all(part.volume > 0 for part in parts)
-    assert cKDTree(parts[0].vertices).query(parts[1].vertices)[0].min() > 0.02  # they do not touch
 
 
 def test_sh_radiance_is_recovered(rng: np.random.Generator) -> None:

@@ -98,7 +98,7 @@ def test_failed_job_is_a_row_with_its_reason(compared: tuple[Path, int]) -> None
     [scene] = table["scenes"]
     tiny, other = scene["rows"]
     assert tiny["variant"] == "tiny" and tiny["seeds"] == [0] and list(tiny["failed"]) == ["1"]
-    assert "seed1: output: cannot be written" in tiny["failed"]["1"]
+    assert "seed1/previews: output: cannot be created" in tiny["failed"]["1"]
     assert other["seeds"] == [0, 1] and not other["failed"]
     assert f"tiny, seed 1: failed: {tiny['failed']['1']}" in (compared[0] / "table.md").read_text()
 
@@ -300,7 +300,7 @@ def test_page_has_table_plot_failures_and_deviations(compared: tuple[Path, int])
     assert sum(not closing for closing, _ in tags) == sum(bool(closing) for closing, _ in tags) > 20
     assert 'src="pictures/0_psnr.png"' in page and (folder / "pictures/0_psnr.png").stat().st_size > 1000
     command_line = json.loads((folder / "compare.json").read_text())["command"]
-    for said in ("a ball <and> no scene", "llvm_ad_rgb", "cannot be written", command_line):
+    for said in ("a ball <and> no scene", "llvm_ad_rgb", "cannot be created", command_line):
         assert html.escape(said) in page, said
 
 

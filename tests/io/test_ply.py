@@ -100,19 +100,10 @@ def test_3dgs_file_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     refused(lambda: read_ply(write_file(tmp_path / "a.ply", columns)), "scale_1: the property is missing")
 
 
-@pytest.mark.parametrize("missing", GEOMETRY)
-def test_missing_property_is_named(missing: str, tmp_path: Path, rng: np.random.Generator) -> None:
-    columns = geometry(rng)
-    del columns[missing]
-    path = write_file(tmp_path / "a.ply", columns)
-    refused(lambda: read_ply(path), f"a.ply: {missing}: the property is missing; export")
-
-
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        ({"albedo_0": 0, "albedo_2": 0}, "albedo_1: the property is missing"),
-        ({"f_dc_0": 0, "f_dc_1": 0}, "f_dc_2: the property is missing"),
+        ({"albedo_0": 0, "albedo_2": 0}, "albedo_1: the property is missing; export"),
         ({"ind_rest_0": 0}, "ind_rest_*: 1 properties; use 0, 9, 24 or 45"),
     ],
 )
@@ -138,11 +129,9 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
     text = write_file(tmp_path / "t.ply", geometry(rng), "ascii").read_bytes()
     face_first = whole.replace(b"element vertex", b"element face 2\nproperty float q\nelement vertex")
     for data, message in [
-        (whole[:-1], "vertex: 4 rows are more than the file contains; the file is truncated"),
+        (whole[:-1], "vertex: 4 rows are more than the file contains; copy"),
         (whole[:60], "no end_header; the file is truncated"),
-        (b"", "not a PLY file"),
         (b"\x89PNG\r\n", "not a PLY file"),
-        (text[:-30], "vertex: "),
         (text.replace(text.split()[-1], b"zero"), "row 3 is broken"),
         (whole.replace(b"format binary_little_endian", b"format pdp_endian"), "no format or no element"),
         (face_first + bytes(8), "face: the vertices must come first"),
@@ -154,10 +143,8 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
     refused(lambda: read_ply(tmp_path / "gone.ply"), "gone.ply: file: cannot be read")
 
 
-def test_unwritable_output_and_bad_values_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_bad_values_are_not_written(tmp_path: Path, rng: np.random.Generator) -> None:
     surfels = table(3, rng)
-    (tmp_path / "file").write_text("")
-    refused(lambda: write_ply(tmp_path / "file" / "a.ply", surfels), "output: cannot be created")
     write_ply(tmp_path / "a.ply", surfels)
     before = (tmp_path / "a.ply").read_bytes()
     raw = surfels.to_numpy()

@@ -21,11 +21,9 @@ from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.mesh import ExtractMesh
 from mi_refgs.fitting.events.propagate import Propagate
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.build import build, by_kind, by_name, plain, scaled
+from mi_refgs.methods.build import scaled
 from mi_refgs.methods.event import EVENTS as REGISTERED
-from mi_refgs.methods.ranges import at_least
 from mi_refgs.methods.window import ITERATIONS, Window
-from mi_refgs.registry import Registry
 from mi_refgs.shade.shading import Shading
 from tests.helpers import refused
 from tests.scenes.highlight import ball
@@ -37,16 +35,10 @@ def test_shipped_methods_load_and_read_back(variant: str, preset: str, tmp_path:
     method = methods.load(variant, preset)
     assert method.iterations == methods.PRESETS[preset].iterations == method.stages()[-1][1].until
     path = tmp_path / "config.toml"
-    path.write_text(methods.dump(method))
-    assert methods.load_resolved(path) == method
-
-
-@pytest.mark.parametrize("losses", [{}, {"normal": methods.LossWeight(0.5)}])
-def test_a_loss_that_a_run_lacks_stays_absent(losses: dict[str, methods.LossWeight], tmp_path: Path) -> None:
-    method = dataclasses.replace(methods.load("ref_gaussian"), loss=losses)
-    path = tmp_path / "config.toml"
-    path.write_text(methods.dump(method))
-    assert methods.load_resolved(path) == method
+    for losses in (method.loss, {"normal": methods.LossWeight(0.5)}, {}):  # one that a run lacks stays absent
+        fitted = dataclasses.replace(method, loss=losses)
+        path.write_text(methods.dump(fitted))
+        assert methods.load_resolved(path) == fitted
 
 
 def test_a_preset_of_numbers_scales_as_a_named_one() -> None:
@@ -59,7 +51,6 @@ def test_a_preset_of_numbers_scales_as_a_named_one() -> None:
     )
     assert named == numbers
     short = methods.load("auto", "500:1000")
-    assert (short.iterations, short.surfels.count, short.surfels.max_count) == (500, 750, 1000)
     assert methods.load(short.file, short.preset, short.assignments) == short
 
 
@@ -165,21 +156,12 @@ propagate.when = { start = 0, until = 2_601, every = 650 }
 """Few of these numbers are whole, or multiples of each other, once a preset has scaled them."""
 
 
-EVENTS = {
-    "ref_gaussian": dict(degree=2, densify=14, reset_opacity=1, mesh=8),
-    "ref_gaussian_paper": dict(degree=3, densify=48, reset_opacity=8, propagate=16, mesh=16, restart=1),
-    "many": dict(degree=3, densify=22, reset_opacity=4, propagate=4, mesh=7, restart=1),
-}
-"""Numbers of events that differ between methods."""
-
-
-@pytest.mark.parametrize("variant", EVENTS)
 def test_every_preset_has_the_same_events_in_the_same_order(
-    variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a trainer does over the whole fit, its steps left out."""
-    (tmp_path / "many.toml").write_text(MANY_EVENTS)
-    path = str(tmp_path / "many.toml") if variant == "many" else variant
+    path = tmp_path / "many.toml"
+    path.write_text(MANY_EVENTS)
     done: list[str] = []
 
     for kind in REGISTERED.values():
@@ -189,7 +171,9 @@ def test_every_preset_has_the_same_events_in_the_same_order(
     monkeypatch.setattr(Shading, "resolve", staticmethod(functools.cache(Shading.resolve)))
     sequences = {}
     for preset in methods.PRESETS:
-        method = methods.load(path, preset, ["surfels.count=20", "surfels.max_count=20", "light.height=8"])
+        method = methods.load(
+            str(path), preset, ["surfels.count=20", "surfels.max_count=20", "light.height=8"]
+        )
         trainer = Trainer(method, ball())
         done.clear()
         while trainer.iteration < method.iterations:
@@ -198,7 +182,8 @@ def test_every_preset_has_the_same_events_in_the_same_order(
             done += ["degree"] * (trainer.setup.sh_degree(trainer.iteration) - degree)
         sequences[preset] = list(done)
     assert sequences["quick"] == sequences["standard"] == sequences["paper"]
-    assert Counter(sequences["quick"]) == EVENTS[variant]
+    expected = dict(degree=3, densify=22, reset_opacity=4, propagate=4, mesh=7, restart=1)
+    assert Counter(sequences["quick"]) == expected
 
 
 def test_assignments_are_applied_unscaled() -> None:
@@ -221,15 +206,12 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
         ("iterations = 10\n[stage.a]\nuntil = 'x'", ["until", "expected int"]),
         (f"{STAGE}at = 'voxel'", ["'voxel' is not allowed", "surfel"]),
         ("iterations = 10", ["missing key 'stage'"]),
-        ("[stage.a]\nuntil = 10", ["missing key 'iterations'"]),
         ("iterations = [", ["not valid TOML"]),
         (
             f"{STAGE}[event.mesh]\nwhen = {{start = 0, until = 9, every = 0}}",
-            ["event.mesh.when", "'every' above 0"],
+            ["mesh.when", "'every' above 0"],
         ),
         (f"{STAGE}[data]\ncoarse = [{{until = 5, block = 1}}]", ["data.coarse.block: 1", "2 or more"]),
-        (f"{STAGE}[data]\ncrop = 4000", ["data.crop: 4000", "4,096 or more"]),
-        (f"{STAGE}[light]\nevery = 0", ["light.every: 0", "1 or more"]),
         (f"{STAGE}[event.cameras]\nafter = -1", ["event.cameras.after: -1", "0 or more"]),
         (f"{STAGE}[event.camera]", ["event: 'camera' is unknown", "cameras"]),
     ],
@@ -241,27 +223,17 @@ def test_bad_files_are_named(text: str, words: list[str], tmp_path: Path) -> Non
 
 
 def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
-    child = tmp_path / "child.toml"
-    child.write_text('extends = "ref_gaussian"\n[loss]\nssim = 0.5\n')
-    base, changed = methods.load("ref_gaussian"), methods.load(str(child))
-    assert changed.loss == base.loss | {"ssim": methods.LossWeight(0.5)}
-    assert dataclasses.replace(changed, loss=base.loss, name=base.name, file=base.file) == base
-    assert changed.name == "child"
-
-
-@pytest.mark.parametrize("base", methods.names())
-def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: Path) -> None:
-    """A shipped method that extends another one, and an own file beside or below the one that names it."""
+    """An own file that extends one below it, which extends a shipped one."""
     (tmp_path / "below").mkdir()
-    (tmp_path / "below" / "own.toml").write_text(f'extends = "{base}"\n[loss]\nssim = 0.5\n')
-    grandchild = tmp_path / "grandchild.toml"
-    grandchild.write_text('extends = "below/own.toml"\ndrop = ["event.densify"]\n[loss]\nnormal = 0.3\n')
-    shipped, changed = methods.load(base), methods.load(str(grandchild))
-    normal = dataclasses.replace(shipped.loss["normal"], weight=0.3)
-    assert changed.loss == shipped.loss | {"ssim": methods.LossWeight(0.5), "normal": normal}
-    assert changed.event == {name: x for name, x in shipped.event.items() if name != "densify"}
-    same = dataclasses.replace(changed, loss=shipped.loss, event=shipped.event, name=base, file=base)
-    assert same == shipped
+    (tmp_path / "below" / "own.toml").write_text('extends = "auto"\n[loss]\nssim = 0.5\n')
+    child = tmp_path / "child.toml"
+    child.write_text('extends = "below/own.toml"\ndrop = ["event.densify"]\n[loss]\nnormal = 0.3\n')
+    base, changed = methods.load("auto"), methods.load(str(child))
+    normal = dataclasses.replace(base.loss["normal"], weight=0.3)
+    assert changed.loss == base.loss | {"ssim": methods.LossWeight(0.5), "normal": normal}
+    assert changed.event == {name: x for name, x in base.event.items() if name != "densify"}
+    same = dict(loss=base.loss, event=base.event, name=base.name, file=base.file)
+    assert changed.name == "child" and dataclasses.replace(changed, **same) == base
 
 
 @pytest.mark.parametrize(
@@ -270,7 +242,6 @@ def test_extends_takes_every_shipped_method_and_own_files(base: str, tmp_path: P
         ('extends = "own.toml"', ["own.toml: extends: the file extends itself", "break"]),
         ('extends = "other.toml"', ["own.toml: extends: the file extends itself"]),
         ('extends = "gone.toml"', ["own.toml: extends: gone.toml: no such method", "ref_gaussian"]),
-        ('extends = "ref_gausian"', ["own.toml: extends: ref_gausian: no such method", "ref_gaussian"]),
         ("extends = 3", ["own.toml: extends: expected a name", "3"]),
         ('extends = "ref_gaussian"\ndrop = "event"', ["own.toml: drop: expected a list"]),
         ('extends = "ref_gaussian"\ndrop = ["seed.x"]', ["own.toml: drop: no key 'seed.x'"]),
@@ -283,14 +254,6 @@ def test_wrong_extends_are_named(text: str, words: list[str], tmp_path: Path) ->
     (tmp_path / "other.toml").write_text('extends = "own.toml"\n')
     (tmp_path / "wrong.toml").write_text("[")
     refused(lambda: methods.load(str(tmp_path / "own.toml")), *words)
-
-
-def test_an_unknown_primitive_is_refused() -> None:
-    chosen = methods.load("ref_gaussian", "quick", ["surfels.primitive='gaussian'"])
-    assert chosen.surfels.columns("scale") == 3
-    for table in ("surfels", "surroundings"):
-        with pytest.raises(InputError, match=rf"{table}\.primitive: 'ball' is unknown; use surfel or gauss"):
-            methods.load("ref_gaussian", "quick", [f"{table}.primitive='ball'"])
 
 
 def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
@@ -306,29 +269,22 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
             methods.for_purpose(word)
 
 
-SURROUNDINGS = dict(count=0, degree=4, max_count=-1)
-"""Values out of range."""
-
-
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
         ("stage.deferred.rates.tint=2.0", "stage.deferred.rates: 'tint' is unknown"),
         ("stage.deferred.rates.metallic=-1.0", "stage.deferred.rates: -1.0 is out of range"),
-        ("stage.deferred.rates.light=nan", "out of range"),
-        ("surfels.from_images=['metallic']", "metallic"),
         ("surfels.attributes=['metallic', 'roughness']", "albedo"),
-        ("event.densify.grow=-0.1", r"event\.densify\.grow: -0\.1"),
         ("loss.ssim=1.5", r"loss\.ssim\.weight: 1.5 is out of range; give a number from 0 to 1"),
-        ("loss.normal=-0.1", r"loss\.normal\.weight: -0.1 is out of range; give 0 or more"),
-        *((f"loss.normal.{key}=-5", rf"loss\.normal\.{key}: -5") for key in ("start", "rise", "until")),
+        ("loss.normal.rise=-5", r"loss\.normal\.rise: -5 is out of range; give 0 or more"),
         ("losses.ssim=1", "--set: unknown key 'losses'"),
         ("loss", "--set: loss: expected key=value"),
         ("iterations.x=1", "--set: iterations.x: 'iterations' is not a table"),
-        *(
-            (f"surroundings.{key}={value}", rf"surroundings\.{key}: .*; give")
-            for key, value in SURROUNDINGS.items()
-        ),
+        ("surroundings.count=0", r"surroundings\.count: .*; give"),
+        ("surfels.primitive='ball'", r"surfels\.primitive: 'ball' is unknown; use surfel or gauss"),
+        ("light.kind='tv'", r"light\.kind: 'tv' is unknown; use learnt"),
+        ("light=3", "light: expected a table, found 3"),
+        ("stage.deferred.visibility_rays=0", "visibility_rays"),
     ],
 )
 def test_bad_settings_are_named(assignment: str, words: str) -> None:
@@ -338,66 +294,8 @@ def test_bad_settings_are_named(assignment: str, words: str) -> None:
 
 def test_a_method_limits_what_presets_allow() -> None:
     """Presets that allow more start as `quick`; presets that allow fewer, and settings, count."""
-    counts = {
-        preset: (method.surfels.count, method.surfels.max_count)
-        for preset in ("quick", "standard", "paper", "500:1000")
-        for method in [methods.load("auto", preset)]
-    }
-    assert counts == dict.fromkeys(("quick", "standard", "paper"), (15_000, 20_000)) | {
-        "500:1000": (750, 1000)
-    }
+    for preset, counts in {"standard": (15_000, 20_000), "500:1000": (750, 1000)}.items():
+        surfels = methods.load("auto", preset).surfels
+        assert (surfels.count, surfels.max_count) == counts
     assert methods.load("auto", "standard", ["surfels.max_count=50000"]).surfels.max_count == 50_000
     assert methods.load("ref_gaussian", "standard").surfels.max_count == 40_000
-
-
-def test_a_stage_sets_every_shading_option() -> None:
-    options = ["dominant=true", "visibility_rays=4", "antialias=true"]
-    method = methods.load("ref_gaussian", "quick", [f"stage.deferred.{option}" for option in options])
-    shading = method.stage["deferred"].shading
-    assert shading.chosen() == ["dominant", "visibility_rays", "antialias"]
-    for wrong in ("visibility_rays=0", "occlusion=true", "dominant=1"):
-        with pytest.raises(InputError, match=wrong.partition("=")[0]):
-            methods.load("ref_gaussian", "quick", [f"stage.deferred.{wrong}"])
-
-
-@dataclasses.dataclass(frozen=True)
-class Lamp:
-    """A kind of thing, of which another one has no `height`."""
-
-    name: typing.ClassVar = "lamp"
-    height: int = dataclasses.field(default=4, metadata=ITERATIONS | at_least(2))
-
-
-@dataclasses.dataclass(frozen=True)
-class Bulb:
-    name: typing.ClassVar = "bulb"
-    on: Window = methods.method.AT_ONCE
-
-
-KINDS = Registry[Any]("kind")
-KINDS.register(Lamp)
-KINDS.register(Bulb)
-
-
-@dataclasses.dataclass(frozen=True)
-class House:
-    """Values that a registry builds: a table of each name, and a table of one kind."""
-
-    room: dict[str, Any] = dataclasses.field(default_factory=dict, metadata=by_name(KINDS))
-    hall: Any = dataclasses.field(default=None, metadata=by_kind(KINDS, "lamp"))
-
-
-def test_a_registry_builds_tables() -> None:
-    table = {"room": {"lamp": {"height": 8}, "bulb": {}}, "hall": {"kind": "bulb"}}
-    house = build(House, table)
-    assert house == House({"lamp": Lamp(8), "bulb": Bulb()}, Bulb())
-    assert build(House, plain(house)) == house
-    half = Bulb(Window(0, 1.5, 0.5))
-    assert scaled(house, 0.5) == House({"lamp": Lamp(4), "bulb": half}, half)
-    assert build(House, {"hall": {}}).hall == Lamp()
-    refused(lambda: build(House, {"room": {"tv": {}}}), "room: 'tv' is unknown; use lamp or bulb")
-    refused(lambda: build(House, {"hall": {"kind": "tv"}}), "hall.kind: 'tv' is unknown; use lamp or bulb")
-    refused(
-        lambda: build(House, {"room": {"lamp": {"height": 1}}}), "room.lamp.height: 1 is out of range; give 2"
-    )
-    refused(lambda: build(House, {"hall": 3}), "hall: expected a table, found 3")

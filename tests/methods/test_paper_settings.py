@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
 from tests.helpers import ROOT
 
@@ -50,8 +49,3 @@ def test_every_scene_of_the_tables_has_settings() -> None:
             continue
         for words in data["scenes"].values():
             assert f"paper/{data['folder']}/{words[0]}" in NAMES
-
-
-def test_an_unknown_name_is_one_sentence() -> None:
-    with pytest.raises(InputError, match="--method: paper/ref_real/no: no such method"):
-        methods.load("paper/ref_real/no")

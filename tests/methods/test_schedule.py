@@ -26,10 +26,6 @@ def schedule(seed: int = 0) -> FitSetup:
     return FitSetup(method, DATA)
 
 
-def cropped(pixels: int) -> FitSetup:
-    return FitSetup(replace(schedule().method, data=DataOptions(crop=pixels)), DATA)
-
-
 def test_views_come_once_an_epoch_in_an_order_of_its_own() -> None:
     epochs = [[schedule().view(7 * epoch + i + 1) for i in range(7)] for epoch in range(5)]
     assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
@@ -42,8 +38,6 @@ def test_draws_follow_seed_iteration_and_operation() -> None:
     draws = [schedule(seed).rng(i, name).random() for seed, i, name in keys]
     assert len(set(draws)) == len(draws)
     assert draws == [schedule(seed).rng(i, name).random() for seed, i, name in keys]
-    orders = [[schedule(seed).view(i + 1) for i in range(7)] for seed in range(4)]
-    assert len(set(map(tuple, orders))) > 1
 
 
 def test_every_operation_of_an_iteration_draws_on_its_own() -> None:
@@ -62,7 +56,7 @@ def test_every_operation_of_an_iteration_draws_on_its_own() -> None:
 @pytest.mark.parametrize("size", [(100, 80), (64, 64), (37, 201)])
 def test_crops_cover_an_image_with_its_border(size: tuple[int, int]) -> None:
     """They begin at whole patches, contain no more than `crop` pixels, and reach every border."""
-    setup = cropped(1_800)
+    setup = FitSetup(replace(schedule().method, data=DataOptions(crop=1_800)), DATA)
     parts = [setup.crop(iteration, *size) for iteration in range(400)]
     assert parts == [setup.crop(iteration, *size) for iteration in range(400)]
     seen = np.zeros(size[::-1])
@@ -73,20 +67,13 @@ def test_crops_cover_an_image_with_its_border(size: tuple[int, int]) -> None:
         assert x + width <= size[0] and y + height <= size[1] and 900 < width * height <= 1_800
         seen[y : y + height, x : x + width] += 1
     assert seen.min() > 0.05 * seen.max()
-    assert len({*parts}) > 10
+    assert len({*parts}) > 10 and setup.crop(1, 45, 40) is None
 
 
-def test_small_images_are_not_cropped() -> None:
-    assert schedule().crop(1, 1000, 1000) is None and cropped(1_800).crop(1, 45, 40) is None
-
-
-@pytest.mark.parametrize(
-    ("iteration", "degree"), [(1, 0), (10, 0), (19, 0), (20, 1), (29, 1), (30, 2), (99, 2)]
-)
-def test_the_degree_rises_with_its_window(iteration: int, degree: int) -> None:
+def test_the_degree_rises_with_its_window() -> None:
     """One more at each multiple of 10 after the first, up to that of the table."""
-    assert schedule().sh_degree(iteration) == degree
-    assert np.isscalar(schedule().sh_degree(iteration))
+    found = [schedule().sh_degree(iteration) for iteration in (1, 10, 19, 20, 29, 30, 99)]
+    assert found == [0, 0, 0, 1, 1, 2, 2]
 
 
 def test_the_light_learns_every_so_often_and_where_a_stage_ends() -> None:

@@ -23,20 +23,15 @@ SIZE, SCENE = 24, "plastic_hollows"
 SETTINGS: dict[str, Any] = {
     "views": 4,
     "size": SIZE,
-    "set": (
-        "iterations=6",
-        "surfels.count=80",
-        "surfels.max_count=100",
-        "light.height=8",
-        "event.mesh.resolution=16",
+    "set": tuple(
+        "iterations=6 surfels.count=80 surfels.max_count=100 light.height=8 event.mesh.resolution=16".split()
     ),
     "lights": (ROOT / "scenes" / "lights" / "studio.exr",),
 }
 TURN, TEST_VIEWS = 4, 4
 """Frames of a turntable, and test views, of the small gallery."""
 COMMITTED = ROOT / "docs" / "gallery"
-LIMIT = 5_000_000
-"""Bytes of the gallery in the repository."""
+LIMIT = 5_000_000  # bytes of the gallery in the repository
 
 
 @pytest.mark.slow

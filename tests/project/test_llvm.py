@@ -49,20 +49,6 @@ def usable() -> Path:
     return library
 
 
-@pytest.mark.parametrize(
-    ("path", "version"),
-    [
-        ("/none/lib/libLLVM-15.0.6.so", (15, 0, 6)),
-        ("/none/lib/libLLVM.so.19.1", (19, 1)),
-        ("/none/lib/libLLVM.so", None),
-        ("/none/llvm-18/lib/libLLVM.so", (18,)),
-        ("/opt/none/llvm@20/lib/libLLVM.dylib", (20,)),
-    ],
-)
-def test_named_version(path: str, version: tuple[int, ...] | None) -> None:
-    assert llvm.named_version(Path(path)) == version
-
-
 def test_find_takes_the_newest_that_loads(usable: Path, tmp_path: Path) -> None:
     """Neither a file that is no library, nor one that is too old, nor a link to nothing."""
     (tmp_path / "libLLVM.so.99.1").write_bytes(b"newest, but no library")
@@ -76,6 +62,7 @@ def test_find_takes_the_newest_that_loads(usable: Path, tmp_path: Path) -> None:
 
 def test_find_prefers_the_highest_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(llvm, "loaded_version", llvm.named_version)
+    assert llvm.named_version(Path("/none/llvm-18/lib/libLLVM.so")) == (18,)
     for name in ("libLLVM-17.so.1", "libLLVM.so.20.1", "libLLVM.so.19.1", "libLLVM-9.so.1"):
         (tmp_path / name).touch()
     assert llvm.find_library([tmp_path]) == tmp_path / "libLLVM.so.20.1"
@@ -84,14 +71,9 @@ def test_find_prefers_the_highest_version(tmp_path: Path, monkeypatch: pytest.Mo
 def test_usable_choice_of_user_is_kept(usable: Path, tmp_path: Path) -> None:
     mine = tmp_path / "libmine.so"  # a name without a version: only the library can tell
     mine.symlink_to(usable)
-    code = "import os, mi_refgs\nprint(os.environ['DRJIT_LIBLLVM_PATH'])"
-    assert run("-c", code, DRJIT_LIBLLVM_PATH=str(mine)).stdout.strip() == str(mine)
-
-
-def test_import_chooses_a_usable_library() -> None:
-    done = run("-c", "import mi_refgs" + RENDER)
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout.split()[-1]) >= llvm.MINIMUM_MAJOR
+    code = "import os, mi_refgs" + RENDER + "print(os.environ['DRJIT_LIBLLVM_PATH'])"
+    done = run("-c", code, DRJIT_LIBLLVM_PATH=str(mine))
+    assert done.stdout.splitlines()[-1:] == [str(mine)], done.stderr
 
 
 @pytest.mark.skipif(not OLD.exists(), reason="no old libLLVM is installed")

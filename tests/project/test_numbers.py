@@ -22,9 +22,6 @@ TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in pages.PAGES
 FIT_FIELDS = [field.name for field in fields(Fit)]
 
 
-# ---------- The pages ----------
-
-
 def test_pages_are_what_their_data_files_say() -> None:
     """`python -m benchmarks.pages` would change nothing; rows of several builds are refused."""
     for path, text in pages.rewritten().items():
@@ -33,6 +30,9 @@ def test_pages_are_what_their_data_files_say() -> None:
 
 def test_every_data_file_is_displayed_and_measured() -> None:
     """A page has a marker of it, and `benchmarks.all` measures it."""
+    text = "".join(TEXTS.values())
+    for name in plots.PLOTS:
+        assert f"](images/{name}.png)" in text and (ROOT / "docs/images" / f"{name}.png").is_file()
     named = set().union(*map(pages.files_of, TEXTS.values()))
     assert named == {path.stem for path in RESULTS.glob("*.json")} == {part.name for part in everything.PARTS}
 
@@ -41,15 +41,6 @@ def test_every_data_file_is_displayed_and_measured() -> None:
 def test_measured_numbers_have_a_data_file(page: str) -> None:
     """Numbers with a unit outside of markers are listed in settings.toml."""
     assert Counter(pages.unmarked(TEXTS[page])) == Counter(pages.SETTINGS[page])
-
-
-def test_plots_are_displayed() -> None:
-    text = "".join(TEXTS.values())
-    for name in plots.PLOTS:
-        assert f"](images/{name}.png)" in text and (ROOT / "docs/images" / f"{name}.png").is_file()
-
-
-# ---------- What finds a mistake ----------
 
 
 def row(**values: Any) -> dict[str, Any]:
@@ -94,9 +85,6 @@ def test_unmarked_numbers_are_found() -> None:
     assert pages.unmarked(text) == ["| time, ms |", "1.5 dB", "5 %", "7°"]
 
 
-# ---------- The command ----------
-
-
 def test_fits_exist() -> None:
     """Scenes and methods; no two fits share a folder; markers name planned fits."""
     for fit in {fit for fits_of in GROUPS.values() for fit in fits_of}:
@@ -111,13 +99,9 @@ def test_fits_exist() -> None:
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_data_files_have_the_planned_fits(group: str) -> None:
-    found = [tuple(row[key] for key in FIT_FIELDS if key in row) for row in _rows(group)]
-    assert [len(values) for values in found] == [len(FIT_FIELDS)] * len(GROUPS[group])
+    rows = read_result(RESULTS / f"{group}.json")["rows"]
+    found = [tuple(row.get(key, "missing") for key in FIT_FIELDS) for row in rows]
     assert found == [tuple(getattr(fit, key) for key in FIT_FIELDS) for fit in GROUPS[group]]
-
-
-def _rows(group: str) -> list[dict[str, Any]]:
-    return list(read_result(RESULTS / f"{group}.json")["rows"])
 
 
 @pytest.mark.slow
@@ -136,9 +120,9 @@ def test_small_run_continues(tmp_path: Path) -> None:
     assert path.stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("rows", [[], [{"a": 1, "b": "x"}, {"a": 0.5, "b": None}], [{"a": 1}, {"b": 2}]])
-def test_data_file_is_read_as_it_was_written(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+def test_data_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     """Rows of the same keys, of different ones, and none."""
-    result = {"build": {"commit": "abc"}, "seconds": 1.5, "rows": rows}
-    write_result(tmp_path / "a.json", result)
-    assert read_result(tmp_path / "a.json") == result
+    for rows in ([], [{"a": 1, "b": "x"}, {"a": 0.5, "b": None}], [{"a": 1}, {"b": 2}]):
+        result = {"build": {"commit": "abc"}, "seconds": 1.5, "rows": rows}
+        write_result(tmp_path / "a.json", result)
+        assert read_result(tmp_path / "a.json") == result

@@ -94,9 +94,8 @@ def test_sdist_contains_all_that_checks_need(built: Path) -> None:
         for path in (ROOT / folder).rglob("*"):
             if path.is_file() and "__pycache__" not in path.parts:
                 assert str(path.relative_to(ROOT)) in names, path
-    assert not {
-        name for name in names if "__pycache__" in name or name.startswith((".venv", "runs", "site/"))
-    }
+    left_out = (".venv", "runs/", "site/")
+    assert not [name for name in names if "__pycache__" in name or name.startswith(left_out)]
 
 
 def test_wheel_contains_the_package_and_nothing_else(built: Path) -> None:
@@ -109,11 +108,8 @@ def test_wheel_contains_the_package_and_nothing_else(built: Path) -> None:
         points.read_string(archive.read(entries).decode())
     expected = {str(path.relative_to(ROOT)) for path in (ROOT / "mi_refgs").rglob("*.py")}
     expected |= {f"mi_refgs/variants/{path.name}" for path in (ROOT / "variants").glob("*.toml")}
-    expected |= {
-        f"mi_refgs/{path.relative_to(ROOT)}"
-        for path in (ROOT / "scenes").rglob("*")
-        if path.suffix in {".toml", ".xml", ".ply", ".exr"}
-    }
+    scenes = [p for p in (ROOT / "scenes").rglob("*") if p.suffix in {".toml", ".xml", ".ply", ".exr"}]
+    expected |= {f"mi_refgs/{path.relative_to(ROOT)}" for path in scenes}
     assert expected | {"mi_refgs/py.typed"} <= packed
     tops = {name.split("/")[0] for name in packed}
     assert tops == {"mi_refgs", *(top for top in tops if top.endswith(".dist-info"))}
@@ -131,19 +127,10 @@ def test_plugins_and_packages_are_listed() -> None:
     assert packages == set(PROJECT["tool"]["setuptools"]["packages"])
 
 
-IMPORT_NAMES = {
-    "scikit_image": "skimage",
-    "pillow": "pil",
-    "mitsuba": "drjit",
-    "dask": "distributed",
-    "openexr": "imath",
-}
+IMPORT_NAMES = dict(
+    scikit_image="skimage", pillow="pil", mitsuba="drjit", dask="distributed", openexr="imath"
+)
 """Modules that a distribution installs under another name than its own, in lower case."""
-
-
-def imported(source: str) -> set[str]:
-    """First names of what a file imports that is neither Python's nor its own package's."""
-    return imported_packages(source) - sys.stdlib_module_names - {"mi_refgs"}
 
 
 def declared(requirements: list[str]) -> set[str]:
@@ -155,12 +142,11 @@ def declared(requirements: list[str]) -> set[str]:
 def test_every_import_is_declared() -> None:
     """What the package imports is a dependency, or belongs to an extra that a user may leave out."""
     project = PROJECT["project"]
-    extras = [
-        line for name, lines in project["optional-dependencies"].items() if name != "dev" for line in lines
-    ]
-    known = declared(project["dependencies"] + extras)
+    extras = {name: lines for name, lines in project["optional-dependencies"].items() if name != "dev"}
+    known = declared(sum(extras.values(), project["dependencies"]))
     for path in (ROOT / "mi_refgs").rglob("*.py"):
-        missing = {name for name in imported(path.read_text()) if name.lower() not in known}
+        found = imported_packages(path.read_text()) - sys.stdlib_module_names - {"mi_refgs"}
+        missing = {name for name in found if name.lower() not in known}
         assert not missing, f"{path.name} imports {missing}, which pyproject.toml does not declare"
 
 
