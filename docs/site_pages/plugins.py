@@ -38,19 +38,13 @@ def docstring(module: str) -> str:
 
 
 def markdown(text: str) -> str:
-    """A plugin's docstring as Markdown, without its label and title."""
-    blocks = re.split(r"\n(?=\S)", inspect.cleandoc(text))
-    written, skip = [], False
-    for i, block in enumerate(blocks):
-        following = blocks[i + 1] if i + 1 < len(blocks) else ""
-        if skip or block.startswith(".. _") or re.match(r"-{4,}", following):
-            skip = bool(re.match(r"-{4,}", following))
-        elif block.startswith(".. pluginparameters::"):
+    """A plugin's docstring as Markdown."""
+    written = []
+    for block in re.split(r"\n(?=\S)", inspect.cleandoc(text)):
+        if block.startswith(".. pluginparameters::"):
             written.append(parameters(block))
         elif block.startswith(".. math::"):
             written.append("```text\n" + textwrap.dedent(block.partition("\n")[2]).strip() + "\n```")
-        elif block.startswith(".. tabs::"):
-            written.append(tabs(block))
         else:
             written.append(inline(block))
     return "\n".join(written)
@@ -75,13 +69,3 @@ def parameters(block: str) -> str:
         shown += f" *{other}" if other else ""
         rows.append([shown, "; ".join([kind, *words]), meaning])
     return "\n" + table(["parameter", "type", "meaning"], rows) + "\n"
-
-
-def tabs(block: str) -> str:
-    """A `tabs` directive with its code tabs."""
-    found = re.findall(r"\.\. code-tab:: (\w+)\n\n(.*?)(?=\n *\.\. code-tab|\Z)", block, flags=re.DOTALL)
-    return "\n\n".join(
-        f'=== "{language}"\n\n'
-        + textwrap.indent(f"```{language}\n{textwrap.dedent(code).strip()}\n```", "    ")
-        for language, code in found
-    )

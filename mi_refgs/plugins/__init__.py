@@ -1,21 +1,9 @@
 """The Mitsuba plugins, and how they follow Mitsuba from variant to variant.
 
-Mitsuba has one set of base classes for each variant, so a plugin class must be defined anew after every
-switch. A plugin therefore lives in a module of its own that defines the class and registers it, both at
-module scope:
-
-    class RefGSIntegrator(mi.SamplingIntegrator):
-        def __init__(self, props):
-            require_supported_variant("refgs")
-            super().__init__(props)
-            ...
-
-    mi.register_integrator("refgs", RefGSIntegrator)
-
-and that is imported, or reloaded, each time the variant changes: by `load` below, which `import mi_refgs`
-connects to Mitsuba's variant callback, and from Mitsuba 3.10 on also by Mitsuba itself, through the entry
-point in pyproject.toml. Being loaded twice is harmless: the second registration replaces the first. Such a
-module must not be imported before a variant is set, and nothing else may import classes from it.
+Each variant has base classes of its own. A module that defines and registers a plugin at module scope is
+therefore imported, or reloaded, whenever the variant changes: by `load`, which `import mi_refgs` connects to
+Mitsuba's variant callback, and from Mitsuba 3.10 on also through the entry point in pyproject.toml. Being
+loaded twice is harmless. Never import such a module before a variant is set, nor classes from it.
 """
 
 from __future__ import annotations
@@ -35,11 +23,7 @@ PLUGINS = {
 
 
 def load() -> None:
-    """Define and register all plugins for the variant that is set.
-
-    Under an unsupported variant each name is registered with a function that says so, instead of Mitsuba's
-    `plugin not found`.
-    """
+    """Register all plugins for the variant that is set; under an unsupported one, functions that say so."""
     supported = is_supported(mi.variant())
     for plugin, (register, module) in PLUGINS.items():
         if not supported:

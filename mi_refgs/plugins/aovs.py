@@ -1,7 +1,4 @@
-"""Arbitrary output variables (AOVs): Mitsuba's `name:type` lists, names of image channels, values.
-
-This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
-"""
+"""Arbitrary output variables (AOVs): Mitsuba's `name:type` lists, names of image channels, values."""
 
 from __future__ import annotations
 
@@ -22,10 +19,7 @@ from mi_refgs.types import Float
 
 
 def suffixes() -> dict[str, str]:
-    """Suffixes of the image channels of every type: attributes of surfels, geometry, and terms.
-
-    They are those of Mitsuba's own `aov` integrator; `Bitmap.split` makes a greyscale layer of a lone Y.
-    """
+    """Suffixes of the image channels of every type, as of Mitsuba's own `aov` integrator."""
     materials = {name: declared.aov for name, declared in ATTRIBUTES.items() if declared.aov}
     geometry = {"normal": "XYZ", "depth": "T", "alpha": "Y", "visibility": "Y"}
     return materials | geometry | dict.fromkeys(TERMS, "RGB")
@@ -44,17 +38,12 @@ class AOV:
 
 
 def parse_aovs(text: str) -> list[AOV]:
-    """Parse a comma-separated list of `name:type`.
-
-    Raises InputError for a malformed pair, an unknown type or a repeated name.
-    """
+    """Parse a comma-separated list of `name:type`; InputError for a bad pair, type or repeated name."""
     aovs: list[AOV] = []
     for pair in filter(None, (part.strip() for part in text.split(","))):
         name, colon, kind = (part.strip() for part in pair.partition(":"))
         if not colon or not name:
-            raise InputError(
-                f"'{pair}' is not a <name>:<type> pair", "refgs", "aovs", "write such as 'nn:normal'"
-            )
+            raise InputError(f"'{pair}' is not a <name>:<type> pair", "refgs", "aovs", "write 'nn:normal'")
         if kind not in suffixes():
             raise InputError(f"unknown type '{kind}'", "refgs", "aovs", f"use one of {', '.join(suffixes())}")
         if any(name == other.name for other in aovs):

@@ -20,16 +20,11 @@ from mi_refgs.shade.split_sum import DIELECTRIC_F0
 from mi_refgs.types import Color3f, Float
 
 ROUGHNESS_FLOOR = 0.01
-"""Least roughness: α = 1e-4 is the smallest that Mitsuba's microfacet distribution samples. The split-sum
-table has no such floor; below it, reflectance changes by less than 3e-5.
-[measured against quadrature, N·V ≥ 0.02]"""
+"""Least roughness: α = 1e-4 is the smallest that Mitsuba samples; below it, reflectance changes by < 3e-5."""
 
 SPECULAR, DIFFUSE = 0, 1  # indices of the components
 
-FLAGS = (
-    mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide,
-    mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide,
-)
+LOBES = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection
 
 
 @dataclass(frozen=True)
@@ -40,35 +35,26 @@ class Material:
     base: Color3f  # (1 - metallic) albedo: reflectance of the diffuse base under the specular layer
     roughness: Float
 
-    @property
-    def α(self) -> Float:
-        """GGX's α, the square of the roughness."""
-        return dr.square(self.roughness)
-
     def specular(self, cosine: Float) -> Color3f:
         """Reflectance of the specular component under constant light, viewed at this cosine."""
         scale, bias = split_sum(cosine, self.roughness)
         return dr.fma(self.f0, scale, bias)
 
     def diffuse(self, cosine: Float) -> Color3f:
-        """Reflectance of the diffuse component, viewed at this cosine."""
         return dr.maximum(1 - self.specular(cosine), 0) * self.base
 
     def distribution(self) -> Any:
         """GGX; Mitsuba's own shadowing, which is separable, is not used."""
-        return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.α, True)
+        return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, dr.square(self.roughness), True)
 
     def slope(self, cosine: Float) -> Float:
         """cosθ (1 + 2 Λ(θ)) of Smith's Λ, finite at cosθ = 0."""
-        return dr.sqrt(dr.lerp(dr.square(self.α), 1, dr.square(cosine)))
+        return dr.sqrt(dr.lerp(dr.square(dr.square(self.roughness)), 1, dr.square(cosine)))
 
 
 class RefGSBSDF(mi.BSDF):
     r"""
-    .. _bsdf-refgs_bsdf:
-
-    Reflectance of the reflective Gaussian surfels (:monosp:`refgs_bsdf`)
-    ---------------------------------------------------------------------
+    The reflectance of the surfels, for Mitsuba's path tracers.
 
     .. pluginparameters::
 
@@ -76,20 +62,18 @@ class RefGSBSDF(mi.BSDF):
        - |spectrum| or |texture|
        - Diffuse reflectance, or that of a metal at normal incidence; 0 to 1. (Default: 0.5)
        - |exposed|, |differentiable|
-
      * - metallic
        - |float| or |texture|
        - From 0, a dielectric that reflects 0.04 at normal incidence, to 1, a metal without diffuse
          reflection. (Default: 0)
        - |exposed|, |differentiable|
-
      * - roughness
        - |float| or |texture|
        - In (0, 1]; GGX's α is its square. Below 0.01 it counts as 0.01, above 1 as 1. (Default: 0.5)
        - |exposed|, |differentiable|
 
-    The integral of this BRDF and of the light is what the shading of the `refgs` integrator
-    (``reflectance = split_sum``, ``diffuse = irradiance``) approximates:
+    The `refgs` integrator (``reflectance = split_sum``, ``diffuse = irradiance``) approximates the integral
+    of the light times
 
     .. math::
 
@@ -99,35 +83,14 @@ class RefGSBSDF(mi.BSDF):
     with GGX's D, and the height-correlated G of Smith [Heitz 2014, "Understanding the Masking-Shadowing
     Function", eqs. 72, 99]. E, per channel, is the specular reflectance under constant light, from the
     split-sum table. No material reflects more than it receives, but for the table's error (1e-3; up to 0.11
-    at n · v below 0.005 and roughness below 0.15); rough metals lose light between the microfacets. The
-    diffuse term is not reciprocal, as E depends on the view v alone: on wi, or on wo for paths that start at
-    a light (``TransportMode.Importance``).
+    at n · v below 0.005 and roughness below 0.15). The diffuse term is not reciprocal: E depends on v alone,
+    which is wo for paths that start at a light (``TransportMode.Importance``).
 
-    It reflects on the side of the normal only, which is all that closed meshes need: nest it in a `twosided`
-    for open ones. Component 0 is the specular reflection, 1 the diffuse one. Maps of metallic and roughness
-    should be loaded with ``raw = true``, as numbers and not as sRGB.
+    It reflects on the side of the normal only: nest it in a `twosided` for open meshes. Component 0 is the
+    specular reflection, 1 the diffuse one. Load maps of metallic and roughness with ``raw = true``.
 
     `eval`, and the weight that `sample` returns, have derivatives with respect to the parameters and the
     directions; samples, of the visible normals [Heitz 2018] or the cosine, and densities have none.
-
-    .. tabs::
-        .. code-tab:: xml
-
-            <bsdf type="refgs_bsdf">
-                <rgb name="albedo" value="0.9, 0.6, 0.3"/>
-                <float name="metallic" value="1"/>
-                <texture type="bitmap" name="roughness">
-                    <string name="filename" value="roughness.exr"/>
-                    <boolean name="raw" value="true"/>
-                </texture>
-            </bsdf>
-
-        .. code-tab:: python
-
-            'type': 'refgs_bsdf',
-            'albedo': {'type': 'rgb', 'value': [0.9, 0.6, 0.3]},
-            'metallic': 1.0,
-            'roughness': {'type': 'bitmap', 'filename': 'roughness.exr', 'raw': True},
     """
 
     def __init__(self, props: Any) -> None:
@@ -135,8 +98,8 @@ class RefGSBSDF(mi.BSDF):
         super().__init__(props)
         defaults = {"albedo": 0.5, "metallic": 0.0, "roughness": 0.5}
         self.textures = {name: _texture(props, name, default) for name, default in defaults.items()}
-        self.m_components = list(FLAGS)
-        self.m_flags = FLAGS[SPECULAR] | FLAGS[DIFFUSE]
+        self.m_components = [lobe | mi.BSDFFlags.FrontSide for lobe in LOBES]
+        self.m_flags = self.m_components[SPECULAR] | self.m_components[DIFFUSE]
         device_table(mi.variant())  # loops and calls that are being recorded cannot make it
 
     def traverse(self, cb: Any) -> None:
@@ -146,7 +109,6 @@ class RefGSBSDF(mi.BSDF):
     # ---------------- the BSDF interface ----------------
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-        """A direction with its density, and f cosθ / density; see mi.BSDF."""
         wi, active = _front(si.wi, active)
         material = self._material(si, active)
         with dr.suspend_grad():
@@ -160,28 +122,19 @@ class RefGSBSDF(mi.BSDF):
             sampled.pdf = dr.select(above, _density(ctx, material, wi, wo), 0)
             sampled.eta = 1
             sampled.sampled_component = dr.select(specular, mi.UInt32(SPECULAR), mi.UInt32(DIFFUSE))
-            sampled.sampled_type = dr.select(
-                specular, mi.UInt32(mi.BSDFFlags.GlossyReflection), mi.UInt32(mi.BSDFFlags.DiffuseReflection)
-            )
+            sampled.sampled_type = dr.select(specular, *(mi.UInt32(lobe) for lobe in LOBES))
             valid = above & (sampled.pdf > 0)
             inverse = dr.rcp(dr.select(valid, sampled.pdf, 1))
         return sampled, dr.select(valid, _value(ctx, material, wi, wo) * inverse, 0)
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        """f cosθ; see mi.BSDF."""
-        wi, active = _front(si.wi, active)
-        wo, active = _front(wo, active)
-        return dr.select(active, _value(ctx, self._material(si, active), wi, wo), 0)
+        return self.eval_pdf(ctx, si, wo, active)[0]
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        """Density of `sample` per solid angle, without derivatives; see mi.BSDF."""
-        with dr.suspend_grad():
-            wi, active = _front(si.wi, active)
-            wo, active = _front(wo, active)
-            return dr.select(active, _density(ctx, self._material(si, active), wi, wo), 0)
+        return self.eval_pdf(ctx, si, wo, active)[1]
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-        """`eval` and `pdf` at once; see mi.BSDF."""
+        """f cosθ, and the density of `sample` per solid angle without derivatives."""
         wi, active = _front(si.wi, active)
         wo, active = _front(wo, active)
         material = self._material(si, active)
@@ -190,7 +143,6 @@ class RefGSBSDF(mi.BSDF):
             return value, dr.select(active, _density(ctx, material, wi, wo), 0)
 
     def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
-        """(1 - E) (1 - metallic) albedo, the same from behind; see mi.BSDF."""
         return self._material(si, active).diffuse(dr.abs(si.wi.z))
 
     def _material(self, si: Any, active: Any) -> Material:
@@ -206,10 +158,7 @@ class RefGSBSDF(mi.BSDF):
 
 
 def _texture(props: Any, name: str, default: float) -> Any:
-    """A texture property, or the texture of a constant one.
-
-    Raises InputError for a constant out of range, and for a colour where a number is needed.
-    """
+    """A texture property; InputError for a constant out of range, or a colour where a number is needed."""
     value = props.get(name, default)
     colour = isinstance(value, mi.ScalarColor3d)
     if colour and name != "albedo":
@@ -235,10 +184,7 @@ def _schlick(f0: Any, cosine: Any) -> Any:
 
 def _enabled(ctx: Any) -> tuple[bool, bool]:
     """Whether the context enables the specular and the diffuse component."""
-    return (
-        ctx.is_enabled(mi.BSDFFlags.GlossyReflection, SPECULAR),
-        ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, DIFFUSE),
-    )
+    return ctx.is_enabled(LOBES[SPECULAR], SPECULAR), ctx.is_enabled(LOBES[DIFFUSE], DIFFUSE)
 
 
 def _value(ctx: Any, material: Material, wi: Any, wo: Any) -> Any:

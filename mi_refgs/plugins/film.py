@@ -1,7 +1,4 @@
-"""Images through a sensor's film, and their derivatives.
-
-This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
-"""
+"""Images through a sensor's film, and their derivatives."""
 
 from __future__ import annotations
 
@@ -28,16 +25,14 @@ AOVs, in the order of the film's blocks; arrays of one value per pixel or one in
 class FilmImage:
     """The image of a `view` through a sensor's film, and its derivatives in both modes, in passes.
 
-    A sample count n (`spp`, or 0 for that of the sampler) gives k × k regular samples per pixel, k = ⌈√n⌉,
-    averaged as by `render.samples`. `aovs` names the channels beyond the weight. Raises InputError for a film
-    of another kind, and where an image of `surfels` does not fit into memory.
+    Raises InputError for a film of another kind, and where an image of `surfels` does not fit into memory.
     """
 
     sensor: Any
-    spp: int
+    spp: int  # see `render.samples`; 0: that of the sampler
     view: Callable[[Camera], Frame]
     channels: Channels
-    aovs: list[str]
+    aovs: list[str]  # names of the channels beyond the weight
     neighbours: int  # see `Shading`
     surfels: int
 
@@ -47,7 +42,6 @@ class FilmImage:
 
     @property
     def film(self) -> Any:
-        """The sensor's film."""
         return self.sensor.film()
 
     def image(self) -> Any:
@@ -62,10 +56,7 @@ class FilmImage:
         return self._developed(values)
 
     def adjoints(self, δ_image: Any) -> Iterator[tuple[Any, Any]]:
-        """Values of one pass after the other, attached to the parameters, and their adjoints.
-
-        They add up to the adjoint of the image. Delete references to the values before the next ones.
-        """
+        """Attached values of each pass, and their adjoints; delete them before the next."""
         found = self._bands(DERIVATIVE_SAMPLES)
         if len(found) == 1:
             yield self._developed(self._values(found[0])), δ_image
@@ -127,7 +118,6 @@ class FilmImage:
     # ---------------- the film ----------------
 
     def _developed(self, values: Any) -> Any:
-        """The developed image of the channels of all pixels; under AD."""
         height, width = self._size
         tensor = mi.TensorXf(values, (height, width, dr.width(values) // (height * width)))
         self.film.prepare(self.aovs)
@@ -135,16 +125,13 @@ class FilmImage:
         return self.film.develop()
 
     def _through_film(self, mode: dr.ADMode, derivative: Any) -> Any:
-        """Tangent of the developed image for that of the channels, or adjoint of these for that of the image.
-
-        The film is linear, so any values will do.
-        """
+        """Tangent of the image for that of the channels, or their adjoint for that of the image."""
         before = self.film.develop(True)
         height, width = self._size
         weight = 4 if self._alpha else 3  # the channel that it divides by
         count = weight + 1 + len(self.aovs)
         index = dr.arange(mi.UInt32, height * width * count) % count
-        values = dr.select(index == weight, mi.Float(1), 0)
+        values = dr.select(index == weight, mi.Float(1), 0)  # the film is linear: any will do
         dr.enable_grad(values)
         image = self._developed(values)
         start, end = (values, image) if mode == dr.ADMode.Forward else (image, values)

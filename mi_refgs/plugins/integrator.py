@@ -18,17 +18,11 @@ import mitsuba as mi
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import require_supported_variant
+from mi_refgs.plugins import properties
 from mi_refgs.plugins.aovs import aov_values
 from mi_refgs.plugins.film import FilmImage
 from mi_refgs.plugins.light import light_of
-from mi_refgs.plugins.properties import (
-    BackgroundProperties,
-    read_aovs,
-    read_light,
-    read_near_field,
-    read_shading,
-    read_surfels,
-)
+from mi_refgs.plugins.properties import BackgroundProperties
 from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.shade.ambient import update_occluder_caches
@@ -40,103 +34,80 @@ from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0
-"""Least time between two checks for unusable values: each waits for the device."""
+"""Least time between two checks for unusable values, each of which waits for the device."""
 
 
 class RefGSIntegrator(mi.SamplingIntegrator):
     r"""
-    .. _integrator-refgs:
-
-    Reflective Gaussians (:monosp:`refgs`)
-    --------------------------------------
+    Splats the surfels of a ``perspective`` view, and shades them under an environment.
 
     .. pluginparameters::
 
      * - filename
        - |string|
-       - PLY file with surfels or 3D Gaussians: raw properties (before the activation) of 2DGS or 3DGS and of
-         the attributes below. In Python, attributes may also be given, or replaced, as tensors.
-
+       - PLY file with surfels or 3D Gaussians: raw values (before the activation) of 2DGS or 3DGS and of the
+         attributes below. In Python, tensors may add or replace attributes.
      * - light *or any name*
        - |emitter|
        - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light; in Python also the raw
          tensor of an ``EnvironmentLight``. (Default: the scene's environment emitter of these types)
-
      * - near_field
        - |string|
-       - File (.npz) with ``nearness`` (h, 2h), 1 / distance of what the light shows in the orientation of an
-         ``envmap`` without rotation, seen from the point ``centre`` (3,). (Default: infinitely far)
-
+       - File (.npz) with ``nearness`` (h, 2h), 1 / distance of what an unrotated ``envmap`` shows, seen from
+         the point ``centre`` (3,). (Default: infinitely far)
      * - mesh
        - |string|
        - PLY file of the mesh that occludes mirror reflections. (Default: none)
-
      * - occlusion
        - |bool|
-       - Trace the visibility of the light, and use the surfels' indirect light where it is blocked.
+       - Trace the visibility of the light, with the surfels' indirect light where it is blocked.
          (Default: whether there is a ``mesh``)
-
      * - shade_at
        - |string|
        - ``pixel`` (deferred: blend attributes, then shade) or ``surfel`` (forward: shade, then blend
          radiance). (Default: the first that the reflectance model has)
-
      * - reflectance
        - |string|
-       - ``split_sum`` (diffuse and GGX specular), ``radiance`` (the SH colour alone, needs no light),
-         ``mirror`` (3DGS-DR), ``gaussian_shader``, ``monte_carlo`` (R3DG), ``displayed`` (encoded SH colours
-         of a splat), or a registered model. (Default: the first of these whose attributes the surfels have)
-
+       - ``split_sum`` (diffuse and GGX specular), ``radiance`` (SH colour, needs no light), ``mirror``
+         (3DGS-DR), ``gaussian_shader``, ``monte_carlo`` (R3DG), ``displayed`` (encoded SH colours of a
+         splat), or a registered model. (Default: the first whose attributes the surfels have)
      * - diffuse
        - |string|
        - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times the light that the specular term
          leaves). (Default: ``sh`` if there is one)
-
      * - dominant, antialias
        - |bool|
-       - More accuracy for more time: look the light up along the GGX lobe's dominant direction; average
+       - Slower and more accurate: look the light up along the GGX lobe's dominant direction; average
          reflections over each pixel, at interpolated normals. (Default: false)
-
      * - visibility_rays, traced_bounces, ambient_rays
        - |int|
-       - Specular-lobe samples of the visibility, 1 is the mirror ray; traced bounces, in place of the
-         surfels' indirect light; rays per vertex of the mesh for the visibility of diffuse light, with
-         ``irradiance``. (Default: 1, 0, 0)
-
+       - Specular-lobe samples of the visibility, 1 is the mirror ray; traced bounces, in place of indirect
+         light; rays per mesh vertex for diffuse visibility, with ``irradiance``. (Default: 1, 0, 0)
      * - directions
        - |int|
-       - Directions that ``monte_carlo`` samples; fewer are faster. (Default: 24)
-
+       - Directions that ``monte_carlo`` samples. (Default: 24)
      * - surroundings
        - |string|
        - PLY file with the surfels around the object, splatted with it: geometry and ``radiance_sh``. Also
-         tensors, ``surroundings_position`` and so on. (Default: none, the object only)
-
+         tensors, ``surroundings_position`` and so on. (Default: none)
      * - background
        - |color| or |string|
        - Linear radiance behind the surfels, or a lat-long map of it (EXR, HDR; in Python also a raw tensor as
          of ``light``); alpha is then 1. (Default: none, transparent)
-
      * - aovs
        - |string|
-       - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator, appended to RGB(A). Types:
-         ``albedo``, ``metallic``, ``roughness``, ``tint``, ``normal`` (world, towards the camera), ``depth``,
-         ``alpha``, ``visibility``, ``diffuse``, ``specular``, ``indirect``, registered attributes.
-         (Default: none)
-
+       - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator. Types: ``albedo``,
+         ``metallic``, ``roughness``, ``tint``, ``normal`` (world, towards the camera), ``depth``, ``alpha``,
+         ``visibility``, ``diffuse``, ``specular``, ``indirect``, registered attributes. (Default: none)
      * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh, tint,
          normal_offset *or any registered attribute*
        - |tensor|
-       - Raw attributes of shape (N, D). They may be replaced by ones with another N, all in one update. A
-         ``scale`` of three columns makes the rows 3D Gaussians.
+       - Raw attributes (N, D); all in one update, N may change. Three columns of ``scale``: 3D Gaussians.
        - |exposed|, |differentiable|
-
      * - light
        - |tensor|
-       - Raw map (h, w, 3) of the integrator's own light, if it has one: radiance =
-         ``EnvironmentLight(raw).radiance()``.
+       - Raw map (h, w, 3) of the integrator's own light: radiance = ``EnvironmentLight(raw).radiance()``.
        - |exposed|, |differentiable|
-
      * - surroundings_position, …, surroundings_radiance_sh, background
        - |tensor|
        - Raw attributes of the surroundings, and raw map of the background as of ``light``, if there are any.
@@ -144,35 +115,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     The keys start with the integrator's id, `refgs` unless the scene sets one: ``params['refgs.roughness']``.
 
-    This integrator splats surfels in the view of a `perspective` sensor. It does not see the scene's
-    shapes, and shows the environment only in reflections. It has no noise, and ignores the seed. A sample
-    count n (of ``mi.render``, else of the sensor's sampler, whose default is 4) gives k × k regular samples
-    per pixel, k = ⌈√n⌉, box filtered; n = 1 takes pixel centres. The film's ``rfilter`` is not used.
-    `mi.render` differentiates it in both modes with respect to the parameters above, to ``data``, ``scale``
-    or ``radiance.value`` of the scene's environment, and to ``to_world`` (rigid changes) and ``x_fov`` of
-    sensors, but not to a background colour or the mesh; `mi_refgs.splat.composite` lists the derivatives
-    that are absent.
+    The scene's shapes are not rendered, and the environment is visible in reflections only. Images have no
+    noise. A sample count n (of ``mi.render``, else of the sampler) gives ⌈√n⌉² regular samples per pixel, box
+    filtered; n = 1 takes pixel centres. The film's ``rfilter`` is not used. Derivatives in both modes reach
+    the parameters above, ``data``, ``scale`` or ``radiance.value`` of the scene's environment, and
+    ``to_world`` (rigid changes) and ``x_fov`` of sensors, but neither a background colour nor the mesh.
 
     A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 covers no
     pixel and gets zero gradient; such a value of the light is black. One warning names the attribute.
-
-    .. tabs::
-        .. code-tab:: xml
-
-            <integrator type="refgs">
-                <string name="filename" value="surfels.ply"/>
-                <emitter type="envmap" name="light">
-                    <string name="filename" value="envmap.exr"/>
-                </emitter>
-                <string name="aovs" value="nn:normal,rough:roughness"/>
-            </integrator>
-
-        .. code-tab:: python
-
-            'type': 'refgs',
-            'filename': 'surfels.ply',
-            'light': {'type': 'envmap', 'filename': 'envmap.exr'},
-            'aovs': 'nn:normal,rough:roughness',
     """
 
     def __init__(self, props: Any) -> None:
@@ -181,14 +131,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.variant = mi.variant()
         if not props.id():
             self.set_id("refgs")  # an address otherwise, and with it every parameter's key
-        self.surfels = read_surfels(props)
-        self.light, self.light_rotation = read_light(props)
-        self.near = read_near_field(props)
+        self.surfels = properties.read_surfels(props)
+        self.light, self.light_rotation = properties.read_light(props)
+        self.near = properties.read_near_field(props)
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
-        self.shading, self.occluder = read_shading(props, self.surfels)
+        self.shading, self.occluder = properties.read_shading(props, self.surfels)
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
         self.background = BackgroundProperties.read(props)
-        self.aovs = read_aovs(props)
+        self.aovs = properties.read_aovs(props)
         self.check()
         self.changed, self.next_check = False, 0.0  # since the last check; seconds of the monotonic clock
         self._warn_of_unusable()
@@ -218,11 +168,6 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         maps = {"light": self.light, "background": self.background.map}
         return {name: found for name, found in maps.items() if found is not None}
 
-    @property
-    def surfel_count(self) -> int:
-        """Number of surfels of the object and its surroundings."""
-        return sum(model.count for model in self._models.values())
-
     # ---------------- parameters ----------------
 
     def traverse(self, cb: Any) -> None:
@@ -234,8 +179,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.check()
         self.changed = True
         self.filtered_light = None
-        # The materials that the occluder caches are gathered from surfels near its vertices: they depend on
-        # geometry. Ambient ratios depend on everything. Without keys, anything may have changed.
+        # Cached materials depend on geometry, ambient ratios on everything. No keys: all may have changed.
         geometry_changed = not keys or not {*keys}.isdisjoint(self.surfels.primitive.widths)
         if geometry_changed or self.shading.ambient_rays:
             self.caches_valid = False
@@ -254,7 +198,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> Any:
-        """The image (h, w, c) of a sensor; see the class for its channels."""
+        """The image (h, w, c) of a sensor."""
         if self.changed and (now := time.monotonic()) >= self.next_check:
             self.changed, self.next_check = False, now + CHECK_SECONDS
             self._warn_of_unusable()
@@ -284,15 +228,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         raise InputError("renders whole images only", "refgs", "sample", "do not nest it, use its own `aovs`")
 
     def _image(self, scene: Any, sensor: Any, spp: int, forward_only: bool = False) -> FilmImage:
-        """The image through the sensor's film."""
         if mi.variant() != self.variant:
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(made, "refgs", "variant", "load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         request = Request({aov.type for aov in self.aovs}, forward_only)
-        view = partial(self.frame, scene, request, self.background)
-        names, neighbours = self.aov_names(), self.shading.neighbours
-        return FilmImage(sensor, spp, view, self._channels, names, neighbours, self.surfel_count)
+        view = partial(self.frame, scene, request)
+        names, count = self.aov_names(), sum(model.count for model in self._models.values())
+        return FilmImage(sensor, spp, view, self._channels, names, self.shading.neighbours, count)
 
     def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
         """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
@@ -300,17 +243,20 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         more = [value for aov in self.aovs for value in aov_values(aov.type, frame, camera)]
         return [*rgb, *([coverage] if alpha else []), mi.Float(1), *more]
 
-    def frame(self, scene: Any, request: Request, background: BackgroundProperties, camera: Camera) -> Frame:
-        """Render one sample per pixel, with this background instead of the integrator's own."""
+    def frame(self, scene: Any, request: Request, camera: Camera) -> Frame:
+        """Render one sample per pixel."""
         light = self._light(scene, request.forward_only)
         if self.occluder is not None and not self.caches_valid:
             update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading)
             # Mitsuba does not announce changes of the scene's light, on which ambient ratios depend.
             self.caches_valid = self.light is not None or not self.shading.ambient_rays
-        surfels, surroundings = Surfels(self.surfels.raw, screened=True), background.splatted(self.surfels)
+        surfels, surroundings = (
+            Surfels(self.surfels.raw, screened=True),
+            self.background.splatted(self.surfels),
+        )
         rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings, self.near)
         frame = render(rendered, camera, request)
-        return replace(frame.only(request.aovs), background=background.behind(frame))
+        return replace(frame.only(request.aovs), background=self.background.behind(frame))
 
     def _light(self, scene: Any, forward_only: bool) -> Light | None:
         """The light as the shading looks it up; its own is filtered once for images without derivatives."""
@@ -322,12 +268,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         return self.filtered_light
 
     def to_string(self) -> str:
-        size = "x".join(str(x) for x in self.light.raw.shape[:2]) if self.light is not None else "the scene's"
-        what = f"surfels = {self.surfels.count},\n  attributes = {', '.join(self.surfels.raw)}"
-        return f"RefGSIntegrator[\n  {what},\n  light = {size},\n  shading = {self.shading}\n]"
+        return f"RefGSIntegrator[\n  surfels = {self.surfels.count},\n  shading = {self.shading}\n]"
 
     def _warn_of_unusable(self) -> None:
-        """Warn of values that are NaN, infinite or too large, and never check again if there are any."""
+        """Warn of unusable values, and never check again if there are any."""
         found = [
             f"{len(rows)} {kind} in {name} (first: {rows[0]})"
             for kind, model in self._models.items()
@@ -337,12 +281,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         found += [f"{black} values of {name}" for name, light in maps if (black := light.unusable())]
         if found:
             self.next_check = math.inf
-            warnings.warn(
-                f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(found)}; these surfels "
-                "are left out, and such light is black",
-                RuntimeWarning,
-                stacklevel=3,
-            )
+            what = f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(found)}"
+            warnings.warn(f"{what}; they are left out, such light is black", RuntimeWarning, stacklevel=3)
 
 
 mi.register_integrator("refgs", RefGSIntegrator)

@@ -1,7 +1,4 @@
-"""Mitsuba's environment emitters as the lights of `mi_refgs.shade`.
-
-This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
-"""
+"""Mitsuba's environment emitters as the lights of `mi_refgs.shade`."""
 
 from __future__ import annotations
 
@@ -28,16 +25,11 @@ from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.light.prefilter import prefilter
 from mi_refgs.shade.shading import Shading
 
-MAX_HEIGHT = 512
-"""Rows above which an emitter's map is downscaled: with 512, filtering takes 45 ms per render on two cores,
-and it grows with the square of the rows. [measured]"""
+MAX_HEIGHT = 512  # rows above which a map is downscaled: filtering 512 takes 45 ms on two cores
 
 
 def own_light(emitter: Any) -> tuple[Any, Any]:
-    """A trainable copy of an `envmap` or `constant` emitter, and its matrix as `_light_from_world` gives it.
-
-    Raises InputError for any other emitter.
-    """
+    """A trainable copy of an `envmap` or `constant` emitter and its rotation; InputError for any other."""
     params = mi.traverse(emitter)
     if "data" in params:
         radiance, _ = _map_radiance(params, emitter)
@@ -49,9 +41,8 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
 def emitter_light(emitter: Any, filtered: bool = True) -> Light:
     """The light of an emitter of the scene, under AD: `filtered`, or with `radiance` only.
 
-    Gradients flow to its `scale` and `data`, or `radiance.value`; to `data` only where its size is one that
-    lights have. Raises InputError if the texels of another size (see `_map_radiance`) should receive some,
-    and for any emitter but `envmap` and `constant`.
+    Gradients flow to its `scale` and `data`, or `radiance.value`. Raises InputError if `data` that is
+    resampled should receive some, and for any emitter but `envmap` and `constant`.
     """
     params = mi.traverse(emitter)
     if "data" not in params:
@@ -69,26 +60,20 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
 
 
 def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scene: Any) -> Light | None:
-    """The integrator's own light and rotation, else the scene's emitter, as the shading's model looks it up.
+    """The integrator's own light, else the scene's; None if the model uses none.
 
-    None if the model uses no light. Raises InputError if there is none.
+    Raises InputError if there is none.
     """
-    wanted = shading.model.light
-    if wanted == "none":
+    if shading.model.light == "none":
         return None
-    light = shading.light_of(own)
-    if light is not None:
+    if (light := shading.light_of(own)) is not None:
         return rotated(light, rotation)
-    emitter = scene.environment()
-    if emitter is None:
-        raise InputError(
-            "there is none", "refgs", "light", "nest an `envmap` in the integrator, or in the scene"
-        )
-    return emitter_light(emitter, wanted == "filtered")
+    if (emitter := scene.environment()) is None:
+        raise InputError("there is none", "refgs", "light", "nest an `envmap` in integrator or scene")
+    return emitter_light(emitter, shading.model.light == "filtered")
 
 
 def rotated(light: Light, light_from_world: Any) -> Light:
-    """Rotate a light by a matrix of `own_light`; None rotates nothing."""
     return light if light_from_world is None else RotatedLight(light, light_from_world)
 
 
@@ -112,27 +97,20 @@ def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
 
 def _constant_radiance(params: Any, emitter: Any) -> Any:
     if emitter.class_name() != "ConstantBackgroundEmitter" or "radiance.value" not in params:
-        raise InputError(
-            (
-                f"emitter '{emitter.id()}': type: refgs takes an `envmap` or a `constant` environment, "
-                f"not a {emitter.class_name()}"
-            ),
-            remedy="use one of these",
-        )
+        what = f"emitter '{emitter.id()}': type: refgs takes no {emitter.class_name()}"
+        raise InputError(what, remedy="use an `envmap` or a `constant` environment")
     colour = mi.Color3f(params["radiance.value"])
     return bounded(colour, colour)
 
 
 def _light_from_world(params: Any) -> Any:
-    """Rotation or mirror image from world to light (mi.Matrix3f, detached), None where it is the identity.
+    """Rotation or reflection from world to light (mi.Matrix3f, detached), None for the identity.
 
-    Raises InputError if `to_world` has scale or shear, with which Mitsuba itself renders another image.
+    Raises InputError if `to_world` has scale or shear.
     """
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
     if np.abs(matrix - np.eye(3)).max() < 1e-7:
         return None
     if not np.abs(matrix.T @ matrix - np.eye(3)).max() < 1e-4:
-        raise InputError(
-            "must be a rotation or a mirror image", "emitter", "to_world", "remove scale and shear"
-        )
+        raise InputError("not a rotation or reflection", "emitter", "to_world", "remove scale and shear")
     return mi.Matrix3f(np.linalg.inv(matrix).astype(np.float32))

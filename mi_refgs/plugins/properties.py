@@ -1,12 +1,8 @@
-"""The properties of the `refgs` integrator, read once while it is constructed.
-
-This module defines no Mitsuba class, so that it need not be reloaded when the variant changes.
-"""
+"""The properties of the `refgs` integrator, read once while it is constructed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -29,12 +25,10 @@ from mi_refgs.surfels.primitives import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f
 
-AROUND = "surroundings_"
-"""Prefix of the parameters of the surroundings' surfels."""
+AROUND = "surroundings_"  # prefix of the parameters of the surroundings' surfels
 
 
 def _get(props: Any, name: str, default: Any) -> Any:
-    """Return a property, or the default where it is absent."""
     try:
         return props.get(name, default)
     except UnicodeError as error:
@@ -42,12 +36,11 @@ def _get(props: Any, name: str, default: Any) -> Any:
 
 
 def read_aovs(props: Any) -> list[AOV]:
-    """Read the AOVs that are appended to the image."""
     return parse_aovs(str(_get(props, "aovs", "")))
 
 
 def _path(props: Any, name: str) -> str | None:
-    """Return a file property; Mitsuba resolves it beside the XML only while it constructs plugins."""
+    """A file property, which Mitsuba resolves beside the XML only while it constructs plugins."""
     value = _get(props, name, None)
     return None if value is None else str(mi.file_resolver().resolve(str(value)))
 
@@ -60,7 +53,6 @@ def _choice(props: Any, name: str, default: str, options: tuple[str, ...]) -> An
 
 
 def _tensor(props: Any, name: str) -> Any:
-    """Return a tensor property as mi.TensorXf; None where it is absent."""
     value = _get(props, name, None)
     if value is None:
         return None
@@ -78,23 +70,17 @@ def _tensor(props: Any, name: str) -> Any:
 
 def read_surfels(props: Any) -> Surfels:
     """Read the surfels of the PLY file; attributes given as tensors replace its own."""
-    raw = _attributes(props, "filename", "")
-    if not raw:
-        raise InputError(
-            "there are no surfels", "refgs", "filename", "name a PLY file, or give attributes as tensors"
-        )
-    return Surfels(raw)
+    if raw := _attributes(props, "filename", ""):
+        return Surfels(raw)
+    raise InputError("there are no surfels", "refgs", "filename", "name a PLY file, or give tensors")
 
 
 def _attributes(props: Any, file: str, prefix: str) -> dict[str, Any]:
-    """Raw attributes of the PLY file that a property names, and of tensors named `prefix` + attribute."""
+    """Raw attributes of the file that a property names, and of tensors named `prefix` + attribute."""
     path = _path(props, file)
     raw = {} if path is None else dict(read_ply(path).raw)
-    for name in ATTRIBUTES:
-        value = _tensor(props, prefix + name)
-        if value is not None:
-            raw[name] = value
-    return raw
+    given = {name: _tensor(props, prefix + name) for name in ATTRIBUTES}
+    return raw | {name: value for name, value in given.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -107,7 +93,6 @@ class BackgroundProperties:
 
     @staticmethod
     def read(props: Any) -> BackgroundProperties:
-        """Read the properties; see `require_fit` for surfels that do not fit the object's."""
         behind = read_background(props)
         colour, light = (None, behind) if isinstance(behind, EnvironmentLight) else (behind, None)
         raw = _attributes(props, "surroundings", AROUND)
@@ -142,10 +127,7 @@ def read_background(props: Any) -> Any:
     """Read what is behind everything: mi.Color3f, an EnvironmentLight, or None for transparency."""
     value = _get(props, "background", None)
     if isinstance(value, str):
-        try:
-            return EnvironmentLight.from_file(Path(_path(props, "background") or ""))
-        except InputError as error:
-            raise error.at("refgs", "background") from error
+        return EnvironmentLight.from_file(_path(props, "background") or "")
     try:
         if getattr(value, "ndim", 0) == 3:
             return EnvironmentLight(mi.TensorXf(value))
@@ -171,10 +153,7 @@ def read_light(props: Any) -> tuple[Any, Any]:
 def read_near_field(props: Any) -> NearField | None:
     """Read the distances of what the light shows; None: infinitely far."""
     path = _path(props, "near_field")
-    try:
-        return None if path is None else NearField.read(path)
-    except InputError as error:
-        raise error.at("refgs", "near_field") from error
+    return None if path is None else NearField.read(path)
 
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:

@@ -80,7 +80,7 @@ class TrainedScene:
         remedy = f"restore it, or write it again with `refgs export {folder}` if the run has checkpoints"
         try:
             content = read_json(note)
-            shading = Shading.from_json(content["shading"])
+            shading = Shading(**content["shading"])
             for name in shading.required_attributes:
                 attribute(name)  # is registered
             iteration, seconds = int(content["iteration"]), float(content["seconds"])

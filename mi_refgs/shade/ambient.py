@@ -5,18 +5,13 @@ per vertex of the occluding mesh give the ratio to it per colour,
 
     ratio = Σ (free ? L(ω) : B(ω)) / Σ L(ω),
 
-L being the light and B the radiance of the mesh where it blocks the ray. Ratios therefore contain the shadows
-of the present light; where nothing is blocked they are 1, whatever the rays. The diffuse term is albedo ×
-irradiance of the pixel's normal × ratio.
-
-L is looked up in a lobe as wide as the part of the hemisphere per ray, so that no lamp falls between rays. B
-is shaded as traced light is (`shade.reflection`), with the ratios of the previous round at the hits, 1 in the
-first: each of BOUNCES rounds adds a bounce. Ratios are detached and kept until they are computed again.
+L being the light, in a lobe as wide as the part of the hemisphere per ray, and B the radiance of the mesh
+where it blocks the ray, shaded with the ratios of the previous round, 1 in the first. The diffuse term is
+albedo × irradiance × ratio; ratios are detached.
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import drjit as dr
@@ -35,9 +30,7 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, UInt32, Vector3f
 
 BOUNCES = 2  # rounds: bounces of light between surfaces before it is taken as unblocked
-
-BRIGHTEST = 4.0
-"""Largest ratio: otherwise a mirror that reflects a lamp into one of a few rays makes a vertex shine."""
+BRIGHTEST = 4.0  # largest ratio: a mirror that reflects a lamp into one of a few rays makes a vertex shine
 
 
 def update_occluder_caches(
@@ -45,8 +38,7 @@ def update_occluder_caches(
 ) -> None:
     """Set `occluder.vertex_surfels` if hits are shaded, and `occluder.ambient` if there are `ambient_rays`.
 
-    An empty mesh has neither, and without a light there are no ratios. Call it again when mesh, surfels or
-    light have changed. Raises InputError as `Occluder.set_materials`.
+    Call it again when mesh, surfels or light have changed. Raises InputError as `Occluder.set_materials`.
     """
     if occluder.empty:
         return
@@ -66,8 +58,7 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     rays = dr.opaque(mi.UInt32, options.ambient_rays)
     blur = dr.opaque(mi.Float, ray_roughness(options.ambient_rays))
-    given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
-    traced = ShadingOptions(**given | {"traced_bounces": 1, "diffuse": "irradiance"})  # whatever is honoured
+    traced = ShadingOptions(**options.settings() | {"traced_bounces": 1, "diffuse": "irradiance"})
     ratios: VertexColours | None = None  # the first round is unoccluded
     for _bounce in range(BOUNCES):
         scene = MeshRadiance.of(occluder, surfels, light, traced, ratios)
@@ -101,17 +92,12 @@ def ambient_direction(frame: Any, turn: UInt32, ray: UInt32, count: UInt32) -> V
 
 
 def ambient_of_pixels(context: TraceContext) -> Color3f:
-    """Ratio where the pixels' rays meet the mesh, and 1 where they miss it; detached.
-
-    Raises InputError if the mesh has no ratios.
-    """
+    """Ratio where the pixels' rays meet the mesh, 1 where they miss it; detached. InputError without any."""
     occluder = context.occluder
     if occluder.empty:
         return mi.Color3f(1)
     if occluder.ambient is None:
-        raise InputError(
-            "none for this mesh", "occluder", "ambient", "call update_occluder_caches after update"
-        )
+        raise InputError("none for this mesh", "occluder", "ambient", "call update_occluder_caches")
     with dr.suspend_grad():
         hit = occluder.closest(context.origin, context.ray, None, context.covered)
         ratio = dr.select(hit.valid, occluder.ambient.at(hit.triangle, hit.barycentric, hit.valid), 1)

@@ -20,13 +20,10 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
 from mi_refgs.kernels.device import aligned
 
-RESOLUTION = 256
-"""Texels along N·V and along roughness, values at texel centres: bilinear lookups are then within 3e-4."""
-
+RESOLUTION = 256  # texels per axis, values at their centres: bilinear lookups are then within 3e-4
 RADIAL_NODES, AZIMUTH_NODES = 48, 32
 """Gauss-Legendre nodes over the half vector's polar angle and midpoints over half its azimuth: error below
 4e-4 in the column of smallest N·V and 1e-4 elsewhere, 1 s of one core."""
-
 HORIZON = 1e-7  # smallest N·L whose 1/(N·L)² still fits float32; below it shadowing leaves nothing
 CACHE_NAME = "split_sum_256_v1.npy"  # raise the version when a number of the table changes
 
@@ -62,20 +59,13 @@ def compute_table() -> np.ndarray:
     return (table / (AZIMUTH_NODES * centre[None, :, None])).astype(np.float32)
 
 
-def cache_dir() -> Path:
-    """User cache folder of mi_refgs: $XDG_CACHE_HOME/mi_refgs, else ~/.cache/mi_refgs."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mi_refgs"
-
-
 @functools.lru_cache(maxsize=1)
 def table() -> np.ndarray:
-    """The table of `compute_table`, kept in the user's cache folder once it is computed.
-
-    A cache that cannot be read or written, or that contains something else, is silently ignored.
-    """
+    """The table of `compute_table`, kept in $XDG_CACHE_HOME or ~/.cache if that can be read or written."""
     path = None
     with suppress(OSError, ValueError, RuntimeError, EOFError):
-        path = cache_dir() / CACHE_NAME
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        path = Path(cache) / "mi_refgs" / CACHE_NAME
         cached = np.load(path, allow_pickle=False)
         kind = cached.shape, cached.dtype
         if kind == ((RESOLUTION, RESOLUTION, 2), np.float32) and np.isfinite(cached).all():
@@ -90,24 +80,22 @@ def table() -> np.ndarray:
 
 @functools.lru_cache(maxsize=4)
 def device_table(variant: str) -> Any:
-    """The table as evaluated mi.Float of the variant that is set; made on the first call, kept for others."""
-    # Gathers alone read it, by elements: NumPy's memory will do. The first one may be in a loop that is being
-    # recorded, where `upload` could not run its kernel.
+    """The table as evaluated mi.Float of the variant that is set."""
+    # In NumPy's memory: the first gather may be in a recorded loop, where `upload` cannot run its kernel.
     return mi.Float(aligned(table()))
 
 
 def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Scale A and bias B of a GGX surface: its reflectance under constant light is F0·A + B.
 
-    Bilinear in the table, both arguments clamped to [0, 1]. The outer half texels continue the outermost two
-    linearly: clamping there would be off by 0.002 at roughness 1. Differentiable in both arguments; the table
-    is not.
+    Bilinear in the table, extrapolated over the outer half texels, both arguments clamped to [0, 1] and
+    differentiable.
     """
     data = device_table(mi.variant())
 
     def place(x: Any) -> tuple[Any, Any]:
         x = dr.clip(x, 0, 1) * RESOLUTION - 0.5
-        # The last bound is one of integers: a NaN passes those of floats.
+        # Bounded as integers: a NaN passes bounds of floats.
         first = dr.minimum(mi.UInt32(dr.maximum(dr.detach(x), 0)), RESOLUTION - 2)
         return first, x - mi.Float(first)
 
@@ -115,7 +103,6 @@ def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Floa
     row, v = place(roughness)
     texel = row * RESOLUTION + column
     t00, t01, t10, t11 = (dr.gather(mi.Vector2f, data, texel + k) for k in (0, 1, RESOLUTION, RESOLUTION + 1))
-    # Differences of texels first: where the table is flat, that of interpolated values is their rounding.
     across, down = t01 - t00, t10 - t00
     pair = t00 + u * across + v * dr.fma(u, (t11 - t10) - across, down)
     return pair.x, pair.y

@@ -16,23 +16,20 @@ from mi_refgs.shade.points import safe_normalize
 from mi_refgs.types import Color3f, Float, UInt32, Vector3f
 
 GOLDEN = 2654435769  # 2³² / golden ratio: multiples of it, modulo 2³², are the most even sequence on a circle
-
-COSINE_FLOOR = 1e-3
-"""Smallest n·v of a lobe: a view from behind is taken as a grazing one, as `shade` takes its reflectance."""
-
+COSINE_FLOOR = 1e-3  # smallest n·v of a lobe: a view from behind is taken as a grazing one
 HORIZON = 1e-6  # smallest n·l of a ray: what goes below leaves no light, and 1/(n·l)² fits float32
 
 
 def lobe_turn(index: mi.UInt32) -> mi.UInt32:
-    """The turn of the points of pixels `index`, as a 32-bit fraction: a hash of the index."""
+    """The turn of the points of pixels `index` as a 32-bit fraction."""
     return mi.UInt32(mi.sample_tea_32(index, dr.zeros(mi.UInt32, dr.width(index)))[0])
 
 
 def lobe_point(turn: mi.UInt32, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Point `ray` of `count` in the unit square, turned along its second coordinate; below 1 in either.
+    """Point `ray` of `count` in the unit square, turned along its second coordinate.
 
     The first coordinates are the middles of `count` equal steps, not jittered: of few rays one that falls far
-    out in the lobe's long tail, where another lamp is seen, spoils its pixel.
+    out in the lobe's long tail spoils its pixel.
     """
     turned = mi.Float((ray * GOLDEN + turn) >> 8) * 2.0**-24
     return (mi.Float(ray) + 0.5) / mi.Float(count), turned

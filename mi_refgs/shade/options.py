@@ -19,14 +19,9 @@ Diffuse = Literal["sh", "irradiance"]
 
 DIFFUSE: tuple[Diffuse, ...] = get_args(Diffuse)
 
-MAX_RAYS = 4096
-"""Most rays per lobe, and most bounces; more add time only, since bounces are unrolled in the kernel."""
-
-MAX_DIRECTIONS = 64
-"""Most directions per hemisphere: their visibility is one bit each of a 64-bit word."""
-
-NOT_A_SETTING = {"setting": False}
-"""Metadata of a field that method files do not contain, because it follows from others."""
+MAX_RAYS = 4096  # rays per lobe, and bounces, which are unrolled in the kernel
+MAX_DIRECTIONS = 64  # per hemisphere: their visibility is one bit each of a 64-bit word
+NOT_A_SETTING = {"setting": False}  # metadata of a field that method files do not contain: it follows
 
 
 def number(default: int, least: int, most: int) -> Any:
@@ -58,17 +53,16 @@ class ShadingOptions:
             least, most = option.metadata.get("range", (0, 0))
             if allowed := get_args(kind):
                 fits, wanted = value in allowed, " or ".join(allowed)
-            elif kind is int:
-                fits, wanted = (
-                    type(value) is int and least <= value <= most,
-                    f"a whole number {least} … {most}",
-                )
             else:
-                fits, wanted = type(value) is kind, "True or False" if kind is bool else "a name"
+                fits = type(value) is kind and (kind is not int or least <= value <= most)
+                wanted = {int: f"a whole number {least} … {most}", bool: "True or False"}.get(kind, "a name")
             if not fits:
-                raise InputError(
-                    f"{abbreviated(value)} is not allowed", "shading", option.name, f"use {wanted}"
-                )
+                what = f"{abbreviated(value)} is not allowed"
+                raise InputError(what, "shading", option.name, f"use {wanted}")
+
+    def settings(self) -> dict[str, Any]:
+        """All options by name."""
+        return {name: getattr(self, name) for name in TYPES}
 
     def chosen(self) -> list[str]:
         """Names of the QUALITY options that differ from their defaults."""
@@ -76,10 +70,6 @@ class ShadingOptions:
 
 
 TYPES = get_type_hints(ShadingOptions)
-"""Type of each option by name."""
-
 QUALITY = tuple(name for name in TYPES if name not in ("at", "reflectance", "diffuse", "occlusion"))
 """Names of the options that trade time for a smaller error."""
-
-TRACED = ("visibility_rays", "traced_bounces", "ambient_rays")
-"""Those that have no effect without occlusion."""
+TRACED = ("visibility_rays", "traced_bounces", "ambient_rays")  # no effect without occlusion

@@ -17,11 +17,10 @@ from mi_refgs.errors import InputError
 class ShadingPoints:
     """N points to shade: normal, view and the attributes that a model names, all arrays of width N.
 
-    `normal` and `view` (mi.Vector3f) are in the world frame and of any length; `view` leads towards the
-    camera. Further attributes are read as `points.roughness`, or by `get` where they may be absent. Three
-    names have one meaning for every model: `visibility` of the light in the reflected direction (mi.Float,
-    0 … 1), `indirect` (mi.Color3f: radiance from there where it is blocked), and `position` (mi.Point3f,
-    world; in forward shading, where rays are traced).
+    `normal` and `view`, towards the camera (mi.Vector3f), are in the world frame and of any length. Further
+    attributes are read as `points.roughness` (InputError without it), or by `get`. For every model,
+    `visibility` (mi.Float, 0 … 1) is that of the light in the reflected direction, `indirect` (mi.Color3f)
+    the radiance from there where it is blocked, and `position` (mi.Point3f) where rays start in the world.
     """
 
     normal: Any
@@ -31,13 +30,11 @@ class ShadingPoints:
     def __init__(
         self, normal: Any, view: Any, attributes: Mapping[str, Any] | None = None, **named: Any
     ) -> None:
-        """Points with `attributes` and those that are `named`; None: absent."""
         self.normal, self.view = normal, view
         given = {**(attributes or {}), **named}
         self.attributes = {name: value for name, value in given.items() if value is not None}
 
     def __getattr__(self, name: str) -> Any:
-        """An attribute; raises InputError if the points do not have it."""
         if name.startswith("_") or name == "attributes":
             raise AttributeError(name)
         if name not in self.attributes:
@@ -62,11 +59,9 @@ class RadianceTerms:
     indirect: Any = None
 
     def known(self) -> dict[str, Any]:
-        """The terms that exist, by name."""
         return {name: getattr(self, name) for name in TERMS if getattr(self, name) is not None}
 
     def total(self) -> Any:
-        """Sum of the terms."""
         return sum(self.known().values(), mi.Color3f(0))
 
     def filled(self) -> RadianceTerms:

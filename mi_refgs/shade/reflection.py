@@ -1,8 +1,6 @@
 """Traced mirror rays: visibility of the light, and radiance of the mesh where it blocks it.
 
-The paper traces one mirror ray for the whole lobe and leaves what it hits to the indirect attribute. The
-option `visibility_rays` averages over samples of the lobe instead; `traced_bounces` shades what blocked rays
-hit.
+The paper traces one mirror ray for the whole lobe and leaves what it hits to the indirect attribute.
 """
 
 from __future__ import annotations
@@ -20,15 +18,13 @@ from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
-from mi_refgs.shade.reflectance.model import MODELS, Reflectance, SurfelView, TraceContext
+from mi_refgs.shade.reflectance.model import MODELS, SurfelView, TraceContext
 from mi_refgs.shade.split_sum import lookup_direction
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Array, Bool, Color3f, Float, Point2f, Point3f, UInt32, Vector3f
 
-CLAMP_MAX_ALPHA = 1 / 3
-"""α of a lobe from which single bright rays are not clamped: in concave scenes, 4 rays, the clamp takes 17 to
-42 % off relMSE at α = 0.01, and adds up to 15 % at 0.36."""
+CLAMP_MAX_ALPHA = 1 / 3  # α from which single bright rays are not clamped: at 0.36 it adds 15 % of relMSE
 
 
 def mirror_visibility(context: TraceContext, normal: Vector3f, view: Vector3f) -> Float:
@@ -69,13 +65,9 @@ class HitSurfels:
 class MeshRadiance:
     """Radiance of the mesh, shaded by the reflectance model with the attributes of the surfels.
 
-    The specular light of a hit requires visibility in its own mirror direction, which is traced once more:
-    otherwise a hit deep in a bowl shines as if it were in the open. What blocks it is another hit, shaded in
-    the same way, `traced_bounces` times in all; what is blocked at the last is dark. The recursion is
-    unrolled: every number of bounces is a kernel of its own.
-
-    Spherical harmonics are those of the surfel nearest to the hit, along the ray, other attributes means of
-    the surfels around it.
+    The specular light of a hit requires visibility in its own mirror direction, which is traced once more.
+    What blocks it is another hit, `traced_bounces` times in all; what is blocked at the last is dark.
+    Spherical harmonics are those of the surfel nearest to the hit, other attributes means around it.
     """
 
     occluder: Occluder
@@ -99,18 +91,12 @@ class MeshRadiance:
         surface = occluder.surface(surfels, [name for name in names if not attribute(name).harmonics])
         harmonics = {}
         for name in (name for name in names if attribute(name).harmonics):
-            # In rows: the adjoint of a hit's gather is then a table of its own. Columns themselves, whose
-            # adjoint writes several columns at a time, must not be written to in the same kernel.
+            # In rows, whose adjoint is a table of its own: the columns must not be written to in that kernel.
             coefficients = surfels.value(name)
             rows = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c]))
             harmonics[name] = rows, len(coefficients)
         dr.eval(surface.rows, harmonics)
         return MeshRadiance(occluder, surface, light, options, harmonics, ambient)
-
-    @property
-    def model(self) -> Reflectance:
-        """The reflectance model."""
-        return MODELS[self.options.reflectance]
 
     def trace(
         self, point: Point3f, direction: Vector3f, normal: Vector3f, active: Bool, bounces: int
@@ -137,14 +123,15 @@ class MeshRadiance:
             row = sample.surfel * count
             attributes[name] = [dr.gather(mi.Color3f, rows, row + i, hit.valid) for i in range(count)]
         surfels: Any = HitSurfels(attributes)
-        values = {**self.model.values(surfels, SurfelView(direction, normal), self.options)}
+        model = MODELS[self.options.reflectance]
+        values = {**model.values(surfels, SurfelView(direction, normal), self.options)}
         if self.options.ambient_rays and self.ambient is not None:
             ambient = self.ambient.at(hit.triangle, hit.barycentric, hit.valid)
         if hit.next is not None:
             indirect = self.radiance(hit.next, reflect(view=-direction, normal=normal))
         traced = {"visibility": hit.visibility, "indirect": indirect, "ambient": ambient}
         points = ShadingPoints(values.pop("normal", normal), -direction, values | traced)
-        return self.model.shade(points, self.light, self.options).total()
+        return model.shade(points, self.light, self.options).total()
 
     def _facing(self, sample: SurfaceSample, direction: Vector3f) -> Vector3f:
         """Unit normal on the ray's side, unless it only leans away (see `FACING_TOLERANCE`)."""
@@ -155,10 +142,8 @@ class MeshRadiance:
 def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
     """The points with visibility (mi.Float, 0 … 1, detached) and indirect light, as `options` require.
 
-    `points.indirect` (from the indirect attribute) stays unless `options.traced_bounces` replaces it by the
-    mean radiance of what blocked rays hit (`MeshRadiance`), single bright ones clamped (`_firefly_clamp`).
-    Its gradient goes to the light and to the materials of the surfels around all hits, in both modes; rays,
-    hits, the clamp and the effect of the pixel's own roughness on the rays are detached.
+    `options.traced_bounces` replaces `points.indirect` by the mean radiance of what blocked rays hit, whose
+    gradient goes to the light and to the materials around all hits; rays, hits and clamps are detached.
     """
     occluder, normal = context.occluder, dr.detach(points.normal)
     if options.visibility_rays == 1 and not options.traced_bounces:
@@ -193,8 +178,7 @@ def _average(
     start: tuple[Point3f, Vector3f, Bool],
     options: ShadingOptions,
 ) -> tuple[Float, Color3f | None]:
-    """Mean visibility over samples of the lobe, weighted by the specular integrand, and the mean radiance of
-    the blocked ones (None without a `scene`), in one loop."""
+    """Mean visibility over samples of the lobe, and mean radiance of the blocked ones (None: no `scene`)."""
     point, facing, seen = start
     count = dr.opaque(mi.UInt32, options.visibility_rays)
     with dr.suspend_grad():
@@ -220,7 +204,7 @@ def _average(
         free, blocked = free + dr.select(stopped, 0, weight), blocked + dr.select(stopped, weight, 0)
         return index + 1, free, blocked, total, largest
 
-    # A sum over rays, whose derivative keeps no state of an iteration: Dr.Jit's max_iterations = -1.
+    # A sum over rays, whose derivative keeps no state of an iteration: max_iterations = -1.
     state = (mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Color3f(0), mi.Color3f(0))
     _, free, blocked, total, largest = dr.while_loop(
         state, lambda index, *_: seen & (index < count), body, max_iterations=-1, label="lobe"
@@ -240,9 +224,7 @@ def _firefly_clamp(total: Color3f, largest: Color3f, free: Color3f, count: Float
     """Factor (0 … 1, detached) of the sum over blocked rays, per colour.
 
     The `largest` of `count` rays counts for no more than all rays would at the mean of the others, `free`
-    ones included: one of a few rays of a narrow lobe that finds a lamp in a reflection makes a speckle. Rays
-    of a wide lobe differ anyway, so this fades out with its α (see CLAMP_MAX_ALPHA). The more rays, the less
-    is clamped: the limit is the true mean.
+    ones included; this fades out with α. The more rays, the less is clamped: the limit is the true mean.
     """
     others = dr.maximum(total - largest, 0)
     narrow = dr.maximum(1 - α / CLAMP_MAX_ALPHA, 0)

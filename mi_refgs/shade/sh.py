@@ -18,14 +18,7 @@ from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 
 
 def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
-    """The (degree + 1)² basis functions at unit directions, ordered by degree l, then m = -l … l.
-
-    Differentiable. Raises InputError unless 0 ≤ degree ≤ 3.
-    """
-    if not 0 <= degree <= MAX_SH_DEGREE:
-        raise InputError(
-            f"{degree} is not in 0 … {MAX_SH_DEGREE}", "sh_basis", "degree", "choose one of those"
-        )
+    """The (degree + 1)² basis functions at unit directions, ordered by degree l ≤ 3, then m = -l … l."""
     x, y, z = direction.x, direction.y, direction.z
     basis: list[Any] = [dr.full(mi.Float, 0.5 * math.sqrt(1 / math.pi), dr.width(x))]
     if degree >= 1:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mi_refgs.errors import InputError
@@ -19,9 +19,8 @@ from mi_refgs.shade.reflection import reflection
 UNTRACED: dict[str, Any] = {name: getattr(ShadingOptions, name) for name in ("occlusion", *TRACED)}
 
 RELIT_RAYS = {"visibility_rays": 16, "traced_bounces": 2, "ambient_rays": 128}
-"""Rays under another light. PSNR of two balls of known materials, relit at 128² with 2 × 2 samples, against
-path tracing: 33.6 dB with one ray, 34.2 with 4, 34.4 with 16 and 34.5 with 64. In a self-reflecting bowl one
-bounce misses 27 % of the light, two 9 %, four 3 %."""
+"""Rays under another light. PSNR of two balls against path tracing: 33.6 dB with one ray, 34.4 with 16, 34.5
+with 64. In a self-reflecting bowl one bounce misses 27 % of the light, two 9 %, four 3 %."""
 
 
 @dataclass(frozen=True)
@@ -32,38 +31,18 @@ class Shading(ShadingOptions):
         super().__post_init__()
         model, chosen = MODELS.find(self.reflectance, "shading: reflectance"), self.chosen()
         mirrors = " or ".join(name for name, other in MODELS.items() if other.visibility == "mirror")
+        unused = self.ambient_rays > 0 and self.diffuse != "irradiance"
+        untraced = not self.occlusion and bool({*chosen} & {*TRACED})
+        untraceable = self.occlusion and not self.traceable
+        blended = self.antialias and self.shaded_at != "pixel"
+        needed = f"{self.reflectance} needs shading at {model.shaded_at[0]}"
         # (what is not allowed, its option, what is wrong, the remedy)
         rules = [
-            (
-                self.shaded_at not in model.shaded_at,
-                "reflectance",
-                f"{self.reflectance} needs shading at {model.shaded_at[0]}",
-                "set it",
-            ),
-            (
-                self.occlusion and not self.traceable,
-                "occlusion",
-                f"needs shading at pixel and reflectance = {mirrors}",
-                "set these",
-            ),
-            (
-                self.ambient_rays > 0 and self.diffuse != "irradiance",
-                "ambient_rays",
-                "need diffuse = irradiance",
-                "set it",
-            ),
-            (
-                not self.occlusion and bool({*chosen} & {*TRACED}),
-                ", ".join(TRACED),
-                "need occlusion",
-                "trace a `mesh`",
-            ),
-            (
-                self.antialias and self.shaded_at != "pixel",
-                "antialias",
-                "needs shading at pixel",
-                "set it, or leave it out",
-            ),
+            (self.shaded_at not in model.shaded_at, "reflectance", needed, "set it"),
+            (untraceable, "occlusion", f"needs shading at pixel and reflectance = {mirrors}", "set these"),
+            (unused, "ambient_rays", "need diffuse = irradiance", "set it"),
+            (untraced, ", ".join(TRACED), "need occlusion", "trace a `mesh`"),
+            (blended, "antialias", "needs shading at pixel", "set it, or leave it out"),
         ]
         for name in chosen:
             able = " or ".join(other for other in MODELS if name in MODELS[other].honoured)
@@ -75,9 +54,9 @@ class Shading(ShadingOptions):
     @staticmethod
     def resolve(options: ShadingOptions, mesh: bool) -> Shading:
         """The options of a stage: occluded if `traceable` and there is a `mesh`; else without TRACED ones."""
-        given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
-        untraced = Shading(**given | UNTRACED)
-        return Shading(**given | {"occlusion": True}) if mesh and untraced.traceable else untraced
+        untraced = Shading(**options.settings() | UNTRACED)
+        traced = mesh and untraced.traceable
+        return Shading(**options.settings() | {"occlusion": True}) if traced else untraced
 
     def relit(self, mesh: bool) -> Shading | None:
         """The shading under another light, occluded by a `mesh` if there is one; None: the model has none."""
@@ -85,7 +64,7 @@ class Shading(ShadingOptions):
         options = self.model.relit(replace(self, at=at, **UNTRACED))
         if options is None:
             return None
-        given = {option.name: getattr(options, option.name) for option in fields(ShadingOptions)}
+        given = options.settings()
         traced = {name: rays for name, rays in RELIT_RAYS.items() if name in self.model.honoured}
         return Shading.resolve(ShadingOptions(**given | traced), mesh)
 
@@ -97,11 +76,6 @@ class Shading(ShadingOptions):
         """With `antialias` where it has an effect: for displayed images; the steps of a fit go without."""
         able = self.shaded_at == "pixel" and "antialias" in self.model.honoured
         return replace(self, antialias=True) if able else self
-
-    @staticmethod
-    def from_json(note: Mapping[str, Any]) -> Shading:
-        """Read what `dataclasses.asdict` has written; raises InputError, or TypeError for an unknown key."""
-        return Shading(**note)
 
     @staticmethod
     def default(attributes: Collection[str], models: Collection[str] = MODELS) -> tuple[str, Diffuse]:
@@ -116,7 +90,6 @@ class Shading(ShadingOptions):
 
     @property
     def model(self) -> Reflectance:
-        """The reflectance model."""
         return MODELS[self.reflectance]
 
     @property
@@ -157,9 +130,7 @@ class Shading(ShadingOptions):
             needs = f"reflectance = {self.reflectance} needs one"
             raise InputError(needs, "shading", "light", f"add it, or set reflectance = {unlit}")
         if self.occlusion and not mesh:
-            raise InputError(
-                "there is no mesh to trace", "shading", "occlusion", "give one, or trace nothing"
-            )
+            raise InputError("there is no mesh to trace", "shading", "occlusion", "give one")
 
 
 def trace(points: ShadingPoints, context: TraceContext, shading: Shading) -> ShadingPoints:

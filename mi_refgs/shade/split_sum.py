@@ -11,17 +11,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.errors import InputError
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 
-DIELECTRIC_F0 = 0.04
-"""Reflectance at normal incidence of a surface that is not metal (index of refraction 1.5)."""
-
-SMOOTHNESS_FLOOR = 1e-12
-"""Least 1 - α in √(1 - α), whose slope is infinite at α = 1; its factor is below 1e-12 there."""
+DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of a dielectric (index of refraction 1.5)
+SMOOTHNESS_FLOOR = 1e-12  # least 1 - α in √(1 - α), whose slope is infinite at α = 1
 
 
 def base_reflectance(points: ShadingPoints) -> mi.Color3f:
@@ -34,10 +30,9 @@ def lookup_direction(
 ) -> mi.Vector3f:
     """Unit direction in which the prefiltered light is looked up: mirrored, or dominant. Unit vectors in.
 
-    The dominant one is near the peak of the GGX lobe, cosine and shadowing included: with α = roughness² and
-    s = 1 - α it lies s (√s + α) of the way from the normal to the mirror direction. Differentiable, but for
-    the clamp of roughness to [0, 1]. [Lagarde and de Rousiers 2014, "Moving Frostbite to Physically Based
-    Rendering", §4.9.3; of its two fits the one that it recommends with a prefiltered map]
+    The dominant one is near the peak of the GGX lobe: with α = roughness² and s = 1 - α it lies s (√s + α) of
+    the way from the normal to the mirror direction. [Lagarde and de Rousiers 2014, "Moving Frostbite to
+    Physically Based Rendering", §4.9.3]
     """
     mirror = reflect(view, normal)
     if not options.dominant:
@@ -52,18 +47,12 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
     """Outgoing radiance towards the camera, as separate terms.
 
     With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
-    r: specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse = (1 - metallic) radiance
-    ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ambient ("irradiance"; see `shade.ambient`, 1 where
-    the points have none). n·v is clamped to [0, 1]: a point seen from behind keeps its mirror direction, with
-    the reflectance at grazing incidence.
+    r (`lookup_direction`): specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse =
+    (1 - metallic) radiance ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ambient ("irradiance"; see
+    `shade.ambient`). A point seen from behind keeps its mirror direction, with the reflectance at grazing
+    incidence. Under a constant light of 1 no more than 1 leaves with "irradiance".
 
-    `options.dominant` turns r (`lookup_direction`).
-
-    Under a constant light of 1 no more than 1 leaves with "irradiance": the albedo scaling of layered models,
-    which is not reciprocal, as 1 - S depends on the view alone. A fitted radiance ("sh") is not scaled.
-
-    Differentiable in everything but the branches of the clamps. Finite for every finite input.
-    Raises InputError for "sh" without a radiance.
+    Finite for every finite input. Raises InputError for "sh" without a radiance.
     """
     # Directional reflectance, and the light in the specular lobe.
     normal, view = safe_normalize(points.normal), safe_normalize(points.view)
@@ -89,10 +78,6 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
         if (ambient := points.get("ambient")) is not None:
             incident *= ambient
         diffuse = transmitted * (1 - points.metallic) * points.albedo * incident
-    elif points.get("radiance") is None:
-        raise InputError(
-            "missing", "shade", "radiance", 'diffuse="sh" needs it, diffuse="irradiance" does not'
-        )
     else:
         diffuse = (1 - points.metallic) * points.radiance
     return RadianceTerms(diffuse, specular, indirect)

@@ -136,7 +136,7 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
         ({"visibility_rays": 1.5}, "visibility_rays: 1.5 is not allowed"),
         ({"mesh": "nowhere.ply"}, "nowhere.ply: mesh: no such file"),
         ({"filename": "nowhere.ply"}, "nowhere.ply: file: cannot be read"),
-        ({"light": {"type": "point"}}, "not a PointLight"),
+        ({"light": {"type": "point"}}, "takes no PointLight"),
         ({"max_depth": 3}, "unreferenced property"),
     ],
 )

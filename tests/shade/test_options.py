@@ -34,7 +34,7 @@ PLAIN = ShadingOptions(diffuse="irradiance")
 def test_shading_survives_json() -> None:
     shading = Shading(occlusion=True, dominant=True, visibility_rays=8, traced_bounces=3)
     note = json.loads(json.dumps(asdict(shading)))
-    assert Shading.from_json(note) == shading
+    assert Shading(**note) == shading
 
 
 @pytest.mark.parametrize(
