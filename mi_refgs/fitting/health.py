@@ -16,7 +16,7 @@ from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import BACKGROUND, LIGHT
 from mi_refgs.runs.checkpoint import channels_of
-from mi_refgs.shade.light.kind import LightOfFit
+from mi_refgs.shade.light.kind import FittedLight
 from mi_refgs.surfels.table import Surfels
 
 CULL_SHARE = 0.1
@@ -90,7 +90,7 @@ def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str
     return f"{where}{channels} not finite at surfels {named}: {len(indices)} were removed"
 
 
-def require_finite_light(light: LightOfFit | None, name: str = LIGHT) -> None:
+def require_finite_light(light: FittedLight | None, name: str = LIGHT) -> None:
     """Raise InputError if a map has a texel that renders black and no longer learns."""
     if light is not None and light.unusable():
         rate = "rates.light" if name == LIGHT else "surroundings.rate"

@@ -13,8 +13,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.methods.initialiser import INITIALISERS, Start, Wanted
 from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.light.learnt import Learnt
 from mi_refgs.shade.light.lobe_matrices import map_directions
+from mi_refgs.shade.light.maps import Learnt
 from mi_refgs.surfels import init
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.init import morton_order

@@ -23,7 +23,7 @@ from mi_refgs.methods.event import EVENTS, Event
 from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, POSE, Method
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import PrefilteredLight
-from mi_refgs.shade.light.kind import LightOfFit
+from mi_refgs.shade.light.kind import FittedLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
@@ -203,7 +203,7 @@ class SharedPrefilter:
         self._light: PrefilteredLight | None = None  # attached to the environment
         self._leaf: Float = None  # its levels, which accumulate the gradients of the steps
 
-    def light(self, environment: LightOfFit | None, shading: Shading) -> Light | None:
+    def light(self, environment: FittedLight | None, shading: Shading) -> Light | None:
         """The light of a step, under AD; a light that is not filtered stays attached to its environment."""
         if self._light is not None and shading.model.light == "filtered":
             return replace(self._light, levels=self._leaf)
@@ -231,7 +231,7 @@ class SharedPrefilter:
         return {} if self._leaf is None else {GATHERED: np.array(dr.grad(self._leaf), dtype=np.float32)}
 
     def restore(
-        self, environment: LightOfFit | None, shading: Shading, state: Mapping[str, np.ndarray]
+        self, environment: FittedLight | None, shading: Shading, state: Mapping[str, np.ndarray]
     ) -> None:
         """Continue from a checkpoint; a gradient of other levels, as in a trial, is left out."""
         self.clear()

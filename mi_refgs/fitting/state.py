@@ -44,7 +44,7 @@ from mi_refgs.runs.checkpoint import (
     tensors,
 )
 from mi_refgs.shade.ambient import update_occluder_caches
-from mi_refgs.shade.light.kind import LightKind, LightOfFit
+from mi_refgs.shade.light.kind import FittedLight, LightKind
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.init import morton_order
@@ -192,7 +192,7 @@ class FitState:
         return surroundings_of(self.params)
 
     @property
-    def light(self) -> LightOfFit | None:
+    def light(self) -> FittedLight | None:
         """The light, also attached."""
         return light_of(self.light_kind, self.params)
 

@@ -33,7 +33,7 @@ from mi_refgs.render.samples import supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
-from mi_refgs.shade.light.kind import LightOfFit
+from mi_refgs.shade.light.kind import FittedLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
@@ -139,7 +139,7 @@ class Trainer:
         return self.fit.surroundings
 
     @property
-    def light(self) -> LightOfFit | None:
+    def light(self) -> FittedLight | None:
         """The light, also attached."""
         return self.fit.light
 

@@ -18,7 +18,7 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.light.kind import LightKind, LightOfFit
+from mi_refgs.shade.light.kind import FittedLight, LightKind
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
@@ -31,7 +31,7 @@ def channels_of(params: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return {name: x for name, x in params.items() if name not in APART and not name.startswith(AROUND)}
 
 
-def light_of(kind: LightKind | None, params: Mapping[str, Any]) -> LightOfFit | None:
+def light_of(kind: LightKind | None, params: Mapping[str, Any]) -> FittedLight | None:
     """The light that the object reflects, if there is one; raises InputError for a wrong shape."""
     return None if kind is None or LIGHT not in params else kind.of(params[LIGHT])
 

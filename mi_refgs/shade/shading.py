@@ -9,7 +9,7 @@ from typing import Any
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.ambient import ambient_of_pixels
-from mi_refgs.shade.light.kind import LightOfFit
+from mi_refgs.shade.light.kind import FittedLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import DIFFUSE, TRACED, Diffuse, ShadedAt, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
@@ -114,7 +114,7 @@ class Shading(ShadingOptions):
         """Pixels along each axis that a pixel's colour depends on."""
         return int(self.antialias)
 
-    def light_of(self, environment: LightOfFit | None) -> Light | None:
+    def light_of(self, environment: FittedLight | None) -> Light | None:
         """The light as the model looks it up, under AD; None without one, or if the model uses none."""
         if environment is None or self.model.light == "none":
             return None

@@ -14,7 +14,7 @@ from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
 from mi_refgs.methods.window import Window
-from mi_refgs.shade.light.learnt import Learnt
+from mi_refgs.shade.light.maps import Learnt
 from tests.scenes.highlight import ball
 
 DATA = ball(size=4, views=7)

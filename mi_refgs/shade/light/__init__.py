@@ -1,10 +1,9 @@
-"""Lights, one kind a file; importing this package registers those that ship."""
+"""Lights, and their kinds; importing this package registers those that ship."""
 
 from mi_refgs.shade.light.constant import Constant
 from mi_refgs.shade.light.kind import LIGHTS, FittedLight, LightKind
-from mi_refgs.shade.light.known import Known
-from mi_refgs.shade.light.learnt import Learnt
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.light.maps import Known, Learnt
 
 for _kind in (Learnt, Constant, Known):
     LIGHTS.register(_kind)

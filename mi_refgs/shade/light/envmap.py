@@ -4,8 +4,8 @@ Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a r
 column centres at half-integers, the first and the last row at the poles (`lobe_matrices`). Images go in and
 out unturned.
 
-Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that
-an optimiser's step bounds the change of radiance; an exponential would let one step multiply a highlight.
+Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that an
+optimiser's step bounds the change of radiance.
 """
 
 from __future__ import annotations
@@ -28,9 +28,11 @@ from mi_refgs.io.exr import write_exr
 from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.light.prefilter import Operator, prefilter
+from mi_refgs.types import TensorXf
 
 ATANH_TERMS = 7  # terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1
 
@@ -52,8 +54,7 @@ def bounded(value: Any, raw: Any) -> Any:
 
 
 def nearest_raw(radiance: np.ndarray) -> np.ndarray:
-    """Raw float32 values whose softplus, as the device rounds it, is nearest to the radiance (float64): a
-    light that was read, written and read again is the same, bit for bit."""
+    """Raw float32 values whose softplus, as the device rounds it, is nearest to the radiance (float64)."""
     wanted, exact = radiance.astype(np.float32), radiance + np.log(-np.expm1(-radiance))
     step = np.maximum(np.spacing(np.abs(exact).astype(np.float32)), np.spacing(wanted) / -np.expm1(-radiance))
     tried = np.stack([exact + k * step for k in (0, -1, 1, -2, 2)]).astype(np.float32)
@@ -70,7 +71,6 @@ POLE_SINE = 1e-4  # within 0.006° of a pole the azimuth is fixed, so that its d
 
 
 def is_height(rows: int) -> bool:
-    """Whether a learnable light may have this number of rows."""
     return rows % 4 == 0 and rows >= MIN_HEIGHT
 
 
@@ -82,19 +82,14 @@ class PrefilteredLight:
     levels: Any  # flat RGBA texels, level after level
 
     def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
-        """Radiance (bilinear) that arrives from unit world directions; derivative in light and direction."""
         return self._bilinear(*azimuth_polar(direction), mi.UInt32(0))
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
-        """∫ L cosθ dω / π over the hemisphere of unit world normals: the last level, whose D is constant."""
-        return self._bilinear(*azimuth_polar(normal), mi.UInt32(len(LEVEL_ROUGHNESS)))
+        return self._bilinear(*azimuth_polar(normal), mi.UInt32(len(LEVEL_ROUGHNESS)))  # its D is constant
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        """Radiance averaged over the GGX lobe around unit world directions. [split sum, Karis 2013]
-
-        Linear between levels in 1/roughness, which keeps the lobe's energy (6 %) and its peak, and in
-        roughness⁴ below the first. Derivative in light, direction and roughness.
-        """
+        """Radiance averaged over the GGX lobe: linear between levels in 1/roughness, which keeps energy and
+        peak, and in roughness⁴ below the first. [split sum, Karis 2013]"""
         place = _level(roughness)
         lower = dr.minimum(mi.UInt32(dr.detach(place)), len(LEVEL_ROUGHNESS) - 1)
         at = azimuth_polar(direction)
@@ -115,25 +110,22 @@ class UnfilteredLight:
     texels: Any  # flat RGB texels, under AD
 
     def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
-        """Radiance in unit directions, as `PrefilteredLight.radiance` gives it."""
         h = dr.opaque(mi.UInt32, self.height)
         u, v = azimuth_polar(direction)
         return interpolated(lambda i: dr.gather(mi.Color3f, self.texels, i), u, v, h, 2 * h)
 
     def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
-        raise InputError(
-            "the light is not filtered", "light", "irradiance", "use EnvironmentLight.prefilter()"
-        )
+        raise InputError("the light is not filtered", "light", "irradiance", "call prefilter()")
 
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        raise InputError("the light is not filtered", "light", "specular", "use EnvironmentLight.prefilter()")
+        raise InputError("the light is not filtered", "light", "specular", "call prefilter()")
 
 
 def interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -> Any:
     """Bilinear value of a map of h rows and w columns at the fractions u of a turn and v of a meridian."""
     x, y = dr.fma(u, mi.Float(w), -0.5), v * mi.Float(h - 1)
     left = mi.Int32(dr.floor(dr.detach(x)))
-    # Bounded as integers: a NaN becomes some integer, and a bound in floats lets it pass.
+    # Bounded as integers: a NaN passes bounds of floats.
     row = dr.minimum(mi.UInt32(dr.detach(y)), h - 2)
     s, t = x - mi.Float(left), y - mi.Float(row)
     column = mi.UInt32(dr.select(left < 0, mi.Int32(w) - 1, dr.minimum(left, mi.Int32(w) - 1)))
@@ -145,11 +137,10 @@ def interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) ->
 
 
 def azimuth_polar(direction: Any) -> tuple[Any, Any]:
-    """Fractions u of a turn and v of a meridian of unit directions, with finite derivatives at the poles."""
+    """Fractions u of a turn and v of a meridian of unit directions, with finite derivatives."""
     x, y, z = direction.x, direction.y, direction.z
     sin2 = x * x + z * z
     off_pole = sin2 > POLE_SINE**2
-    # The pole itself has no azimuth, in Mitsuba neither; it looks along +z here.
     φ = dr.atan2(dr.select(off_pole, x, 0), -dr.select(off_pole, z, 1))
     u = φ * (0.5 / dr.pi)
     u = dr.select(u < 0, u + 1, u)
@@ -159,7 +150,7 @@ def azimuth_polar(direction: Any) -> tuple[Any, Any]:
 
 
 def _level(roughness: Any) -> Any:
-    """Fractional level 0 … L of a roughness, clamped to [0, 1]."""
+    """Fractional level 0 … L of a roughness."""
     first = LEVEL_ROUGHNESS[0]
     r = dr.clip(roughness, 0, 1)
     sharp = dr.minimum(r, first) * (1 / first)
@@ -171,24 +162,43 @@ def _level(roughness: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class EnvironmentLight:
+class FittedLight:
+    """A light of raw values of any shape, which a fit learns."""
+
+    raw: TensorXf
+
+    def prefilter(self) -> Light:
+        """The light as models look it up, under AD; without gradient where a value is not < RAW_LIMIT."""
+        raise NotImplementedError
+
+    def unfiltered(self) -> Light:
+        """The light for models that look up `radiance` only, under AD."""
+        return self.prefilter()
+
+    def environment(self) -> EnvironmentLight:
+        """The map that a run saves, which every application shows, edits and exports."""
+        directions = lobe_matrices.map_directions(DEFAULT_HEIGHT)
+        light = self.prefilter().radiance(mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)))
+        radiance = np.broadcast_to(light.numpy(), (3, directions.size // 3))  # a constant has width 1
+        return EnvironmentLight.from_radiance(radiance.T.reshape(directions.shape))
+
+    def unusable(self) -> int:
+        """Number of raw values that are not < RAW_LIMIT; waits for the device."""
+        return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
+
+
+class EnvironmentLight(FittedLight):
     """A learnable lat-long light: `raw` is a tensor (h, 2h, 3), h a multiple of 4, radiance = softplus(raw).
 
     Raises InputError for another shape.
     """
 
-    raw: Any
-
     def __post_init__(self) -> None:
         shape = tuple(self.raw.shape)
         h = shape[0] if shape else 0
         if shape != (h, 2 * h, 3) or not is_height(h):
-            raise InputError(
-                f"shape {shape}",
-                "EnvironmentLight",
-                "raw",
-                f"need (h, 2h, 3), h ≥ {MIN_HEIGHT} a multiple of 4: EnvironmentLight.from_file resamples",
-            )
+            need = f"need (h, 2h, 3), h ≥ {MIN_HEIGHT} a multiple of 4: EnvironmentLight.from_file resamples"
+            raise InputError(f"shape {shape}", "EnvironmentLight", "raw", need)
 
     @classmethod
     def constant(cls, radiance: float = 0.5, height: int = DEFAULT_HEIGHT) -> EnvironmentLight:
@@ -197,10 +207,7 @@ class EnvironmentLight:
 
     @classmethod
     def from_radiance(cls, radiance: np.ndarray) -> EnvironmentLight:
-        """Take linear radiance (h, 2h, 3), in Mitsuba's orientation; values below 1e-4 become 1e-4.
-
-        Raises InputError for NaN, infinity or another shape.
-        """
+        """Take linear radiance (h, 2h, 3), 1e-4 at least; InputError for NaN, infinity or another shape."""
         radiance = np.asarray(radiance, np.float64)
         if not np.isfinite(radiance).all():
             raise InputError("NaN or infinite values", "EnvironmentLight", "radiance", "replace those texels")
@@ -210,8 +217,7 @@ class EnvironmentLight:
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
         """Read a lat-long image (EXR, HDR) and resample it to `height` rows, keeping its energy.
 
-        Without `height`: the image's own rows, to the next lower multiple of 4, and FINEST at most. Raises
-        InputError as `read_radiance` does.
+        Without `height`: the image's own rows, at most FINEST. Raises InputError as `read_radiance` does.
         """
         image = read_radiance(path, height or FINEST)
         rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
@@ -219,36 +225,25 @@ class EnvironmentLight:
 
     @property
     def height(self) -> int:
-        """Rows h of the map."""
         return int(self.raw.shape[0])
 
     def radiance(self) -> Any:
         """Linear radiance (h, 2h, 3), a tensor under AD; 0 with gradient 0 where |raw| is not < RAW_LIMIT."""
         return mi.TensorXf(bounded(softplus(self.raw.array), self.raw.array), shape=tuple(self.raw.shape))
 
-    def unusable(self) -> int:
-        """Number of raw values that are not < RAW_LIMIT, which are black; waits for the device."""
-        return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
-
     @phase("prefilter forward", backward="prefilter backward")
     def prefilter(self) -> PrefilteredLight:
-        """The levels of this light, under AD; a fixed linear operator on the radiance (`prefilter`)."""
         return PrefilteredLight(*prefilter(self.radiance()))
 
     def unfiltered(self) -> UnfilteredLight:
-        """The map of this light, under AD, for models that look up `radiance` only."""
         return UnfilteredLight(self.height, self.radiance().array)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the radiance as a float32 EXR, in the orientation of Mitsuba's `envmap`; atomic.
-
-        Raises InputError when the path cannot be written.
-        """
+        """Write the radiance as a float32 EXR, atomically; InputError when the path cannot be written."""
         path = Path(path)
         with suppress(OSError):  # a folder that cannot be made cannot be written to either
             path.parent.mkdir(parents=True, exist_ok=True)
         write_exr(path, self.radiance().numpy())
 
     def environment(self) -> EnvironmentLight:
-        """The light itself, which a run saves."""
         return self

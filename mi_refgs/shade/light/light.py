@@ -1,4 +1,4 @@
-"""Lights: one protocol of three lookups, which reflectance models ask and nothing else."""
+"""Lights: the protocol of three lookups that reflectance models use."""
 
 from __future__ import annotations
 

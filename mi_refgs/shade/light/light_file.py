@@ -13,16 +13,14 @@ from mi_refgs.io.hdr import read_hdr
 from mi_refgs.io.images import linear_from_srgb, read_bytes
 from mi_refgs.shade.light.lobe_matrices import resampling
 
-MAX_ROWS = 4096
-"""Most rows that are kept of a map, unless the caller wants fewer: 400 MB of float32 with their columns."""
+MAX_ROWS = 4096  # most rows that are kept of a map: 400 MB of float32
 
 
 def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndarray:
     """Linear radiance (h, w, 3) float32, at least 0, of a lat-long EXR, HDR, PNG or JPEG file.
 
-    A map of more than `rows` rows or 2 · `rows` columns is averaged to that many, keeping its integral as
-    `lobe_matrices.resample` does; a smaller one comes as it is. Raises InputError when it is no such image,
-    and for one of more than `files.MAX_PIXELS`, before any pixel is decoded.
+    A map of more than `rows` rows or 2 · `rows` columns is averaged to that many. Raises InputError when it
+    is no such image, or has more than `files.MAX_PIXELS`.
     """
     path = Path(path)
     image = np.maximum(_read(path), 0)

@@ -1,15 +1,11 @@
 """The GGX lobe as a linear operator on a lat-long map, diagonal in azimuth. NumPy float64, no Dr.Jit.
 
 With N = V = R the lobe depends only on the angle between R and L, so on a lat-long grid the filter commutes
-with every rotation about the pole: it acts on each azimuthal frequency m separately, as a small matrix from
-input rows to output rows. Those matrices, built once per resolution, are the prefilter of the whole lobe:
-where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
+with rotations about the pole: it acts on each azimuthal frequency m separately, as a small matrix from input
+rows to output rows. Where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
 
-Grid    Rows are at θ = πi/(h-1) from +y (first and last row are the poles), columns at φ = 2π(j+½)/w with
-        φ = atan2(x, -z). That is where Mitsuba's `envmap` puts the texels of an image, measured by
-        tests/shade/test_envmap.py.
-Radiance between texels is bilinear, as Mitsuba looks it up: the operator integrates the lobe against that
-function.
+Rows are at θ = πi/(h-1) from +y (first and last row are the poles), columns at φ = 2π(j+½)/w with
+φ = atan2(x, -z), as in Mitsuba's `envmap`. Radiance between texels is bilinear, as Mitsuba looks it up.
 """
 
 from __future__ import annotations
@@ -20,18 +16,11 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 LEVEL_ROUGHNESS = (0.1, 0.15, 0.22, 0.32, 0.45, 0.65, 1.0)
-"""Roughness of the filtered levels (level 0 is the map itself): α about doubles from one to the next, so that
-a mixture of two neighbours is within 6 % (L1) of the lobe between them. [measured, docs/decisions.md]"""
-
+"""Roughness of the filtered levels (level 0 is the map): a mixture of two neighbours is within 6 % (L1)
+of the lobe between them."""
 LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)
-"""Rows of each level, at most. Bilinear lookups of a point light are then off by 1.2, 1.1, 1.4, 0.4 and 0.3 %
-(L1) from the third level on; the first two are as fine as the finest map that is filtered. [measured]"""
-
-
-DROP_BELOW = 1e-5
-"""Matrix entries below this fraction of their level's largest are dropped: 0.05 % of a lobe (L1), 1e-4 of its
-peak at the worst."""
-
+"""Rows of each level, at most: lookups of a point light are off by 1.4 % (L1) from the third level on."""
+DROP_BELOW = 1e-5  # of a level's largest entry; smaller ones are dropped: 0.05 % of a lobe (L1)
 HORIZON_CUTS = 0.5  # roughness from which a lobe ends at the horizon rather than before it
 MIN_SUBSAMPLES = 2  # quadrature points per texel side where the lobe is wider than a texel
 
@@ -46,7 +35,7 @@ class Level:
 
 
 def row_angles(h: int) -> np.ndarray:
-    """Polar angles (h,) of the rows, radians from +y; first and last row are the poles."""
+    """Polar angles (h,) of the rows, radians from +y."""
     return np.linspace(0.0, np.pi, h)
 
 
@@ -79,9 +68,9 @@ def row_areas(h: int) -> np.ndarray:
 
 
 def resampling(count: int, wanted: int, periodic: bool = False) -> csr_matrix:
-    """Sparse matrix (wanted, count) between grids of rows, or of columns if `periodic`.
+    """Matrix (wanted, count) between grids of rows, or of columns if `periodic`; its rows sum to 1.
 
-    Area-weighted hats to coarsen, linear to refine; rows of the matrix sum to 1.
+    Area-weighted hats to coarsen, linear to refine.
     """
     last = 0 if periodic else 1  # rows are on both ends of their interval, columns are not
     ratio = (count - last) / (wanted - last)
@@ -114,8 +103,7 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     """Matrices (h_out, h, h+1) of the lobe from input to output rows, frequencies 0 … h of w = 2h columns.
 
     Entry (i, k, m) multiplies Σ_j x[k, j] (cos, sin)(mφ_j); the series Σ_m (a_m cos mφ + b_m sin mφ) is then
-    the filtered radiance of row i at any azimuth, and exactly the circulant filter of the w columns at the
-    columns themselves.
+    the filtered radiance of row i at any azimuth.
     """
     w, texel = 2 * h, np.pi / (h - 1)
     core = 2 * roughness**2  # the lobe falls to a quarter at this angle, radians
@@ -150,10 +138,7 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
 
 
 def build_levels(h: int) -> list[Level]:
-    """The filtered levels of a map (h, 2h), coarser ones on coarser grids.
-
-    Maps of more rows than the finest level are averaged down to it first, inside the same matrices.
-    """
+    """The filtered levels of a map (h, 2h); one of more rows than the finest is averaged down to it first."""
     h_in = min(h, LEVEL_MAX_HEIGHT[0])
     built = []
     for roughness, cap in zip(LEVEL_ROUGHNESS, LEVEL_MAX_HEIGHT, strict=True):
@@ -169,8 +154,7 @@ def build_levels(h: int) -> list[Level]:
         rows = weights.shape[0]
         weights = weights[:, :, : rows + 1]  # a level of w columns has frequencies up to w/2
         if rows < h_in and roughness > HORIZON_CUTS:
-            # The edge at the horizon has a long series. Cut short, it rings: light would turn negative
-            # opposite a sun. Lanczos' factors fade it out.
+            # The edge at the horizon rings, and light would turn negative: Lanczos' factors fade it out.
             weights = weights * np.sinc(np.arange(rows + 1) / (rows + 1))
         kept = np.abs(weights) > DROP_BELOW * np.abs(weights).max()
         kept[:, :, 0] = True  # the mean is never thinned: constants stay constant

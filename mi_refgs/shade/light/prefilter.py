@@ -2,10 +2,8 @@
 
     radiance ─ FFT ─► coefficients ─ matrix ─► coefficients of every level ─ inverse FFT ─► levels
 
-`analyse` and `synthesise` are each other's transpose, so that the adjoint is the same with the matrix
-transposed. All of it runs in NumPy and SciPy on the host: a light is small, and shared by several steps of a
-fit. The levels are one flat buffer, TEXEL floats per texel: RGBA, A unused, so that a lookup is one access;
-the map itself comes first.
+`analyse` and `synthesise` are each other's transpose. All of it runs on the host: a light is small. The
+levels are one flat buffer, TEXEL floats per texel: RGBA, A unused; the map itself comes first.
 """
 
 from __future__ import annotations
@@ -38,7 +36,6 @@ class Operator:
 
     @property
     def texels(self) -> int:
-        """Texels of all levels."""
         first, height = self.shapes[-1]
         return first + 2 * height**2
 
@@ -60,7 +57,6 @@ class Operator:
 
     @property
     def _ends(self) -> list[int]:
-        """Ends of the levels among the coefficients."""
         return np.cumsum([h * (h + 1) for _, h in self.shapes[1:]]).tolist()
 
 
@@ -80,7 +76,6 @@ def synthesise(coefficients: np.ndarray, height: int) -> np.ndarray:
 
 
 def _first_angles(height: int) -> np.ndarray:
-    """mφ_0 (h + 1,) of the middle of the first column, radians."""
     return np.arange(height + 1) * (np.pi / (2 * height))
 
 
@@ -92,7 +87,7 @@ def _product(matrix: csc_matrix, coefficients: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=4)
 def _matrix(height: int) -> tuple[csc_matrix, list[int]]:
-    """The matrix of an operator, the same in every variant, and the rows of its levels."""
+    """The matrix of an operator, and the rows of its levels."""
     built, values, rows, columns, first = build_levels(height), [], [], [], 0
     for level in built:
         i, k, m = np.nonzero(level.weights)

@@ -54,8 +54,7 @@ class TraceContext:
     def start(self, normal: Vector3f) -> tuple[Point3f, Vector3f, Bool]:
         """Where the primary rays meet the mesh, the unit normals there, and whether they do; detached.
 
-        Not the blended depth: at a silhouette, and between two layers, that lies inside the object and every
-        ray from there is blocked, which draws a dark outline.
+        Not the blended depth: at a silhouette that lies inside the object, which draws a dark outline.
         """
         distance, hit = self.occluder.first_hit(self.origin, self.ray, self.covered)
         return mi.Point3f(mi.Vector3f(self.origin) + distance * self.ray), safe_normalize(normal), hit
@@ -64,10 +63,9 @@ class TraceContext:
 class Reflectance:
     """A reflectance model: declares its inputs and shades points, as separate radiance terms.
 
-    Register one object per subclass. Attributes are the named values that a model computes per surfel: in
-    forward shading ("surfel") they are shaded and radiance is blended; in deferred shading ("pixel") they are
-    blended as slots of the G-buffer, divided by alpha, and shaded. Where traced rays hit the mesh, the model
-    shades the attributes of the surfels around the hit.
+    Register one object per subclass. In forward shading ("surfel") the `values` per surfel are shaded and
+    radiance is blended; in deferred shading ("pixel") they are blended, divided by alpha, and shaded. Where
+    traced rays hit the mesh, the model shades the attributes of the surfels around the hit.
     """
 
     name: str = ""
@@ -79,7 +77,7 @@ class Reflectance:
     honoured: tuple[str, ...] = ()  # names of the QUALITY options that it honours
 
     def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
-        """Names of the attributes beside the geometry that the surfels must have."""
+        """Attributes beside the geometry that the surfels must have."""
         raise NotImplementedError
 
     def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
@@ -103,10 +101,7 @@ class Reflectance:
         raise NotImplementedError
 
     def relit(self, options: ShadingOptions) -> ShadingOptions | None:
-        """The options with which the model shows a fit under another light; None: it cannot.
-
-        Here without the diffuse colours that were fitted, unless the model requires them.
-        """
+        """The options with which the model shows a fit under another light; None: it cannot."""
         options = replace(options, diffuse="irradiance")
         lit = {*LIT}.intersection(self.required_attributes(options))
         return None if lit or self.light == "none" else options
@@ -114,8 +109,7 @@ class Reflectance:
     def textures(self, values: Mapping[str, Any]) -> dict[str, Any] | None:
         """Albedo, metallic and roughness of `split_sum` that reflect as attributes `values`, both by name.
 
-        They are what meshes are baked to and decompositions compared by. Plain arithmetic: values are Dr.Jit
-        arrays, or images in NumPy. None: there are none, and such exports are refused.
+        Plain arithmetic: values are Dr.Jit arrays, or images in NumPy. None: exports to meshes are refused.
         """
         return None
 
@@ -123,9 +117,8 @@ class Reflectance:
 def require_complete(model: Reflectance) -> None:
     """Raise InputError for a model that cannot render: a method is missing, or a value does not exist."""
     if not isinstance(model, Reflectance):
-        raise InputError(
-            "give an object of a subclass of Reflectance", "reflectance model", abbreviated(model)
-        )
+        what = "give an object of a subclass of Reflectance"
+        raise InputError(what, "reflectance model", abbreviated(model))
     traced = ("trace",) if model.visibility == "own" else ()
     sampled = ("lobe",) if "visibility_rays" in model.honoured else ()
     for name in ("required_attributes", "values", "shade", *traced, *sampled):
@@ -138,15 +131,9 @@ def require_complete(model: Reflectance) -> None:
         ("honoured", model.honoured, QUALITY),
     ):
         if not {*values} <= {*allowed}:
-            raise InputError(
-                f"{name}: {abbreviated(getattr(model, name))} is not allowed",
-                "reflectance model",
-                model.name,
-                f"use {' or '.join(allowed)}",
-            )
+            what = f"{name}: {abbreviated(getattr(model, name))} is not allowed"
+            raise InputError(what, "reflectance model", model.name, f"use {' or '.join(allowed)}")
 
 
 MODELS: Registry[Reflectance] = Registry("reflectance model", require_complete)
 """Every model by name. The first one whose attributes the surfels have is the plugin's default."""
-
-register, unregister = MODELS.register, MODELS.unregister

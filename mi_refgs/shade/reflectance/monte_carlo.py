@@ -55,7 +55,7 @@ class MonteCarlo(Reflectance):
         return {"albedo": base, "metallic": 0 * roughness, "roughness": roughness}
 
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-        """The points with `free` (mi.UInt64, detached): bit j says that light arrives from direction j."""
+        """The points with `free` (mi.UInt64): bit j says that light arrives from direction j."""
         count = dr.opaque(mi.UInt32, options.directions)
         normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(points.position)
 
