@@ -16,7 +16,7 @@ from benchmarks.common.setup import ALBEDO, Setup, path_tracer
 from benchmarks.common.view import BUILT_IN, ROOT, Light, Look, Points
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.split_sum import shade
+from mi_refgs.shade.reflectance.split_sum import shade
 
 MESHES = ROOT / "scenes" / "meshes"
 

@@ -18,9 +18,9 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance import TraceContext
+from mi_refgs.shade.reflectance.split_sum import shade
 from mi_refgs.shade.reflection import reflection
 from mi_refgs.shade.shading import Shading
-from mi_refgs.shade.split_sum import shade
 from mi_refgs.splat import Camera
 
 TIMED_ROUGHNESS = 0.3

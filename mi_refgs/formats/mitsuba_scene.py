@@ -18,7 +18,7 @@ from mi_refgs.io.images import srgb_from_linear, write_png
 from mi_refgs.render.scene_xml import add_sensor, put, write_xml
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.brdf import split_sum
-from mi_refgs.shade.split_sum import DIELECTRIC_F0
+from mi_refgs.shade.reflectance.split_sum import DIELECTRIC_F0
 
 MAX_DEPTH = 6  # edges of a path, as in `refgs dataset`
 SAMPLES = 256  # samples per pixel by default; -D spp=16 on Mitsuba's command line chooses others

@@ -16,7 +16,7 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.shade.brdf import device_table, split_sum
-from mi_refgs.shade.split_sum import DIELECTRIC_F0
+from mi_refgs.shade.reflectance.split_sum import DIELECTRIC_F0
 from mi_refgs.types import Color3f, Float
 
 ROUGHNESS_FLOOR = 0.01

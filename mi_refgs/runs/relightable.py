@@ -22,10 +22,9 @@ from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance.model import LIT
-from mi_refgs.shade.reflectance.split_sum import SplitSum
+from mi_refgs.shade.reflectance.split_sum import DIELECTRIC_F0, SplitSum
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.shade.shading import RELIT_RAYS
-from mi_refgs.shade.split_sum import DIELECTRIC_F0
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 

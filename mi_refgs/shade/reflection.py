@@ -19,22 +19,12 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance.model import MODELS, SurfelView, TraceContext
-from mi_refgs.shade.split_sum import lookup_direction
+from mi_refgs.shade.reflectance.split_sum import lookup_direction
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Array, Bool, Color3f, Float, Point2f, Point3f, UInt32, Vector3f
 
 CLAMP_MAX_ALPHA = 1 / 3  # α from which single bright rays are not clamped: at 0.36 it adds 15 % of relMSE
-
-
-def mirror_visibility(context: TraceContext, normal: Vector3f, view: Vector3f) -> Float:
-    """Whether the light is visible in the mirror direction (0 or 1), detached; 1 where nothing is traced."""
-    with dr.suspend_grad():
-        point, facing, hit = context.start(normal)
-        visibility = context.occluder.visible(point, reflect(view=view, normal=facing), facing, hit)
-        # Now, once: every kernel of the adjoint that reads it would trace the rays again.
-        dr.eval(visibility)
-        return visibility
 
 
 @dataclass(frozen=True)
@@ -145,25 +135,25 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
     `options.traced_bounces` replaces `points.indirect` by the mean radiance of what blocked rays hit, whose
     gradient goes to the light and to the materials around all hits; rays, hits and clamps are detached.
     """
-    occluder, normal = context.occluder, dr.detach(points.normal)
-    if options.visibility_rays == 1 and not options.traced_bounces:
-        return points.replaced(visibility=mirror_visibility(context, normal, points.view))
-    if occluder.empty:
+    occluder, scene, bounces = context.occluder, None, options.traced_bounces
+    sampled = options.visibility_rays > 1
+    if occluder.empty and (sampled or bounces):
         return points.replaced(visibility=dr.full(mi.Float, 1, dr.width(context.ray)), indirect=None)
-    scene = None
-    if options.traced_bounces:
+    if bounces:
         assert context.light is not None  # by `Shading.require_inputs`
         scene = MeshRadiance.of(occluder, context.surfels, context.light, options, occluder.ambient)
     with dr.suspend_grad():
-        start = context.start(normal)
-    if options.visibility_rays > 1:
+        start = point, facing, seen = context.start(dr.detach(points.normal))
+        mirror = reflect(view=points.view, normal=facing)
+    if sampled:
         visibility, indirect = _average(points, context, scene, start, options)
+    elif scene is None:
+        with dr.suspend_grad():
+            visibility = occluder.visible(point, mirror, facing, seen)
+        dr.eval(visibility)  # now, once: every kernel of the adjoint that reads it would trace the rays again
     else:
-        assert scene is not None
-        point, facing, seen = start
-        mirror = dr.detach(reflect(view=points.view, normal=facing))
-        hit = scene.trace(point, mirror, facing, seen, options.traced_bounces)
-        dr.eval(hit)  # now, once, as for the visibility alone
+        hit = scene.trace(point, mirror, facing, seen, bounces)
+        dr.eval(hit)
         visibility = dr.select(hit.valid, mi.Float(0), mi.Float(1))
         indirect = dr.select(hit.valid, scene.radiance(hit, mirror), 0)
     if scene is None:

@@ -78,9 +78,7 @@ def test_gradients_reach_what_a_parameter_is_made_from() -> None:
         assert abs(dr.grad(optimizer["gain"])[0]) > 0
         optimizer.step()
         losses.append(float(loss.array[0]))
-    assert losses[-1] < losses[0]
-    assert not dr.grad_enabled(mi.render(of))
-    assert not dr.grad_enabled(mi.render(of))
+    assert losses[-1] < losses[0] and not dr.grad_enabled(mi.render(of))
 
 
 def test_a_parameter_that_changes_nothing_has_tangent_zero() -> None:
@@ -129,12 +127,7 @@ def test_tangents_add_up_over_losses(
         return float(dr.forward_to(sum((weighed(name, leaf) for name in names), mi.Float(0)))[0])
 
     alone = {name: tangent(name) for name in ("image", "leaf", "parameter")}
-    for names in (
-        ("image", "leaf"),
-        ("parameter", "image", "leaf"),
-        ("image", "parameter"),
-        ("image", "image"),
-    ):
+    for names in (("parameter", "image", "leaf"), ("image", "parameter"), ("image", "image")):
         expected = sum(alone[name] for name in names)
         assert tangent(*names) == pytest.approx(expected, rel=1e-4, abs=1e-6), names
     assert alone["image"] != 0

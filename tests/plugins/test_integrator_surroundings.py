@@ -107,9 +107,3 @@ def test_lost_background_is_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / name).unlink()
     with pytest.raises(InputError, match=f"{name}: file: missing; restore it"):
         TrainedScene.read(tmp_path)
-
-
-def test_object_only_needs_surfels(tmp_path: Path) -> None:
-    (tmp_path / "plain.xml").write_text('<scene version="3.0.0"><sensor type="perspective"/></scene>')
-    command = ["render", tmp_path / "plain.xml", "-o", tmp_path / "x.exr", "--object"]
-    refused(command, "--object: the scene has no `refgs`")

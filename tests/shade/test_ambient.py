@@ -111,12 +111,6 @@ def test_rays_are_spread_as_the_cosine() -> None:
     assert cosine.min() > 0 and np.ptp(ω[:, 0] - normals, axis=0).min() > 0.05
 
 
-def test_one_ray_stands_for_its_part_of_the_hemisphere() -> None:
-    """π / K of the projected hemisphere is the solid angle 4 π α² of the lobe."""
-    for rays in (1, 16, 256):
-        assert 4 * ambient.ray_roughness(rays) ** 4 * rays == pytest.approx(1)
-
-
 def test_what_is_convex_gets_all_light() -> None:
     """Whatever the light; and where the pixel's ray misses the mesh too."""
     raw = raw_channels(4000)

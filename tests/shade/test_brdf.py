@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -104,25 +105,18 @@ def test_finite_outside_the_table() -> None:
 def test_cache_is_written_read_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     computed = brdf.table()
     calls: list[int] = []
-
-    def compute() -> np.ndarray:
-        calls.append(1)
-        return computed
-
-    monkeypatch.setattr(brdf, "compute_table", compute)
+    monkeypatch.setattr(brdf, "compute_table", lambda: calls.append(1) or computed)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    path = tmp_path / "mi_refgs" / brdf.CACHE_NAME
-    fresh = brdf.table.__wrapped__
-    np.testing.assert_array_equal(fresh(), computed)
-    assert path.is_file() and len(calls) == 1 and list(path.parent.iterdir()) == [path]
-    np.testing.assert_array_equal(fresh(), computed)
-    assert len(calls) == 1, "the second call should read the cache"
-    path.write_bytes(path.read_bytes()[:1000])
-    np.testing.assert_array_equal(fresh(), computed)
-    assert len(calls) == 2 and np.load(path).shape == computed.shape, "a damaged cache should be replaced"
-    np.save(path, np.zeros((2, 2)))
-    np.testing.assert_array_equal(fresh(), computed)
-    assert len(calls) == 3, "another array should not pass for the table"
+    path, fresh = tmp_path / "mi_refgs" / brdf.CACHE_NAME, brdf.table.__wrapped__
+    damage: list[Callable[[], object]] = [
+        lambda: path.write_bytes(path.read_bytes()[:1000]),
+        lambda: np.save(path, np.zeros((2, 2))),
+    ]
+    for count, change in ((1, None), (1, None), (2, damage[0]), (3, damage[1])):
+        if change is not None:
+            change()
+        np.testing.assert_array_equal(fresh(), computed)
+        assert len(calls) == count and [*path.parent.iterdir()] == [path]
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     np.testing.assert_array_equal(fresh(), computed)

@@ -11,11 +11,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.io.exr import write_exr
 from mi_refgs.reference import light as reference
 from mi_refgs.shade.light import envmap, lobe_matrices, prefilter
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from tests.helpers import level_maps, refused, unit, vector
+from tests.helpers import level_maps, refused, slow, unit, vector
 from tests.scenes.shading_points import exact_light
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -72,26 +71,6 @@ def test_exported_map_round_trip(rng: np.random.Generator, tmp_path: Path) -> No
     np.testing.assert_allclose(again.radiance().numpy(), light.radiance().numpy(), rtol=1e-6)
 
 
-def test_import_at_another_resolution_keeps_the_energy(rng: np.random.Generator, tmp_path: Path) -> None:
-    mi.Bitmap(rng.uniform(0, 1, (50, 90, 3)).astype(np.float32)).write(str(tmp_path / "odd.exr"))
-    image = np.array(mi.Bitmap(str(tmp_path / "odd.exr")))
-    mean = np.tensordot(lobe_matrices.row_areas(50), image.mean(1), 1)
-    for height in (16, 64):
-        radiance = EnvironmentLight.from_file(tmp_path / "odd.exr", height).radiance().numpy()
-        assert radiance.shape == (height, 2 * height, 3)
-        kept = np.tensordot(lobe_matrices.row_areas(height), radiance.mean(1), 1)
-        np.testing.assert_allclose(kept, mean, rtol=0.02)
-    assert EnvironmentLight.from_file(tmp_path / "odd.exr").height == 48
-
-
-def test_files_are_known_by_what_they_hold(tmp_path: Path) -> None:
-    write_exr(tmp_path / "grey.hdr", np.full((8, 16), 0.75))
-    mi.Bitmap(np.full((8, 16, 3), [0.5, 1, 2], np.float32)).write(str(tmp_path / "colour.hdr"))
-    for name, colour in (("grey", [0.75, 0.75, 0.75]), ("colour", [0.5, 1, 2])):
-        radiance = EnvironmentLight.from_file(tmp_path / f"{name}.hdr").radiance().numpy()
-        np.testing.assert_allclose(radiance, np.broadcast_to(colour, (8, 16, 3)), rtol=1e-2)
-
-
 def test_bad_input(tmp_path: Path) -> None:
     (tmp_path / "text.exr").write_text("not an image")
     refused(lambda: EnvironmentLight.from_file(tmp_path / "text.exr"), "text.exr: pixels")
@@ -118,12 +97,6 @@ def test_softplus_is_exact_positive_and_finite() -> None:
     np.testing.assert_allclose(dr.grad(raw), np.exp(-np.logaddexp(0, -x32)), atol=2e-5)
 
 
-def test_activation_and_its_inverse() -> None:
-    radiance = np.geomspace(1e-4, 1e5, 8 * 16 * 3).reshape(8, 16, 3)
-    shown = EnvironmentLight.from_radiance(radiance).radiance().numpy()
-    np.testing.assert_allclose(shown, radiance, rtol=1e-5)
-
-
 # ---------------- prefilter ----------------
 
 
@@ -137,17 +110,16 @@ def test_constant_light_stays_constant(height: int, rng: np.random.Generator) ->
         np.testing.assert_allclose(value.numpy(), 2.5, rtol=1e-5)
 
 
-def test_levels_against_brute_force(rng: np.random.Generator) -> None:
-    """Every level at texels around two suns, at the poles and anywhere, against quadrature of the whole
-    lobe."""
+@pytest.mark.parametrize("levels", [(2, 5), slow((0, 1, 3, 4, 6))])
+def test_levels_against_brute_force(levels: tuple[int, ...]) -> None:
+    """At texels around two suns and at the poles, against quadrature of the whole lobe."""
     h = 32
     radiance = sun_and_gradient(h)
-    light = EnvironmentLight.from_radiance(radiance).prefilter()
-    for roughness, level in zip(lobe_matrices.LEVEL_ROUGHNESS, level_maps(light)[1:], strict=True):
+    maps = level_maps(EnvironmentLight.from_radiance(radiance).prefilter())[1:]
+    for roughness, level in ((lobe_matrices.LEVEL_ROUGHNESS[k], maps[k]) for k in levels):
         rows = len(level)
         i, j = round((h // 3) * (rows - 1) / (h - 1)), int((h // 4 + 0.5) * rows / h)
-        texels = [(i, j), (i + 1, j), (0, 0), (3, rows), (rows - 1, 5)]
-        texels += [(int(a), int(b)) for a, b in rng.integers(0, rows, (1, 2))]
+        texels = [(i, j), (0, 0), (3, rows), (rows - 1, 5)]
         directions = [texel_direction(rows, *texel) for texel in texels]
         expected = np.array([reference.lobe_average(radiance, d, roughness) for d in directions])
         error = np.abs(level[*zip(*texels, strict=True)] - expected).max()
@@ -215,27 +187,6 @@ def test_prefilter_adjoint_and_tangent(height: int, rng: np.random.Generator) ->
     _, levels = prefilter.prefilter(radiance)
     tangent = dr.forward_to(levels)
     np.testing.assert_allclose(tangent, op.apply(x[::-1].reshape(radiance.shape)).ravel(), atol=1e-6)
-
-
-def test_second_call_compiles_nothing(rng: np.random.Generator) -> None:
-    d, r = vector(unit(rng.normal(size=(100, 3)))), mi.Float(rng.uniform(0, 1, 100).astype(np.float32))
-
-    def step(seed: float) -> None:
-        raw = mi.TensorXf(dr.full(mi.Float, seed, 16 * 32 * 3) + 0.1, (16, 32, 3))
-        dr.make_opaque(raw)
-        dr.enable_grad(raw)
-        light = EnvironmentLight(raw).prefilter()
-        dr.backward(light.specular(d, r) + light.irradiance(d))
-        dr.eval(dr.grad(raw))
-        dr.sync_thread()
-
-    step(0.1)
-    step(0.2)
-    launches, _, misses = dr.detail.launch_stats()
-    step(0.3)
-    later, _, later_misses = dr.detail.launch_stats()
-    assert later > launches, "the step should have run"
-    assert later_misses == misses
 
 
 # ---------------- lookups ----------------

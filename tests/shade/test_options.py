@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -18,23 +16,15 @@ from mi_refgs.reference.light import radiance_of
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.shade.points import reflect
-from mi_refgs.shade.shading import Shading
-from mi_refgs.shade.split_sum import shade
-from tests.helpers import slow, unit
+from mi_refgs.shade.reflectance.split_sum import shade
+from tests.helpers import slow
 from tests.scenes.integrator import check_derivatives, image, plane_mesh, raw_channels, scene
-from tests.scenes.shading_points import N, points_of, shading_values
+from tests.scenes.shading_points import points_of
 
 PLAIN = ShadingOptions(diffuse="irradiance")
 
 
 # ---------------- the settings ----------------
-
-
-def test_shading_survives_json() -> None:
-    shading = Shading(occlusion=True, dominant=True, visibility_rays=8, traced_bounces=3)
-    note = json.loads(json.dumps(asdict(shading)))
-    assert Shading(**note) == shading
 
 
 @pytest.mark.parametrize(
@@ -90,20 +80,6 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
         for options in (PLAIN, replace(PLAIN, dominant=True))
     )
     assert dominant < (0.8 if roughness < 0.6 else 0.5) * mirror
-
-
-def test_a_point_seen_from_behind_keeps_its_mirror_direction() -> None:
-    """With roughness 0 the dominant direction is the mirror direction, wherever the camera is."""
-    rng = np.random.default_rng(5)
-    values = shading_values(rng, ("albedo", "metallic", "roughness"))
-    values["roughness"] = np.zeros(N)
-    values["normal"] = unit(rng.normal(size=(N, 3)))
-    light = EnvironmentLight.from_radiance(rng.uniform(0.1, 3, (16, 32, 3))).prefilter()
-    points = points_of(values)
-    mirrored = shade(points, light, PLAIN).specular.numpy()
-    dominant = shade(points, light, replace(PLAIN, dominant=True)).specular.numpy()
-    np.testing.assert_allclose(dominant, mirrored, rtol=2e-4, atol=2e-4)
-    assert dr.all(dr.isfinite(reflect(points.view, points.normal)), axis=None)
 
 
 def test_properties_of_the_plugin(tmp_path: Path) -> None:

@@ -125,21 +125,22 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
 
 def lit(folder: Path, light: str) -> Any:
     """Radiance of the light of a short fit with this table."""
+    folder.mkdir()
     text = METHOD.replace('kind = "sun"\nelevation = 60', light)
     assert main(train_command(write_data(folder / "data"), folder / "run", method(folder, text))) == 0
     run: Any = mi_refgs.load(folder / "run")
     return run.trained.light.radiance().numpy()
 
 
-def test_a_constant_light_learns_one_colour(tmp_path: Path) -> None:
-    found = lit(tmp_path, 'kind = "constant"\nradiance = 0.7')
+def test_a_constant_light_learns_one_colour_and_a_known_one_none(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    found = lit(tmp_path / "constant", 'kind = "constant"\nradiance = 0.7')
     np.testing.assert_allclose(found, np.broadcast_to(found[0, 0], found.shape), rtol=1e-5)
     assert 1e-4 < np.abs(found - 0.7).max() < 0.3
-
-
-def test_a_known_light_stays_what_it_is(tmp_path: Path, rng: np.random.Generator) -> None:
     sky = rng.uniform(0.2, 1, (8, 16, 3)).astype(np.float32)
     write_exr(tmp_path / "sky.exr", sky)
-    np.testing.assert_allclose(lit(tmp_path, f'kind = "file"\nfile = "{tmp_path}/sky.exr"'), sky, rtol=1e-5)
+    known = lit(tmp_path / "known", f'kind = "file"\nfile = "{tmp_path}/sky.exr"')
+    np.testing.assert_allclose(known, sky, rtol=1e-5)
     with pytest.raises(InputError, match=r"light\.file"):
         LIGHTS["file"]().start()

@@ -118,18 +118,6 @@ def test_the_plugin_renders_and_differentiates_it(order: str) -> None:
     check_derivatives(of, "integrator.shininess")
 
 
-def test_the_picture_is_what_the_model_says() -> None:
-    """Under a constant light of 1 the radiance is albedo + SHARE: blending is linear."""
-    white = {"type": "constant", "radiance": 1.0}
-    of = scene(raw=raw(), reflectance="phong", shade_at="surfel", aovs="n:albedo,a:alpha", light=white)
-    seen = image(of)
-    alpha = seen[..., -1:]
-    full = alpha[..., 0] > 0.1
-    assert full.sum() > 20
-    expected = alpha * (seen[..., -4:-1] + SHARE)
-    np.testing.assert_allclose(seen[full][:, :3], expected[full], rtol=2e-3)
-
-
 def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     """`refgs train` with a table that names it; the exported surfels have the channel, and it has moved."""
     (tmp_path / "own.toml").write_text(METHOD)
@@ -141,6 +129,17 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     assert np.isfinite(moved).all() and np.ptp(moved) > 0
     rendered = mi.render(mi.load_file(str(tmp_path / "run" / "scene.xml")), spp=1).numpy()
     assert np.isfinite(rendered).all() and rendered.max() > 0.1
+    # Scored and relit by its model: twice the light is twice the image.
+    run = mi_refgs.load(tmp_path / "run")
+    assert run.evaluate()["psnr"] > 0
+    sky = np.full((8, 16, 3), 0.5, np.float32)
+    dim, bright = (run.relight(EnvironmentLight.from_radiance(factor * sky)) for factor in (1, 2))
+    assert dim.trained.shading.reflectance == "phong" and dim.trained.surfels.has("shininess")
+    once, twice = (np.asarray(relit.render(0))[..., :3] for relit in (dim, bright))
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-3, atol=1e-5)
+    assert once.max() > 0.05
+    scene = replace(run.trained, mesh=known_mesh())
+    refused(lambda: bake(scene, [], 200, 16), "reflectance: phong has no textures")
     # Without what it needs, the run is whole, and nothing is to be written or removed.
     reflectance.unregister("phong")
     command = ["train", data, "-o", tmp_path / "run", "--resume"]
@@ -165,24 +164,6 @@ def test_it_shades_what_traced_rays_hit() -> None:
     assert 0 < blocked.sum() < 40
     lit = found.indirect.numpy().T[blocked]
     assert all(np.allclose(x, albedo + SHARE, rtol=1e-4) or np.allclose(x, albedo, rtol=1e-4) for x in lit)
-
-
-def test_relit_it_stays_itself(tmp_path: Path) -> None:
-    """A run is scored and relit by its model, with all that the model requires; twice the light is twice the
-    image. What it is not asked to know, its materials for other programs, is refused."""
-    (tmp_path / "own.toml").write_text(METHOD)
-    data = write_data(tmp_path / "data")
-    assert main(train_command(data, tmp_path / "run", tmp_path / "own.toml")) == 0
-    run = mi_refgs.load(tmp_path / "run")
-    assert run.evaluate()["psnr"] > 0
-    sky = np.full((8, 16, 3), 0.5, np.float32)
-    dim, bright = (run.relight(EnvironmentLight.from_radiance(factor * sky)) for factor in (1, 2))
-    assert dim.trained.shading.reflectance == "phong" and dim.trained.surfels.has("shininess")
-    once, twice = (np.asarray(relit.render(0))[..., :3] for relit in (dim, bright))
-    np.testing.assert_allclose(twice, 2 * once, rtol=1e-3, atol=1e-5)
-    assert once.max() > 0.05
-    scene = replace(run.trained, mesh=known_mesh())
-    refused(lambda: bake(scene, [], 200, 16), "reflectance: phong has no textures")
 
 
 def test_textures_are_baked_and_compared() -> None:

@@ -248,13 +248,7 @@ def test_hemisphere_is_blocked_where_mesh_stands() -> None:
         np.testing.assert_array_equal([not free[k] >> j & 1 for j in range(DIRECTIONS)], blocked)
 
 
-def test_what_models_refuse() -> None:
-    with pytest.raises(InputError, match="gaussian_shader needs shading at surfel"):
-        Shading("pixel", "gaussian_shader")
-    with pytest.raises(InputError, match="'lambert' is unknown; use split_sum or"):
-        Shading(reflectance="lambert")
-    with pytest.raises(InputError, match="occlusion"):
-        Shading("surfel", "gaussian_shader", occlusion=True)
+def test_missing_radiance_is_refused() -> None:
     points = points_of(shading_values(np.random.default_rng(0), MATERIALS))
     with pytest.raises(InputError, match="radiance: missing"):
         shaded(points, EnvironmentLight.from_radiance(MAP), Shading())

@@ -10,7 +10,7 @@ import pytest
 
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.shade.split_sum import shade
+from mi_refgs.shade.reflectance.split_sum import shade
 from tests.helpers import slow, unit
 from tests.scenes.shading_points import exact_light, exact_terms, points_of, shading_values
 
@@ -30,37 +30,30 @@ def mirrored_to(view: np.ndarray, target: np.ndarray) -> np.ndarray:
     return unit(view + target)
 
 
-def case(name: str, rng: np.random.Generator) -> dict[str, Any]:
+def cases(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+    """Values of N points by name, each with some at an end."""
     names = ("albedo", "metallic", "roughness", "radiance", "visibility", "indirect")
     values = shading_values(rng, names, N)
     values |= {name: unit(values[name]) for name in ("normal", "view")}
     view = values["view"]
     across_the_seam = rng.normal(size=(N, 3)) * (1e-4, 1, 0) + [0, 0, -1]
-    cases: dict[str, dict[str, Any]] = {
-        "roughness 0": {"roughness": 0.0},
-        "roughness 1": {"roughness": 1.0},
-        "roughness 1e-6": {"roughness": 1e-6},
-        "metallic 0": {"metallic": 0.0},
-        "metallic 1": {"metallic": 1.0},
+    changed: dict[str, dict[str, Any]] = {
+        **{f"roughness {end}": {"roughness": end} for end in (0.0, 1.0, 1e-6)},
+        **{f"metallic {end}": {"metallic": end} for end in (0.0, 1.0)},
+        **{f"n·v = {cosine}": {"normal": tilted(view, cosine, rng)} for cosine in (1e-3, 0.0, -0.3)},
+        **{f"normals of length {length}": {"normal": length * values["normal"]} for length in (1e-9, 1e15)},
         "black albedo": {"albedo": 0.0, "metallic": 1.0},
-        "n·v = 1e-3": {"normal": tilted(view, 1e-3, rng)},
-        "n·v = 0": {"normal": tilted(view, 0.0, rng)},
-        "n·v < 0": {"normal": tilted(view, -0.3, rng)},
         "n = v": {"normal": view},
-        "normals of length 1e-9": {"normal": 1e-9 * values["normal"]},
-        "normals of length 1e15": {"normal": 1e15 * values["normal"]},
         "towards the axes": {"normal": mirrored_to(view, AXES[np.arange(N) % 6])},
         "beside the pole": {"normal": mirrored_to(view, unit(rng.normal(size=(N, 3)) * 0.01 + [0, 1, 0]))},
         "beside the map's seam": {"normal": mirrored_to(view, unit(across_the_seam))},
     }
-    return values | {key: np.broadcast_to(x, values[key].shape).copy() for key, x in cases[name].items()}
+    return {
+        name: values | {key: np.broadcast_to(x, values[key].shape).copy() for key, x in ends.items()}
+        for name, ends in changed.items()
+    }
 
 
-NAMES = (
-    "roughness 0, roughness 1, roughness 1e-6, metallic 0, metallic 1, black albedo, n·v = 1e-3, n·v = 0, "
-    "n·v < 0, n = v, normals of length 1e-9, normals of length 1e15, towards the axes, beside the pole, "
-    "beside the map's seam"
-).split(", ")
 LIGHTS = {
     "smooth": lambda rng: rng.uniform(0.1, 3, (16, 32, 3)),
     "a peak of 1e6": lambda rng: np.where(rng.random((16, 32, 1)) < 0.01, 1e6, 0.3) * np.ones(3),
@@ -83,8 +76,7 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
     radiance[[0, -1]] = radiance[[0, -1]].mean(axis=1, keepdims=True)  # a pole has no azimuth, so one colour
     prefiltered = EnvironmentLight.from_radiance(radiance).prefilter()
     exact, options = exact_light(prefiltered), ShadingOptions(diffuse=diffuse)
-    for name in NAMES:
-        values = case(name, rng)
+    for name, values in cases(rng).items():
         made = points_of(values)
         keys = ("albedo", "metallic", "radiance", "roughness", "normal")
         leaves = {key: getattr(made, key) for key in keys}

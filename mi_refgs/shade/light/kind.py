@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from mi_refgs.registry import Registry
-from mi_refgs.shade.light.envmap import FittedLight
+from mi_refgs.shade.light.envmap import EnvironmentLight, FittedLight
 from mi_refgs.types import TensorXf
 
 
@@ -28,8 +28,8 @@ class LightKind:
         raise NotImplementedError
 
     def of(self, raw: TensorXf) -> FittedLight:
-        """The light of raw values, under AD."""
-        raise NotImplementedError
+        """The light of raw values, under AD; unless it is overridden, an environment map."""
+        return EnvironmentLight(raw)
 
 
 LIGHTS: Registry[type[LightKind]] = Registry("light")

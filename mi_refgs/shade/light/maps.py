@@ -25,9 +25,6 @@ class Learnt(LightKind):
     def start(self) -> TensorXf:
         return EnvironmentLight.constant(self.radiance, self.height).raw
 
-    def of(self, raw: TensorXf) -> EnvironmentLight:
-        return EnvironmentLight(raw)
-
 
 @dataclass(frozen=True)
 class Known(LightKind):
@@ -43,6 +40,3 @@ class Known(LightKind):
         if not self.file:
             raise InputError("none is named", field="light.file", remedy="give an EXR or HDR file")
         return EnvironmentLight.from_file(self.file, self.height).raw
-
-    def of(self, raw: TensorXf) -> EnvironmentLight:
-        return EnvironmentLight(raw)

@@ -1,24 +1,98 @@
-"""The model of Ref-Gaussian: diffuse radiance under a GGX layer, lit by a split sum. [Yao 2025, §3.2-3.3]"""
+"""The model of Ref-Gaussian: diffuse radiance under a GGX layer, lit by a split sum.
+
+Points have albedo (mi.Color3f, 0 … 1: diffuse reflectance, or F0 of a metal), metallic (mi.Float, 0 … 1) and
+roughness (mi.Float, 0 … 1, α = roughness²); for diffuse="sh" also radiance (mi.Color3f), as fitted.
+
+[Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from mi_refgs.shade import split_sum
+import drjit as dr
+import mitsuba as mi
+
+from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, Float
 
 MATERIALS = ("albedo", "metallic", "roughness")  # attributes of the surface under the light
+DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of a dielectric (index of refraction 1.5)
+SMOOTHNESS_FLOOR = 1e-12  # least 1 - α in √(1 - α), whose slope is infinite at α = 1
+
+
+def base_reflectance(points: ShadingPoints) -> mi.Color3f:
+    """F0: reflectance at normal incidence, between a dielectric's and the metal's albedo."""
+    return dr.fma(points.albedo - DIELECTRIC_F0, points.metallic, DIELECTRIC_F0)
+
+
+def lookup_direction(
+    normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, options: ShadingOptions
+) -> mi.Vector3f:
+    """Unit direction in which the prefiltered light is looked up: mirrored, or dominant. Unit vectors in.
+
+    The dominant one is near the peak of the GGX lobe: with α = roughness² and s = 1 - α it lies s (√s + α) of
+    the way from the normal to the mirror direction. [Lagarde and de Rousiers 2014, "Moving Frostbite to
+    Physically Based Rendering", §4.9.3]
+    """
+    mirror = reflect(view, normal)
+    if not options.dominant:
+        return mirror
+    α = dr.square(dr.clip(roughness, 0, 1))
+    smooth = 1 - α
+    mirrored = smooth * (dr.sqrt(dr.maximum(smooth, SMOOTHNESS_FLOOR)) + α)
+    return safe_normalize(dr.lerp(normal, mirror, mirrored))
+
+
+def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
+    """Outgoing radiance towards the camera, as separate terms.
+
+    With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
+    r (`lookup_direction`): specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse =
+    (1 - metallic) radiance ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ambient ("irradiance"; see
+    `shade.ambient`). A point seen from behind keeps its mirror direction, with the reflectance at grazing
+    incidence. Under a constant light of 1 no more than 1 leaves with "irradiance".
+
+    Finite for every finite input. Raises InputError for "sh" without a radiance.
+    """
+    # Directional reflectance, and the light in the specular lobe.
+    normal, view = safe_normalize(points.normal), safe_normalize(points.view)
+    f0 = base_reflectance(points)
+    scale, bias = split_sum(dr.dot(normal, view), points.roughness)
+    reflectance = dr.fma(f0, scale, bias)
+    direction = lookup_direction(normal, view, points.roughness, options)
+    specular = light.specular(direction, points.roughness) * reflectance
+
+    # Visibility of that light, and what blocks it.
+    indirect = None
+    visibility, blocking = points.get("visibility"), points.get("indirect")
+    if visibility is not None:
+        specular *= visibility
+        if blocking is not None:
+            indirect = (1 - visibility) * blocking * reflectance
+
+    # Diffuse base under the specular layer.
+    if options.diffuse == "irradiance":
+        # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
+        transmitted = dr.maximum(1 - reflectance, 0)
+        incident = light.irradiance(normal)
+        if (ambient := points.get("ambient")) is not None:
+            incident *= ambient
+        diffuse = transmitted * (1 - points.metallic) * points.albedo * incident
+    else:
+        diffuse = (1 - points.metallic) * points.radiance
+    return RadianceTerms(diffuse, specular, indirect)
 
 
 class SplitSum(Reflectance):
-    """The equations of `shade.split_sum`, with what mirror rays find (`shade.reflection`)."""
+    """The split sum, with what mirror rays find (`shade.reflection`)."""
 
     name = "split_sum"
     visibility = "mirror"
@@ -39,10 +113,10 @@ class SplitSum(Reflectance):
         return values
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
-        return split_sum.shade(points, light, options)
+        return shade(points, light, options)
 
     def lobe(self, points: ShadingPoints) -> tuple[Float, Color3f]:
-        return points.roughness, split_sum.base_reflectance(points)
+        return points.roughness, base_reflectance(points)
 
     def textures(self, values: Mapping[str, Any]) -> dict[str, Any]:
         return {name: values[name] for name in MATERIALS}
