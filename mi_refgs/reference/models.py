@@ -56,7 +56,7 @@ Model = Callable[[Points, Light | None, Options, Taps], list[Array]]
 
 
 def split_sum(points: Points, light: Light | None, options: Options, taps: Taps) -> list[Array]:
-    """Model of `reflectance.split_sum`: GGX by a prefiltered light and a table, diffuse by SH or irradiance."""
+    """GGX by a prefiltered light and a table, diffuse by SH or irradiance (`reflectance.split_sum`)."""
     assert light is not None
     n, v, values = unit(points.normal), unit(points.view), points.values
     albedo, metallic, roughness = values["albedo"], values["metallic"], values["roughness"][:, 0]

@@ -165,8 +165,8 @@ AOVS = "nn:normal,d:depth,a:albedo"
 @pytest.mark.parametrize("kind", ["crop", *map(slow, ("occlusion", "antialias", "open"))])
 def test_derivatives_are_those_of_differences(kind: str, tmp_path: Path) -> None:
     """Supersampled images and their AOVs."""
-    mesh = {"mesh": plane_mesh(tmp_path), "visibility_rays": 2}
-    options: dict[str, Any] = {"occlusion": mesh, "antialias": {"antialias": True}}.get(kind, {})
+    mesh: dict[str, Any] = {"mesh": plane_mesh(tmp_path), "visibility_rays": 2}
+    options = {"occlusion": mesh, "antialias": {"antialias": True}}.get(kind, {})
     make, eye = open_scene if kind == "open" else scene, sensor(film=CROP if kind == "crop" else {})
     moved = Moved(make(eye, aovs=AOVS, **options))
 

@@ -105,7 +105,12 @@ def test_finite_outside_the_table() -> None:
 def test_cache_is_written_read_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     computed = brdf.table()
     calls: list[int] = []
-    monkeypatch.setattr(brdf, "compute_table", lambda: calls.append(1) or computed)
+
+    def compute() -> np.ndarray:
+        calls.append(1)
+        return computed
+
+    monkeypatch.setattr(brdf, "compute_table", compute)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     path, fresh = tmp_path / "mi_refgs" / brdf.CACHE_NAME, brdf.table.__wrapped__
     damage: list[Callable[[], object]] = [

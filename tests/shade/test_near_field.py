@@ -106,6 +106,6 @@ def test_file(tmp_path: Path) -> None:
         ({"centre": np.full(3, np.nan), "nearness": np.ones((4, 8))}, "not finite"),
         ({"centre": CENTRE, "nearness": np.ones((4, 9))}, "shapes"),
     ):
-        np.savez(path, **values)  # type: ignore[arg-type]
+        np.savez(path, **values)
         with pytest.raises(InputError, match=rf"near_field\.npz: near field: .*{words}"):
             NearField.read(path)
