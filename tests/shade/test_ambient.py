@@ -12,22 +12,19 @@ import pytest
 import trimesh
 
 from mi_refgs.errors import InputError
-from mi_refgs.occlusion.mesh import Mesh, read_mesh
+from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.reference.light import specular
 from mi_refgs.reference.occlusion import ambient as exact
-from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade import ambient
 from mi_refgs.shade.ggx_sampling import lobe_turn
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflection import TraceContext
-from mi_refgs.shade.shading import Shading
-from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import unit, vector
 from tests.scenes.corner import VOXEL, corner, gradient_sky, wall_surfels
-from tests.scenes.integrator import HEIGHT, WIDTH, hollow_mesh, plane_mesh, raw_channels, sensor, sky
+from tests.scenes.integrator import hollow_mesh, raw_channels, sensor, sky
 from tests.scenes.shading_points import exact_light, exact_terms
 
 RAYS = 12
@@ -144,28 +141,6 @@ def test_pixels_read_what_the_mesh_holds() -> None:
     np.testing.assert_allclose(ratio.numpy().T, expected, atol=1e-5)
     occluder.update(mesh)
     assert occluder.ambient is None
-
-
-def test_the_diffuse_term_is_multiplied_and_nothing_else(tmp_path: Path) -> None:
-    mesh, surfels = read_mesh(plane_mesh(tmp_path)), Surfels.from_numpy(raw_channels())
-    light = EnvironmentLight.from_radiance(sky()).prefilter()
-    occluder = Occluder(mesh)
-    pose = np.array(sensor()["to_world"].matrix)
-    camera = Camera.from_pose(WIDTH, HEIGHT, -18, -18, WIDTH / 2, HEIGHT / 2, pose)
-
-    def terms(rays: int) -> Any:
-        shading = Shading(diffuse="irradiance", occlusion=True, ambient_rays=rays)
-        return render(SurfelScene(surfels, shading, light, occluder), camera).terms
-
-    plain = terms(0)
-    occluder.ambient = ambient.VertexColours.of(mesh, np.full(mesh.vertices.shape, [0.5, 0.25, 2.0]))
-    half = terms(8)
-    factor = half.diffuse.numpy() / np.maximum(plain.diffuse.numpy(), 1e-9)
-    met = (np.abs(factor - 1).max(0) > 1e-3) & (plain.diffuse.numpy().min(0) > 1e-6)
-    assert 0 < met.mean() < 1
-    np.testing.assert_allclose(factor[:, met].T, np.tile([0.5, 0.25, 2.0], (met.sum(), 1)), rtol=1e-4)
-    for name in ("specular", "indirect"):
-        np.testing.assert_array_equal(getattr(half, name).numpy(), getattr(plain, name).numpy())
 
 
 def test_the_plugin_follows_its_parameters(tmp_path: Path) -> None:
