@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
 
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
@@ -106,21 +105,6 @@ def test_rays_are_spread_as_the_cosine() -> None:
     np.testing.assert_allclose((cosine**2).mean(1), 0.5, atol=1e-3)
     np.testing.assert_allclose(ω.mean(1), 2 / 3 * normals, atol=0.02)
     assert cosine.min() > 0 and np.ptp(ω[:, 0] - normals, axis=0).min() > 0.05
-
-
-def test_what_is_convex_gets_all_light() -> None:
-    """Whatever the light; and where the pixel's ray misses the mesh too."""
-    raw = raw_channels(4000)
-    x, y, z = raw["position"].T
-    raw["rotation"] = np.stack([-y, x, 0 * x, 1 + z], 1)  # without noise
-    shape = trimesh.creation.icosphere(subdivisions=2, radius=0.7)
-    ball = Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32), 0.02)
-    surfels = Surfels.from_numpy(raw)
-    occluder = with_ratios(ball, surfels, EnvironmentLight.from_radiance(sky()).prefilter())
-    np.testing.assert_allclose(occluder.ambient.numpy(), 1, atol=1e-6)
-    origin, ray = mi.Point3f(0, 0, 3), mi.Vector3f([0.0, 0.4, 0.1], [0.0, 0.4, 0], [-1.0, -1, -2])
-    ratio = ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, origin, ray))
-    np.testing.assert_allclose(ratio.numpy(), np.ones((3, 3)), atol=1e-6)
 
 
 def test_pixels_read_what_the_mesh_holds() -> None:

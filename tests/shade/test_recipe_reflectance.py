@@ -6,7 +6,6 @@ One channel, one class and two `register`s are all that is added.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ SHARE = 0.3  # of the light that the lobe reflects
 class Phong(Reflectance):
     """albedo irradiance(n), and a lobe about the mirror direction that narrows with the shininess.
 
-    The mesh blocks the lobe, and is shaded where it does.
+    The mesh blocks the lobe, and is shaded where it does. Other programs show a rough dielectric.
     """
 
     name = "phong"
@@ -67,6 +66,10 @@ class Phong(Reflectance):
             lobe *= points.visibility
         return RadianceTerms(points.albedo * light.irradiance(normal), lobe, indirect)
 
+    def textures(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        dull = 1 - values["shininess"]
+        return {"albedo": values["albedo"], "metallic": 0 * dull, "roughness": dull}
+
 
 METHOD = """
 iterations = 2000
@@ -84,23 +87,11 @@ reflectance = "phong"
 def phong() -> Iterator[None]:
     attributes.register(SHININESS)
     reflectance.register(Phong())
-    reflectance.register(Velvet())
     yield
-    reflectance.unregister("velvet")
     if "phong" in reflectance.MODELS:
         reflectance.unregister("phong")
     if "shininess" in attributes.ATTRIBUTES:
         attributes.ATTRIBUTES.unregister("shininess")
-
-
-class Velvet(Phong):
-    """Phong's model, which other programs show as a rough dielectric."""
-
-    name = "velvet"
-
-    def textures(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        dull = 1 - values["shininess"]
-        return {"albedo": values["albedo"], "metallic": 0 * dull, "roughness": dull}
 
 
 def raw() -> dict[str, np.ndarray]:
@@ -138,8 +129,6 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     once, twice = (np.asarray(relit.render(0))[..., :3] for relit in (dim, bright))
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-3, atol=1e-5)
     assert once.max() > 0.05
-    scene = replace(run.trained, mesh=known_mesh())
-    refused(lambda: bake(scene, [], 200, 16), "reflectance: phong has no textures")
     # Without what it needs, the run is whole, and nothing is to be written or removed.
     reflectance.unregister("phong")
     command = ["train", data, "-o", tmp_path / "run", "--resume"]
@@ -170,7 +159,7 @@ def test_textures_are_baked_and_compared() -> None:
     """What a model says of itself reaches textures, and the maps that evaluations compare."""
     raw = {name: x for name, x in known_surfels().raw.items() if name != "metallic"}
     raw["shininess"] = raw.pop("roughness")
-    light, shading = EnvironmentLight.constant(0.5, 8), Shading(reflectance="velvet", diffuse="irradiance")
+    light, shading = EnvironmentLight.constant(0.5, 8), Shading(reflectance="phong", diffuse="irradiance")
     scene = TrainedScene(Surfels(raw), light, known_mesh(), shading, 1, 0.0)
     camera = Camera.look_at([0.3, -3, 1], size=32)
     baked = bake(scene, [Shot("a", "train", camera)], 200, 16)
@@ -181,9 +170,6 @@ def test_textures_are_baked_and_compared() -> None:
     view = RenderedView(np.zeros((32, 32, 3)), np.zeros((32, 32)), np.zeros((32, 32, 3)), rendered)
     maps = material_maps(scene)(camera, view)
     np.testing.assert_array_equal(maps["roughness"], 1 - rendered["shininess"])
-    assert material_maps(replace(scene, shading=replace(shading, reflectance="phong")))(
-        camera, view
-    ).keys() == {"shininess"}
 
 
 @pytest.mark.parametrize("aov, widths", [("S", (1,)), ("RGB", (1,)), ("Y", (3,))])
