@@ -13,9 +13,6 @@ import textwrap
 from mi_refgs.plugins import PLUGINS
 from site_pages import ROOT, table
 
-FLAGS = {"exposed": "in `mi.traverse`", "differentiable": "differentiable"}
-"""Flags of a parameter, as this page says them."""
-
 
 def page() -> str:
     """One section a plugin."""
@@ -56,16 +53,13 @@ def inline(text: str) -> str:
 
 
 def parameters(block: str) -> str:
-    """The table of a `pluginparameters` directive: name, type, meaning; flags are put to the type."""
+    """The table of a `pluginparameters` directive, from its list of `name (type): meaning`."""
     rows = []
-    for entry in re.split(r"\n *\* - ", block)[1:]:
-        name, kind, *rest = (" ".join(part.split()) for part in re.split(r"\n *- ", entry))
+    for entry in re.split(r"\n *\* ", block)[1:]:
+        found = re.fullmatch(r"(.*?) \((.*?)\): (.*)", " ".join(entry.split()))
+        assert found, entry
+        name, kind, meaning = found.groups()
         names, _, other = name.partition(" *")
-        kind = inline(re.sub(r"\|(\w+)\|", r"\1", kind))
-        meaning, flags = (rest[0], rest[1:]) if rest and not rest[0].startswith("|") else ("", rest)
-        meaning = inline(re.sub(r"\|(\w+)\|", r"\1", meaning))
-        words = [FLAGS[flag] for flag in re.findall(r"\|(\w+)\|", " ".join(flags))]
-        shown = ", ".join(f"`{part.strip()}`" for part in names.split(","))
-        shown += f" *{other}" if other else ""
-        rows.append([shown, "; ".join([kind, *words]), meaning])
+        shown = ", ".join(f"`{part.strip()}`" for part in names.split(",")) + (f" *{other}" if other else "")
+        rows.append([shown, kind, inline(meaning)])
     return "\n" + table(["parameter", "type", "meaning"], rows) + "\n"

@@ -58,19 +58,12 @@ class RefGSBSDF(mi.BSDF):
 
     .. pluginparameters::
 
-     * - albedo
-       - |spectrum| or |texture|
-       - Diffuse reflectance, or that of a metal at normal incidence; 0 to 1. (Default: 0.5)
-       - |exposed|, |differentiable|
-     * - metallic
-       - |float| or |texture|
-       - From 0, a dielectric that reflects 0.04 at normal incidence, to 1, a metal without diffuse
-         reflection. (Default: 0)
-       - |exposed|, |differentiable|
-     * - roughness
-       - |float| or |texture|
-       - In (0, 1]; GGX's α is its square. Below 0.01 it counts as 0.01, above 1 as 1. (Default: 0.5)
-       - |exposed|, |differentiable|
+     * albedo (spectrum or texture, differentiable): Diffuse reflectance, or that of a metal at normal
+       incidence; 0 to 1. (Default: 0.5)
+     * metallic (float or texture, differentiable): From 0, a dielectric that reflects 0.04 at normal
+       incidence, to 1, a metal without diffuse reflection. (Default: 0)
+     * roughness (float or texture, differentiable): In (0, 1]; GGX's α is its square. Below 0.01 it counts as
+       0.01, above 1 as 1. (Default: 0.5)
 
     The `refgs` integrator (``reflectance = split_sum``, ``diffuse = irradiance``) approximates the integral
     of the light times

@@ -17,8 +17,7 @@ from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.splat.camera import Camera
 
 Channels = Callable[[Frame, Camera, bool], list[Any]]
-"""Function of a frame, its camera and whether the film has alpha. Returns R, G, B, (A), the weight and the
-AOVs, in the order of the film's blocks; arrays of one value per pixel or one in all."""
+"""R, G, B, (A), the weight and the AOVs of a frame, of width N or 1; the last argument: with alpha or not."""
 
 
 @dataclass(frozen=True)

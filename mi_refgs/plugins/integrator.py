@@ -43,77 +43,45 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     .. pluginparameters::
 
-     * - filename
-       - |string|
-       - PLY file with surfels or 3D Gaussians: raw values (before the activation) of 2DGS or 3DGS and of the
-         attributes below. In Python, tensors may add or replace attributes.
-     * - light *or any name*
-       - |emitter|
-       - An ``envmap`` or ``constant`` emitter, copied into the integrator's own light; in Python also the raw
-         tensor of an ``EnvironmentLight``. (Default: the scene's environment emitter of these types)
-     * - near_field
-       - |string|
-       - File (.npz) with ``nearness`` (h, 2h), 1 / distance of what an unrotated ``envmap`` shows, seen from
-         the point ``centre`` (3,). (Default: infinitely far)
-     * - mesh
-       - |string|
-       - PLY file of the mesh that occludes mirror reflections. (Default: none)
-     * - occlusion
-       - |bool|
-       - Trace the visibility of the light, with the surfels' indirect light where it is blocked.
-         (Default: whether there is a ``mesh``)
-     * - shade_at
-       - |string|
-       - ``pixel`` (deferred: blend attributes, then shade) or ``surfel`` (forward: shade, then blend
-         radiance). (Default: the first that the reflectance model has)
-     * - reflectance
-       - |string|
-       - ``split_sum`` (diffuse and GGX specular), ``radiance`` (SH colour, needs no light), ``mirror``
-         (3DGS-DR), ``gaussian_shader``, ``monte_carlo`` (R3DG), ``displayed`` (encoded SH colours of a
-         splat), or a registered model. (Default: the first whose attributes the surfels have)
-     * - diffuse
-       - |string|
-       - ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times the light that the specular term
-         leaves). (Default: ``sh`` if there is one)
-     * - dominant, antialias
-       - |bool|
-       - Slower and more accurate: look the light up along the GGX lobe's dominant direction; average
-         reflections over each pixel, at interpolated normals. (Default: false)
-     * - visibility_rays, traced_bounces, ambient_rays
-       - |int|
-       - Specular-lobe samples of the visibility, 1 is the mirror ray; traced bounces, in place of indirect
-         light; rays per mesh vertex for diffuse visibility, with ``irradiance``. (Default: 1, 0, 0)
-     * - directions
-       - |int|
-       - Directions that ``monte_carlo`` samples. (Default: 24)
-     * - surroundings
-       - |string|
-       - PLY file with the surfels around the object, splatted with it: geometry and ``radiance_sh``. Also
-         tensors, ``surroundings_position`` and so on. (Default: none)
-     * - background
-       - |color| or |string|
-       - Linear radiance behind the surfels, or a lat-long map of it (EXR, HDR; in Python also a raw tensor as
-         of ``light``); alpha is then 1. (Default: none, transparent)
-     * - aovs
-       - |string|
-       - Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator. Types: ``albedo``,
-         ``metallic``, ``roughness``, ``tint``, ``normal`` (world, towards the camera), ``depth``, ``alpha``,
-         ``visibility``, ``diffuse``, ``specular``, ``indirect``, registered attributes. (Default: none)
-     * - position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh, tint,
-         normal_offset *or any registered attribute*
-       - |tensor|
-       - Raw attributes (N, D); all in one update, N may change. Three columns of ``scale``: 3D Gaussians.
-       - |exposed|, |differentiable|
-     * - light
-       - |tensor|
-       - Raw map (h, w, 3) of the integrator's own light: radiance = ``EnvironmentLight(raw).radiance()``.
-       - |exposed|, |differentiable|
-     * - surroundings_position, …, surroundings_radiance_sh, background
-       - |tensor|
-       - Raw attributes of the surroundings, and raw map of the background as of ``light``, if there are any.
-       - |exposed|, |differentiable|
+     * filename (string): PLY file with surfels or 3D Gaussians: raw values (before the activation) of 2DGS or
+       3DGS and of the attributes below. In Python, tensors may add or replace attributes.
+     * light *or any name* (emitter): An ``envmap`` or ``constant`` emitter, copied into the integrator's own
+       light; in Python also the raw tensor of an ``EnvironmentLight``. (Default: the scene's environment
+       emitter of these types)
+     * near_field (string): File (.npz) with ``nearness`` (h, 2h), 1 / distance of what an unrotated
+       ``envmap`` shows, seen from the point ``centre`` (3,). (Default: infinitely far)
+     * mesh (string): PLY file of the mesh that occludes mirror reflections. (Default: none)
+     * occlusion (bool): Trace the visibility of the light, with the surfels' indirect light where it is
+       blocked. (Default: whether there is a ``mesh``)
+     * shade_at (string): ``pixel`` (deferred: blend attributes, then shade) or ``surfel`` (forward: shade,
+       then blend radiance). (Default: the first that the reflectance model has)
+     * reflectance (string): ``split_sum`` (diffuse and GGX specular), ``radiance`` (SH colour, needs no
+       light), ``mirror`` (3DGS-DR), ``gaussian_shader``, ``monte_carlo`` (R3DG), ``displayed`` (encoded SH
+       colours of a splat), or a registered model. (Default: the first whose attributes the surfels have)
+     * diffuse (string): ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times the light that the
+       specular term leaves). (Default: ``sh`` if there is one)
+     * dominant, antialias (bool): Slower and more accurate: look the light up along the GGX lobe's dominant
+       direction; average reflections over each pixel, at interpolated normals. (Default: false)
+     * visibility_rays, traced_bounces, ambient_rays (int): Specular-lobe samples of the visibility, 1 is the
+       mirror ray; traced bounces, in place of indirect light; rays per mesh vertex for diffuse visibility,
+       with ``irradiance``. (Default: 1, 0, 0)
+     * directions (int): Directions that ``monte_carlo`` samples. (Default: 24)
+     * surroundings (string): PLY file with the surfels around the object, splatted with it: geometry and
+       ``radiance_sh``. Also tensors, ``surroundings_position`` and so on. (Default: none)
+     * background (color or string): Linear radiance behind the surfels, or a lat-long map of it (EXR, HDR; in
+       Python also a raw tensor as of ``light``); alpha is then 1. (Default: none, transparent)
+     * aovs (string): Comma-separated ``<name>:<type>`` pairs as in the ``aov`` integrator. Types: ``albedo``,
+       ``metallic``, ``roughness``, ``tint``, ``normal`` (world, towards the camera), ``depth``, ``alpha``,
+       ``visibility``, ``diffuse``, ``specular``, ``indirect``, registered attributes. (Default: none)
+     * position, rotation, scale, opacity, radiance_sh, albedo, metallic, roughness, indirect_sh, tint,
+       normal_offset *or any registered attribute* (tensor, differentiable): Raw attributes (N, D); all in one
+       update, N may change. Three columns of ``scale``: 3D Gaussians.
+     * light (tensor, differentiable): Raw map (h, w, 3) of the integrator's own light: radiance =
+       ``EnvironmentLight(raw).radiance()``.
+     * surroundings_position, …, surroundings_radiance_sh, background (tensor, differentiable): Raw attributes
+       of the surroundings, and raw map of the background as of ``light``, if there are any.
 
-    The keys start with the integrator's id, `refgs` unless the scene sets one: ``params['refgs.roughness']``.
+    Keys of ``mi.traverse`` start with the integrator's id: ``params['refgs.roughness']`` without another one.
 
     The scene's shapes are not rendered, and the environment is visible in reflections only. Images have no
     noise. A sample count n (of ``mi.render``, else of the sampler) gives ⌈√n⌉² regular samples per pixel, box

@@ -12,11 +12,7 @@ from typing import Any, Literal, get_args, get_type_hints
 from mi_refgs.errors import InputError, abbreviated
 
 ShadedAt = Literal["pixel", "surfel"]
-"""Deferred shading of blended attributes per pixel, or forward shading per surfel before blending."""
-
 Diffuse = Literal["sh", "irradiance"]
-"""Diffuse radiance from fitted spherical harmonics, or from albedo and the light's irradiance."""
-
 DIFFUSE: tuple[Diffuse, ...] = get_args(Diffuse)
 
 MAX_RAYS = 4096  # rays per lobe, and bounces, which are unrolled in the kernel

@@ -44,7 +44,8 @@ class Operator:
         levels = np.zeros((self.texels, TEXEL), np.float32)
         levels[: 2 * self.height**2, :3] = radiance.reshape(-1, 3)
         coefficients = _product(self.matrix, analyse(radiance))
-        for (first, h), end in zip(self.shapes[1:], self._ends, strict=True):
+        ends = np.cumsum([h * (h + 1) for _, h in self.shapes[1:]])
+        for (first, h), end in zip(self.shapes[1:], ends, strict=True):
             filtered = synthesise(coefficients[end - h * (h + 1) : end], h)
             levels[first : first + 2 * h * h, :3] = filtered.reshape(-1, 3)
         return levels
@@ -54,10 +55,6 @@ class Operator:
         δmap, *maps = (δlevels[f : f + 2 * h * h, :3].reshape(h, 2 * h, 3) for f, h in self.shapes)
         coefficients = np.concatenate([analyse(level) for level in maps])
         return δmap + synthesise(_product(self.matrix.T, coefficients), self.height)
-
-    @property
-    def _ends(self) -> list[int]:
-        return np.cumsum([h * (h + 1) for _, h in self.shapes[1:]]).tolist()
 
 
 def analyse(rows: np.ndarray) -> np.ndarray:
