@@ -187,6 +187,7 @@ class FittedLight:
         return int(dr.count(~(dr.abs(dr.detach(self.raw.array)) < RAW_LIMIT))[0])
 
 
+@dataclass(frozen=True)
 class EnvironmentLight(FittedLight):
     """A learnable lat-long light: `raw` is a tensor (h, 2h, 3), h a multiple of 4, radiance = softplus(raw).
 
