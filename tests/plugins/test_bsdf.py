@@ -331,8 +331,7 @@ def test_parameters_and_text() -> None:
     params = mi.traverse(of)
     for key in ("albedo.value", "metallic.value", "roughness.data"):
         assert params.flags(key) == mi.ParamFlags.Differentiable
-    text = repr(of)
-    assert text.startswith("RefGSBSDF[\n  albedo = SRGB") and "roughness = BitmapTexture[" in text
+    assert "roughness = BitmapTexture[" in repr(of)
     si, wo = interaction(seen_at(0.6)), vector(seen_at(0.8)[None])
 
     def value(one: Any) -> np.ndarray:
