@@ -194,7 +194,8 @@ def test_passes_share_their_kernels_and_take_few_samples_at_a_time(
     count = len(passes.bands(Camera.from_sensor(of.sensors()[0]), 8))
     assert count == 16
     kernels = history(of, 64, backward)
-    assert max(kernel["size"] for kernel in kernels) < samples / 2  # which the light's texels are
+    copies = 10  # operations of a kernel that uploads the levels of the light
+    assert max(kernel["size"] for kernel in kernels if kernel["operation_count"] > copies) < samples / 2
     times = Counter(kernel["hash"] for kernel in kernels)
     assert len(times) < len(kernels) / count + 12
     assert sum(n % count == 0 for n in times.values()) > len(times) / 2
