@@ -12,6 +12,7 @@ from mi_refgs.fitting.objective import Loss as Loss
 from mi_refgs.fitting.objective import LossInputs as LossInputs
 from mi_refgs.fitting.objective import register as register_loss
 from mi_refgs.fitting.runner import Progress as Progress
+from mi_refgs.fitting.state import TableEdit as TableEdit
 from mi_refgs.fitting.train import Trainer as Trainer
 from mi_refgs.formats.format import Format as Format
 from mi_refgs.formats.format import Option as FormatOption
@@ -22,6 +23,7 @@ from mi_refgs.methods.initialiser import Initialiser as Initialiser
 from mi_refgs.methods.initialiser import register as register_initialiser
 from mi_refgs.methods.method import Method as Method
 from mi_refgs.methods.read import load as load_method
+from mi_refgs.methods.window import Window as Window
 from mi_refgs.occlusion.mesh import Mesh as Mesh
 from mi_refgs.occlusion.mesh import read_mesh as read_mesh
 from mi_refgs.occlusion.mesh import write_mesh as write_mesh
@@ -41,6 +43,9 @@ from mi_refgs.runs.relightable import relightable as relightable
 from mi_refgs.runs.run import Run as Run
 from mi_refgs.runs.trained_scene import TrainedScene as TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight as EnvironmentLight
+from mi_refgs.shade.light.kind import FittedLight as FittedLight
+from mi_refgs.shade.light.kind import LightKind as LightKind
+from mi_refgs.shade.light.kind import register as register_light
 from mi_refgs.shade.options import ShadingOptions as ShadingOptions
 from mi_refgs.shade.points import RadianceTerms as RadianceTerms
 from mi_refgs.shade.points import ShadingPoints as ShadingPoints

@@ -67,9 +67,8 @@ class Registry(Mapping[str, T], Generic[T]):
     def find(self, name: str, field: str) -> T:
         """Return an item by name; raises UnknownNameError that starts with `field` and lists the names."""
         if name not in self._items:
-            raise UnknownNameError(
-                f"{abbreviated(name)} is unknown", field, remedy=f"use {' or '.join(self._items)}"
-            )
+            remedy = f"use {' or '.join(self._items)}; or register it first"
+            raise UnknownNameError(f"{abbreviated(name)} is unknown", field, remedy=remedy)
         return self._items[name]
 
     def __getitem__(self, name: str) -> T:

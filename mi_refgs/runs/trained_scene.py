@@ -88,7 +88,7 @@ class TrainedScene:
             if iteration < 0 or not 0 <= seconds < math.inf:
                 raise ValueError("iteration or seconds out of range")
         except UnknownNameError as error:
-            raise InputError(f"{error}", note, remedy="or register it, as when the run was fitted") from error
+            raise error.at(note) from error
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
             raise InputError(f"cannot be read ({reason})", note, remedy=remedy) from error

@@ -87,7 +87,7 @@ diffuse = "irradiance"
 
 @pytest.fixture(autouse=True)
 def sun() -> Iterator[None]:
-    LIGHTS.register(Sun)
+    mi_refgs.register_light(Sun)
     yield
     LIGHTS.unregister("sun")
 
