@@ -156,7 +156,6 @@ class Page:
             self.status(f"{width} × {height}, {samples} per pixel, {1000 * shown.seconds:.0f} ms")
 
     def close(self) -> None:
-        """Stop listening."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 

@@ -13,9 +13,6 @@ from mi_refgs.data.poses import MITSUBA_FROM_OPENCV, MITSUBA_FROM_OPENGL, pinhol
 from mi_refgs.data.view import View
 from mi_refgs.splat.camera import Camera
 
-UP_TOLERANCE = math.cos(math.radians(20))
-"""Cosine up to which the cameras' mean up direction counts as z."""
-
 
 @dataclass(frozen=True, eq=False)
 class Pose:
@@ -79,8 +76,8 @@ class Pose:
 
 
 def up_of(views: list[View]) -> np.ndarray:
-    """Return the unit up direction (3,) of a data set: z, unless its cameras agree on another one."""
+    """Return the unit up direction (3,) of a data set: z, unless its cameras agree on one 20° from it."""
     z = np.array([0.0, 0.0, 1.0])
     mean = np.mean([view.to_world[:3, 1] for view in views], axis=0) if views else z
     length = float(np.linalg.norm(mean))
-    return z if length < 0.5 or mean[2] / length > UP_TOLERANCE else np.asarray(mean / length)
+    return z if length < 0.5 or mean[2] / length > math.cos(math.radians(20)) else np.asarray(mean / length)
