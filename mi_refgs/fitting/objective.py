@@ -75,8 +75,9 @@ def _check_name(loss: Loss) -> None:
     bare = re.fullmatch("[A-Za-z0-9_-]+", loss.name)
     if not bare or loss.name == "ssim":
         raise InputError(
-            f"loss: '{loss.name}' is in use in [loss], or has characters besides letters, digits, _ and -; "
-            "choose another name"
+            f"'{loss.name}' is in use in [loss], or has characters besides letters, digits, _ and -",
+            "loss",
+            remedy="choose another name",
         )
 
 
@@ -144,7 +145,9 @@ def require_losses(method: Method) -> None:
         absent += ["a stage at = pixel"] * (loss.maps and not deferred)
         absent += ["a light"] * (loss.light and method.light is None)
         if absent and method.loss[name].weight:
-            raise InputError(f"loss.{name}: needs {' and '.join(absent)}; add it, or drop the loss")
+            raise InputError(
+                f"needs {' and '.join(absent)}", f"loss.{name}", remedy="add it, or drop the loss"
+            )
 
 
 def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss]:
@@ -174,7 +177,9 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
     for name, registered in LOSSES.items():
         if name in factors and (value := registered.value(inputs)) is not None:
             if dr.width(value) != 1:
-                raise InputError(f"loss.{name}: has {dr.width(value)} values; reduce it, as with dr.mean")
+                raise InputError(
+                    f"has {dr.width(value)} values", f"loss.{name}", remedy="reduce it, as with dr.mean"
+                )
             loss += factors[name] * value
     squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
     return loss, sum(squares, mi.Float(0)) / 3

@@ -99,7 +99,7 @@ class ParameterTable:
         surfels = self.surfels
         parent = np.delete(np.arange(surfels.count), rows)
         if not len(parent):
-            raise InputError("surfels: none of them is finite; lower the rates (--set rates.…)")
+            raise InputError("none of them is finite", "surfels", remedy="lower the rates (--set rates.…)")
         index = upload(parent, mi.UInt32)
         self._move(surfels.gather(index), index, dr.zeros(mi.Bool, len(parent)))
 

@@ -109,7 +109,9 @@ def for_purpose(purpose: str) -> str:
     found = {_read(path).get("about", {}).get("purpose"): path.stem for path in files}
     if not purpose or purpose not in found:
         known = ", ".join(sorted(filter(None, found)))
-        raise InputError(f"--for: {purpose}: no method is for that; use one of {known}, or choose a --method")
+        raise InputError(
+            "no method is for that", "--for", purpose, f"use one of {known}, or choose a --method"
+        )
     return found[purpose]
 
 
@@ -137,7 +139,7 @@ def _find(name: str, where: str, folder: Path) -> Path:
     path = folder / name if name.endswith(".toml") else shipped / f"{name}.toml"
     if not is_file(path):
         known = ", ".join(names())
-        raise InputError(f"{where}: {name}: no such method; use one of {known}, or a path to a .toml")
+        raise InputError("no such method", where, name, f"use one of {known}, or a path to a .toml")
     return path
 
 
@@ -224,7 +226,7 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
     """Apply `key=value`; `event.NAME=false` removes an event."""
     key, separator, text = assignment.partition("=")
     if not separator:
-        raise InputError(f"--set: {assignment}: expected key=value, such as loss.ssim=0.1")
+        raise InputError("expected key=value, such as loss.ssim=0.1", "--set", assignment)
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):

@@ -148,8 +148,11 @@ def densify_and_prune(
         keep[np.argmax(opacity)] = True
     if not keep.any():
         raise InputError(
-            "event.densify.prune_opacity: no surfel is opaque and small enough to stay; lower it, raise "
-            "prune_extent, or check that the images and their cameras belong together"
+            "no surfel is opaque and small enough to stay",
+            "event.densify.prune_opacity",
+            remedy=(
+                "lower it, raise prune_extent, or check that the images and their cameras belong together"
+            ),
         )
 
     # Early in a fit most surfels are faint, those that will be needed, too: they only make room.

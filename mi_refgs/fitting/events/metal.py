@@ -64,7 +64,7 @@ class Metal(Decision):
 
     def require(self, attributes: Collection[str]) -> None:
         if "metallic" not in attributes:
-            raise InputError("there is no attribute 'metallic'; add it, or drop this")
+            raise InputError("there is no attribute 'metallic'", remedy="add it, or drop this")
 
     def components(self) -> Sequence[str]:
         return [self.name]

@@ -43,7 +43,7 @@ class Propagate(Event[Trainer]):
 
     def require(self, attributes: Collection[str]) -> None:
         if "metallic" not in attributes:
-            raise InputError("there is no attribute 'metallic'; add it, or drop this")
+            raise InputError("there is no attribute 'metallic'", remedy="add it, or drop this")
 
     def due(self, trainer: Trainer) -> bool:
         held = trainer.fit.optimiser.factors.get("opacity", 1.0) == 0

@@ -37,7 +37,9 @@ class ResetOpacity(Event[Trainer]):
     def require(self, attributes: Collection[str]) -> None:
         for name in self.raise_to_start:
             if name not in attributes or ATTRIBUTES[name].activation != "sigmoid":
-                raise InputError(f"raise_to_start: '{name}' is no attribute between 0 and 1; remove it")
+                raise InputError(
+                    f"'{name}' is no attribute between 0 and 1", "raise_to_start", remedy="remove it"
+                )
 
     def due(self, trainer: Trainer) -> bool:
         return self.when.due(trainer.iteration)

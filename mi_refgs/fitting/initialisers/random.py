@@ -44,7 +44,7 @@ def _within(count: int, region: Region, rng: np.random.Generator) -> np.ndarray:
         found = np.concatenate([found, points[region.above(points)]])[:count]
         if len(found) == count:
             return found
-    raise InputError("region: planes: they leave hardly anything of the sphere; correct or remove them")
+    raise InputError("they leave hardly anything of the sphere", "region", "planes", "correct or remove them")
 
 
 def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator) -> np.ndarray:
