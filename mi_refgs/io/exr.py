@@ -1,7 +1,4 @@
-"""EXR files as NumPy arrays, written atomically.
-
-Mitsuba reads and writes EXR files only where it loads or saves a scene (`mitsuba_exr` says why).
-"""
+"""EXR files as NumPy arrays, written atomically."""
 
 from __future__ import annotations
 

@@ -47,10 +47,7 @@ def straight_srgb(rgba: np.ndarray) -> np.ndarray:
 
 
 def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
-    """Mean over factor × factor blocks of an (H, W, C) image.
-
-    Rows below and columns right of the last whole block are left out, so that coordinates divide by `factor`.
-    """
+    """Mean over the whole factor × factor blocks of an (H, W, C) image; what is left over is left out."""
     if factor == 1:
         return image
     height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
@@ -89,10 +86,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def read_png(path: str | Path) -> np.ndarray:
-    """8-bit image file (PNG, JPEG) as float32 (H, W, 3 or 4) in [0, 1], still sRGB encoded, alpha straight.
-
-    Raises InputError if the file is missing, unreadable or has more than 8 bits per channel.
-    """
+    """8-bit image file as float32 (H, W, 3 or 4) in [0, 1], sRGB encoded; raises InputError for others."""
     return read_bytes(path)[0].astype(np.float32) / np.float32(255)
 
 
@@ -116,7 +110,7 @@ def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
     """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, or alpha if it has transparent pixels; and white.
 
     White is the smallest of 1, 255 and 65535 that no number of the file exceeds: files of 8 and 16 bits may
-    contain labels, and files of 16 bits numbers of 8. Raises InputError if the file is missing or unreadable.
+    contain labels, and files of 16 bits numbers of 8.
     """
     path = Path(path)
     with open_image(path) as image:
@@ -146,7 +140,7 @@ def read_tiff(path: str | Path) -> np.ndarray:
 
 
 def has_alpha(path: str | Path) -> bool:
-    """Whether a PNG or JPEG file has alpha, from its header; raises InputError as `read_png` does."""
+    """Whether a PNG or JPEG file has alpha, from its header."""
     with open_image(Path(path)) as image:
         return _transparent(image)
 

@@ -232,7 +232,7 @@ def test_extends_changes_only_what_it_says(tmp_path: Path) -> None:
     normal = dataclasses.replace(base.loss["normal"], weight=0.3)
     assert changed.loss == base.loss | {"ssim": methods.LossWeight(0.5), "normal": normal}
     assert changed.event == {name: x for name, x in base.event.items() if name != "densify"}
-    same = dict(loss=base.loss, event=base.event, name=base.name, file=base.file)
+    same: dict[str, Any] = dict(loss=base.loss, event=base.event, name=base.name, file=base.file)
     assert changed.name == "child" and dataclasses.replace(changed, **same) == base
 
 
