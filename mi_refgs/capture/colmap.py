@@ -1,7 +1,6 @@
 """COLMAP through pycolmap: features, pairs, matches, reconstruction and lens; silent and deterministic.
 
-Features and matches are in a database, to which a second run adds what is missing. [Schönberger and Frahm
-2016, "Structure-from-Motion Revisited"]
+Features and matches are in a database, to which a second run adds. [Schönberger and Frahm 2016]
 """
 
 from __future__ import annotations
@@ -33,8 +32,7 @@ MOST_MODELS = 5  # largest number of separate groups of images that are reconstr
 EXHAUSTIVE = 150  # largest number of images for which every pair is matched: 11,175 pairs take some minutes
 IN_ORDER = 8  # images before and after each, by name, with which it is matched in larger sets: a walk
 ALIKE = 20  # most similar images with which each is also matched in larger sets: they close loops
-WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12
-"""Size of the vocabulary, features per image from which it is made, and iterations of k-means."""
+WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12  # words, features per image to find them, k-means rounds
 LENS_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV")  # that are tried, from few to many parameters
 LENS_GAIN = 0.01  # by which more parameters must reduce the mean reprojection error; noise gives 1e-4
 
@@ -85,10 +83,7 @@ def _run(call: Callable[[Any], Result]) -> Result:
 def _in_parts(
     items: Sequence[Item], size: int, what: str, work: Callable[[Sequence[Item], Any], None]
 ) -> None:
-    """Call `work(items, token)` for `size` items at a time, with a progress bar.
-
-    Nothing else may open the database meanwhile: a second reader, with locks of its own, can corrupt it.
-    """
+    """Call `work(items, token)` for `size` items at a time; nothing else may open the database meanwhile."""
     with progress_bar(len(items), what) as shown:
         for start in range(0, len(items), size):
             part = items[start : start + size]
@@ -157,10 +152,7 @@ def features(database: Path) -> dict[str, np.ndarray]:
 
 
 def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[Any]:
-    """Reconstruct each connected group of images: pycolmap.Reconstructions, the largest first.
-
-    Empty if no pair of images can be the initial one.
-    """
+    """Reconstruct each connected group of images: pycolmap.Reconstructions, the largest first."""
     pycolmap = load()
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
@@ -173,12 +165,11 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
         def one_more() -> None:
             shown.update(next(placed) <= count)
 
-        def call(token: Token) -> Any:
-            calls = {"initial_image_pair_callback": one_more, "next_image_callback": one_more}
-            arguments = (database, folder, output, options)
-            return pycolmap.incremental_mapping(*arguments, **calls, cancellation_token=token)
-
-        models = _run(call)
+        arguments = (database, folder, output, options)
+        calls = {"initial_image_pair_callback": one_more, "next_image_callback": one_more}
+        models = _run(
+            lambda token: pycolmap.incremental_mapping(*arguments, **calls, cancellation_token=token)
+        )
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
@@ -196,10 +187,9 @@ def pairs_to_match(features: dict[str, np.ndarray]) -> list[tuple[str, str]]:
 
 
 def image_similarity(descriptors: Sequence[np.ndarray]) -> np.ndarray:
-    """Cosine similarities (N, N) of VLAD vectors of the images' features.
+    """Cosine similarities (N, N) of VLAD vectors of the images' features, with signed square roots.
 
-    The words are found by k-means in the images themselves; signed square roots. [Jégou et al. 2010;
-    Arandjelović and Zisserman 2013]
+    [Jégou et al. 2010; Arandjelović and Zisserman 2013]
     """
     rng = np.random.default_rng(0)
     drawn = [rng.permutation(d)[:WORD_SAMPLES].astype(np.float32) for d in descriptors]
@@ -234,12 +224,11 @@ class Solved:
 
     @property
     def axis(self) -> np.ndarray:
-        """Viewing directions (V, 3), world."""
+        """Viewing directions (V, 3)."""
         return self.rotation[:, 2]
 
     @classmethod
     def of(cls, model: Reconstruction) -> Solved:
-        """Convert a pycolmap.Reconstruction; images are sorted by name."""
         images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
         poses = [image.cam_from_world() for image in images]
         cameras = [model.cameras[image.camera_id] for image in images]

@@ -1,7 +1,6 @@
 """World frame of a capture: +z against gravity, the region of interest is the unit ball around the origin.
 
-Structure from motion leaves rotation, position and scale of its world undetermined; they are estimated from
-how cameras are held and from the point at which they look.
+Rotation, position and scale are estimated from how cameras are held and where they look.
 """
 
 from __future__ import annotations
@@ -34,16 +33,15 @@ class Similarity:
     translation: np.ndarray  # (3,)
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) in the new world."""
         return self.scale * points @ self.rotation.T + self.translation
 
 
 def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
     """The direction (3,) against gravity; `up` (V, 2): (right, down) of the upward direction in each image.
 
-    Cameras are mostly held level, whatever their tilt: the direction orthogonal to the right-hand directions
-    of all images, by least absolute values, which is robust to rolled ones. If all cameras look the same way,
-    the tilt is undetermined: then it is the mean upward direction, orthogonal to the mean right.
+    Cameras are mostly held level: it is orthogonal to the right-hand directions of all images, by least
+    absolute values, which is robust to rolled ones. If all cameras look the same way, it is the mean upward
+    direction, orthogonal to the mean right.
     """
     right = np.stack([-up[:, 1], up[:, 0]], axis=1)
     to_world = solved.rotation.transpose(0, 2, 1)[:, :, :2]
@@ -87,15 +85,15 @@ def seen_share(solved: Solved, points: np.ndarray) -> np.ndarray:
 def region_of_interest(solved: Solved) -> Region:
     """A sphere around the point at which most cameras look, above what supports the object.
 
-    Its radius is that of `region_radius`, or smaller if the points in the images of at least half of the
-    cameras, weighted by track length, are closer, or larger if the object is (`object_region`).
+    Its radius is that of `region_radius`, or smaller if the points that half of the cameras see are closer,
+    or larger if the object is (`object_region`).
     """
     focus = focus_of(solved)
     distance = np.linalg.norm(solved.origin - focus, axis=1)
     radius = region_radius(distance, solved.half_angle)
     if not radius > 0:
-        what = "a camera is at the point at which all look"
-        raise InputError(what, "photographs", remedy="walk around an object")
+        what, remedy = "a camera is at the point at which all look", "walk around an object"
+        raise InputError(what, "photographs", remedy=remedy)
     offset = np.linalg.norm(solved.points - focus, axis=1)
     near = offset < radius
     near[near] = seen_share(solved, solved.points[near]) >= SEEN_SHARE
@@ -122,11 +120,7 @@ def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
     return Similarity(scale, rotation, -scale * rotation @ np.array(region.centre))
 
 
-def moved(solved: Solved, similarity: Similarity) -> Solved:
+def moved(solved: Solved, to: Similarity) -> Solved:
     """Cameras and points in the new world."""
-    return replace(
-        solved,
-        rotation=solved.rotation @ similarity.rotation.T,
-        origin=similarity.apply(solved.origin),
-        points=similarity.apply(solved.points),
-    )
+    turned, points = solved.rotation @ to.rotation.T, to.apply(solved.points)
+    return replace(solved, rotation=turned, origin=to.apply(solved.origin), points=points)

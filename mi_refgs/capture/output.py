@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -42,10 +42,7 @@ class Straight:
 
     @classmethod
     def of(cls, camera: Any, size: tuple[int, int]) -> Straight:
-        """The camera for images of `size`, from a pycolmap.Camera of the working copies.
-
-        Raises InputError if the lens cannot be undone.
-        """
+        """The camera for images of `size`, from a pycolmap.Camera of the working copies."""
         values = dict(zip(MODELS[camera.model_name][1].split(), camera.params, strict=True))
         known = Camera(camera.model_name, camera.width, camera.height, values)
         scale = np.divide(size, (camera.width, camera.height))
@@ -54,8 +51,7 @@ class Straight:
             lens = known.lens()
             undo = None if lens is None else undistortion(lens, *size, fx, fy, cx, cy)
         except InputError as error:
-            what = f"the lens found cannot be undone ({error})"
-            remedy = "choose another lens model, such as --camera-model RADIAL"
+            what, remedy = f"the lens found cannot be undone ({error})", "choose another --camera-model"
             raise InputError(what, "photographs", remedy=remedy) from None
         zoom = 1.0 if undo is None else undo.zoom
         return cls(size, (zoom * fx, zoom * fy), (cx, cy), undo)
@@ -83,14 +79,14 @@ def straighten(model: colmap.Reconstruction, photographs: dict[str, Photograph])
 def prepare(folder: Path, sources: Sequence[Path]) -> None:
     """Make the folder of a data set; `sources` are the folders that are read.
 
-    Raises InputError for a folder that is or contains a source, that contains anything but a capture, and
-    that cannot be written.
+    Raises InputError for a folder that is or contains a source, or anything but a capture.
     """
     real = folder.resolve()
     for source in sources:
         if real in (source.resolve(), *source.resolve().parents):
-            what = f"it contains {source}, which is read"
-            raise InputError(what, folder, "output", "choose another folder")
+            raise InputError(
+                f"it contains {source}, which is read", folder, "output", "choose another folder"
+            )
     own = (folder / WORK / "key").is_file()
     own = own or ((folder / REPORT).is_file() and "key" in read_json(folder / REPORT))
     if not own and folder.is_dir() and any(folder.iterdir()):
@@ -102,12 +98,9 @@ def prepare(folder: Path, sources: Sequence[Path]) -> None:
 
 
 def write_images(
-    placed: Sequence[Photograph],
-    straight: Callable[[Photograph], Straight],
-    masks: dict[str, Path],
-    folder: Path,
+    placed: Sequence[Photograph], straight: dict[str, Straight], masks: dict[str, Path], folder: Path
 ) -> None:
-    """Write images/NAME, and masks/NAME.png if there are masks, in place of those of the last capture."""
+    """Write images/NAME and, with masks, masks/NAME.png in place of those of the last capture."""
     for part in (IMAGES, MASKS):
         shutil.rmtree(folder / part, ignore_errors=True)
         if part == IMAGES or masks:
@@ -116,7 +109,7 @@ def write_images(
     def write(photograph: Photograph) -> None:
         from PIL import Image
 
-        camera, image = straight(photograph), folder / IMAGES / photograph.name
+        camera, image = straight[photograph.copy], folder / IMAGES / photograph.name
         if camera.undo is None and photograph.as_displayed:
             replace_file(image, partial(shutil.copyfile, photograph.path))
         else:

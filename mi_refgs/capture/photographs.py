@@ -19,8 +19,7 @@ from mi_refgs.io.files import replace_file
 from mi_refgs.io.images import ENDINGS, exif_tags, image_size, open_image, read_mask, to_8_bits
 from mi_refgs.progress import with_bar
 
-OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()
-"""Formats of cameras that are not read here, for a message that says what to do."""
+OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()  # for a message
 FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point
 DIAGONAL_35MM = 43.2666  # mm, of a frame of 36 mm × 24 mm, to which EXIF's 35 mm equivalent relates
 ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405  # EXIF tags
@@ -43,7 +42,6 @@ class Photograph:
 
     @property
     def name(self) -> str:
-        """File name of its image in the data set."""
         return self.path.name
 
     @property
@@ -72,10 +70,7 @@ class Photograph:
         return (-1.0, 0.0) if self.lying else (0.0, -1.0)
 
     def load(self, longest: int | None = None) -> Any:
-        """The image as oriented in the data set: an RGB PIL image of at most `longest` pixels per side.
-
-        Raises InputError for a file that is no readable image of 8 bits a channel.
-        """
+        """The image as oriented in the data set: an RGB PIL image of at most `longest` pixels per side."""
         from PIL import Image
 
         with open_image(self.path) as image:
@@ -114,10 +109,8 @@ class Photograph:
 def find_photographs(folder: Path) -> list[Photograph]:
     """The photographs of a folder by name, oriented as most of them are.
 
-    Portraits among landscapes of one camera, and the reverse, are rotated by 90°: with the same sensor, all
-    have one size and one lens.
-
-    Raises InputError for a missing folder, too few images, images of many sizes, and unreadable files.
+    Portraits among landscapes of one camera, and the reverse, are rotated by 90°: so all have one size and
+    one lens. Raises InputError for a missing folder, too few images, many sizes, and unreadable files.
     """
     if not folder.is_dir():
         raise InputError("no such folder", folder, "photographs", "give one with JPEG or PNG files")
@@ -152,7 +145,7 @@ def _photograph(path: Path) -> Photograph:
 
 
 def _positive(value: object) -> float | None:
-    """A positive number in EXIF data, else None; it may be a fraction with denominator 0, or anything."""
+    """A positive number in EXIF data, which may be a fraction with denominator 0, or anything; else None."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -173,8 +166,7 @@ def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int) 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
     """The mask of each photograph by the photograph's name; empty without a folder.
 
-    Masks are named as in `data.images.mask_in`, and have the stored or displayed size. Raises InputError for
-    a photograph without a mask and for a mask of another size.
+    Masks are named as in `data.images.mask_in`, and have the stored or displayed size.
     """
     masks: dict[str, Path] = {}
     if folder is None:
@@ -194,8 +186,7 @@ def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[s
 def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
     """The mask as oriented in the data set, (H, W, 1) uint8, 255 on the object.
 
-    A mask of the stored size is rotated like the photograph, unless that is also the displayed size. Raises
-    InputError as `read_mask` does.
+    A mask of the stored size is rotated like the photograph, unless that is also the displayed size.
     """
     from PIL import Image
 

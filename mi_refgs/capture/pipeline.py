@@ -1,7 +1,7 @@
 """The capture pipeline: from photographs to a COLMAP data set with cameras, points and a region of interest.
 
-The folder `.work` contains what the steps leave, and the hash of their inputs: a run that was interrupted
-goes on, one with the same inputs computes nothing again, and other photographs or options begin anew.
+The folder `.work` contains the results of steps, and the hash of their inputs: an interrupted run goes on,
+and other photographs or options begin anew.
 """
 
 from __future__ import annotations
@@ -53,9 +53,7 @@ def capture(
 
     `masks`: a folder as in `find_masks`. `camera`: COLMAP's name of the lens model, or None for the
     simplest of three that fits. `region`: of interest, in the data set's world, instead of the estimated one.
-    `tell` is called with messages. Returns the content of capture.json.
-
-    Raises InputError for unusable input, with the remedy, and without pycolmap.
+    Returns the content of capture.json. Raises InputError for unusable input, and without pycolmap.
     """
     # Photographs and options.
     pycolmap = colmap.load()
@@ -92,7 +90,7 @@ def capture(
         for stale in (*folder.glob(f"{SPARSE}/*.bin"), last):  # without them the folder is no data set
             stale.unlink(missing_ok=True)
         placed = [copies[name] for name in solved.names]
-        output.write_images(placed, lambda p: straight[p.copy], mask_files, folder)
+        output.write_images(placed, straight, mask_files, folder)
         output.write_model(model, copies, straight, similarity, folder / SPARSE)
     write_region(folder, found)
     draw(folder / PLOT, world, found)
@@ -147,9 +145,9 @@ def _solve(
     models = colmap.reconstruct(database, images, raw, len(names))
     groups = [Solved.of(model).names for model in models]
     require_placed(source, len(names), groups)
-    best = models[0] if camera else colmap.best_lens(models[0])
     if camera:
-        colmap.adjust(best)
+        colmap.adjust(models[0])
+    best = models[0] if camera else colmap.best_lens(models[0])
     shutil.rmtree(raw)
     raw.mkdir()
     best.write_binary(raw)
@@ -159,10 +157,7 @@ def _solve(
 def _groups(
     photographs: Sequence[Photograph], images: Path, model: str
 ) -> list[tuple[list[str], str, list[float]]]:
-    """Images, lens model and initial parameters of each camera: of equal size, device and focal length.
-
-    There are no parameters without a focal length in EXIF data.
-    """
+    """Images, lens model and, with EXIF data, parameters of each camera: of equal size, device and focal length."""
     cameras: dict[Any, list[Photograph]] = {}
     for photograph in photographs:
         cameras.setdefault((photograph.kept_size, photograph.device, photograph.focal), []).append(photograph)
@@ -226,7 +221,7 @@ def require_features(folder: Path, counts: Sequence[int]) -> None:
     """Raise InputError if the median image has hardly any features."""
     if (median := int(np.median(counts))) < FEW_FEATURES:
         what = f"half of them have no more than {median} features: they are blurred, or without texture"
-        remedy = "hold still, use more light, put a patterned ground, such as a newspaper, below the object"
+        remedy = "hold still, use more light, put a patterned ground below the object"
         raise InputError(what, folder, "photographs", remedy)
 
 
@@ -234,9 +229,7 @@ def require_placed(folder: Path, count: int, groups: Sequence[Sequence[str]]) ->
     """Raise InputError unless the largest group has half of the images."""
     if not groups:
         what = f"no two of the {count} show the same points from different sides"
-        remedy = (
-            "walk around the object, and take images so close that each shows two thirds of the one before"
-        )
+        remedy = "walk around the object; each image must show two thirds of the one before"
         raise InputError(what, folder, "photographs", remedy)
     if len(groups[0]) < LEAST_PLACED * count:
         sizes = ", ".join(str(len(group)) for group in groups)

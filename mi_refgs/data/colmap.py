@@ -1,7 +1,6 @@
-"""Reader of COLMAP's layout: a reconstruction in `sparse/0`, as text or binary, and images in `images`.
+"""Reader of COLMAP's layout: a reconstruction in `sparse/0`, text or binary, `images`, and perhaps `masks`.
 
-`masks` may contain masks of the object, as NAME.png with or without the image's ending before it. Every
-eighth image in the order of names is a test view, unless `test.txt` beside the reconstruction lists them.
+Every eighth image by name is a test view, unless `test.txt` beside the reconstruction lists them.
 """
 
 from __future__ import annotations
@@ -34,19 +33,15 @@ class ColmapReader:
     looks_for = "sparse/0/cameras.bin or .txt, beside images"
 
     def recognises(self, folder: Path) -> bool:
-        """Whether the folder contains a reconstruction."""
         return _model(folder) is not None
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        """Read the views of one split, and the reliable points."""
         model = Reconstruction(folder, options)
         views = tuple(model.view(image) for image in model.registered(split))
         return Recording(views, model.points(), source=model.source, notes=model.notes())
 
 
 class Reconstruction:
-    """One reconstruction with its images."""
-
     def __init__(self, folder: Path, options: ReadOptions) -> None:
         model, ending = _model(folder) or (folder, ENDINGS[0])
         options.require_png(folder)
@@ -60,7 +55,6 @@ class Reconstruction:
         self.files = {name: file for name, file in found.items() if file is not None}
 
     def registered(self, split: str) -> list[Image]:
-        """The images of a split that have a file."""
         images = [image for image in self.images if image.name in self.files]
         if not images:
             what = f"none of its {len(self.images)} images is in {self.folder.path}"
@@ -80,17 +74,14 @@ class Reconstruction:
         if camera is None:
             remedy = "export the model again"
             raise InputError(f"there is no camera {image.camera}", self.source, image.name, remedy)
-        field = f"{self.source}: {image.name}"
-        where = f"{field}: camera {image.camera}"
+        where = f"{self.source}: {image.name}: camera {image.camera}"
         try:
             lens = camera.lens()
         except InputError as error:
             raise error.at(file=where) from None
-        pose = from_world_to_camera(image.rotation, image.translation, field)
-        mask = self.folder.mask(image.name)
-        file = ImageFile.of(self.files[image.name], self.options.downscale, mask)
-        pinhole = _intrinsics(camera, file)
-        return make_view(file, self.options, where, image.name, pinhole, pose, lens)[0]
+        pose = from_world_to_camera(image.rotation, image.translation, f"{self.source}: {image.name}")
+        file = ImageFile.of(self.files[image.name], self.options.downscale, self.folder.mask(image.name))
+        return make_view(file, self.options, where, image.name, _intrinsics(camera, file), pose, lens)[0]
 
     def points(self) -> PointCloud | None:
         """The reliable points, or all where only a few are reliable; None without any."""
@@ -106,7 +97,6 @@ class Reconstruction:
         return PointCloud(points.position[good], colour)
 
     def notes(self) -> tuple[str, ...]:
-        """What the user may want to correct."""
         notes, names = [], self.folder.names()
         if absent := len(self.images) - len(self.files):
             notes.append(f"{absent} of {len(self.images)} cameras have no image and are left out")

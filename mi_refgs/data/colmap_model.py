@@ -1,7 +1,6 @@
-"""COLMAP's model files cameras, images and points3D: read as text or binary, written as text.
+"""COLMAP's model files: read as text or binary, written as text.
 
-COLMAP's own library is an extra, and allocates what a file promises: here the length of the file is compared
-first.
+COLMAP's own library is an extra, and allocates what a file promises before it compares the file's length.
 """
 
 from __future__ import annotations
@@ -35,15 +34,12 @@ MODELS: dict[str, tuple[int, str]] = {
     "FISHEYE": (15, "fx fy cx cy"),
 }
 """Camera models whose distortion can be undone: number in binary files, parameters in their order."""
-TEST_LIST = "test.txt"
-"""File beside the model with the names of the test views, one per line, as 3D Gaussian Splatting reads it."""
+TEST_LIST = "test.txt"  # beside the model: names of the test views, one per line, as 3DGS reads it
 MAX_NAME = 4096  # bytes of an image's name; no path is longer
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Camera model and intrinsics."""
-
     model: str
     width: int  # pixels
     height: int
@@ -76,8 +72,6 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Triangulated points."""
-
     position: np.ndarray  # (P, 3) float64, world
     colour: np.ndarray  # (P, 3) uint8, sRGB-encoded
     error: np.ndarray  # (P,) mean reprojection error, pixels; −1 or 0: unknown
@@ -92,10 +86,10 @@ class _Cursor:
 
     def take(self, layout: str) -> tuple[Any, ...]:
         """The next values, little-endian without padding."""
-        self.at += struct.calcsize(f"<{layout}")
+        start, self.at = self.at, self.at + struct.calcsize(f"<{layout}")
         if self.at > len(self.data):
             raise ValueError(f"ends after {len(self.data)} bytes, within a record")
-        return struct.unpack_from(f"<{layout}", self.data, self.at - struct.calcsize(f"<{layout}"))
+        return struct.unpack_from(f"<{layout}", self.data, start)
 
     def count(self, row: int) -> int:
         """The next number, of records of at least `row` bytes that follow."""
@@ -111,7 +105,6 @@ class _Cursor:
         return number
 
     def name(self) -> str:
-        """The next zero-terminated text."""
         start, self.at = self.at, self.data.find(b"\0", self.at, self.at + MAX_NAME) + 1
         if not self.at:
             raise ValueError("a name has no end")
@@ -141,13 +134,13 @@ def read_images(path: Path) -> list[Image]:
     images: dict[str, Image] = {}
     for name, camera, *pose in _records(path, _binary_images, _text_images):
         values = np.array(pose, dtype=np.float64)
-        length = float(np.linalg.norm(values[:4])) if np.abs(values).max() <= MAX_NUMBER else 0.0
-        if not length > 0:
+        if not (np.abs(values).max() <= MAX_NUMBER and np.linalg.norm(values[:4]) > 0):
             remedy = "remove the image, or reconstruct again"
             raise InputError("the pose has no usable numbers", path, abbreviated(name), remedy)
         if name in images:
             raise InputError("the image occurs twice", path, abbreviated(name), "remove one of the two")
-        images[name] = Image(name, camera, _rotation(values[:4] / length), values[4:])
+        rotation = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()  # COLMAP's w is first
+        images[name] = Image(name, camera, rotation, values[4:])
     return [images[name] for name in sorted(images)]
 
 
@@ -235,18 +228,6 @@ def _without_comments(lines: Iterator[str]) -> Iterator[str]:
     return (line for line in lines if line and not line.startswith("#"))
 
 
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """The matrix (3, 3) of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def write_model(
     folder: Path,
     cameras: Iterable[tuple[tuple[float, ...], Lens | None]],  # (width, height, fx, fy, cx, cy), pixels; lens
@@ -255,8 +236,7 @@ def write_model(
     camera_of: Iterable[int],  # number of each image's camera, from 1
     tests: Iterable[str],  # names of the test views
 ) -> None:
-    """Write cameras.txt, images.txt, points3D.txt without points, and test.txt; raises InputError if that
-    fails."""
+    """Write cameras.txt, images.txt, points3D.txt without points, and test.txt."""
     rows, images = list[str](), list[str]()
     for i, (numbers, lens) in enumerate(cameras, 1):
         given = {} if lens is None else lens.coefficients

@@ -27,9 +27,7 @@ from mi_refgs.registry import Registry
 HOLDOUT = 8  # every eighth image is a test view where a data set names none (LLFF, 3DGS, 2DGS)
 EXTENT_MARGIN = 1.1  # scene extent over the largest distance of a training camera to their mean (3DGS)
 NEAR_EXTENTS = 2e-3  # depth of the near plane in scene extents, about 0.01 units of Blender's data sets
-FAR = 1e3
-"""Distance of the training cameras' mean from the world's origin, in scene extents, from which positions are
-shifted: from there float32 resolves less than a ten-thousandth of the extent."""
+FAR = 1e3  # distance of the cameras' mean from the origin, in extents, from which positions are shifted
 DISTINCT = 1e-11  # extent over that distance below which all cameras are at one place; nothing is shifted
 OPAQUE_CHECKED = 8  # images whose alpha is examined: if none has a transparent pixel, alpha is ignored
 MAX_SIZES = 4  # image sizes in a data set, such as portrait and landscape: a fit compiles kernels for each
@@ -40,8 +38,6 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a reader returns images."""
-
     downscale: int = 1  # side of the blocks of pixels that are averaged
     background: float = 1.0  # 0 … 1, in the colour space of the images, where they have alpha
     images: str = "png"  # "png": sRGB-encoded, or "exr": linear radiance
@@ -49,7 +45,7 @@ class ReadOptions:
     cache: ImageCache = field(default_factory=ImageCache, compare=False)
 
     def require_png(self, folder: Path) -> None:
-        """Raise InputError if EXR images are asked for, which the layout of the folder has not."""
+        """Raise InputError if EXR images are requested, which most layouts do not have."""
         if self.images != "png":
             raise InputError("has no EXR images", file=folder, field="images", remedy="read it as 'png'")
 
@@ -93,11 +89,9 @@ class Reader(Protocol):
     """Reader of one layout of data sets."""
 
     name: str
-    looks_for: str
-    """The files by which it recognises a folder, for messages."""
+    looks_for: str  # the files by which it recognises a folder, for messages
 
-    def recognises(self, folder: Path) -> bool:
-        """Whether the folder has this layout."""
+    def recognises(self, folder: Path) -> bool: ...
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         """Read the views of "train" or "test"; raises InputError that names file, field and remedy."""
@@ -115,18 +109,16 @@ def register_reader(reader: Reader) -> Reader:
 def reader_of(folder: Path) -> Reader:
     """The reader of a folder; raises InputError if there is no such folder, or none recognises it."""
     if not folder.is_dir():
-        remedy = "give one that contains images and cameras"
-        raise InputError("no such folder", file=folder, field="data set", remedy=remedy)
+        raise InputError("no such folder", folder, "data set", "give one that contains images and cameras")
     for reader in READERS.values():
         if reader.recognises(folder):
             return reader
     known = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS.values())
-    what, remedy = "no layout is recognised", f"complete it ({known})"
-    raise InputError(what, file=folder, field="data set", remedy=remedy)
+    raise InputError("no layout is recognised", folder, "data set", f"complete it ({known})")
 
 
 def held_out(ordered: Sequence[Item], split: str, source: Path | None = None) -> list[Item]:
-    """The items of a split if one list contains both: every eighth, from the first, is a test view.
+    """The items of a split of one list: every eighth, from the first, is a test view.
 
     Raises InputError that names the `source`, if it is given, where there are none.
     """
@@ -148,14 +140,13 @@ def make_view(
     options: ReadOptions,
     where: str,
     name: str,
-    intrinsics: tuple[float, float, float, float],
+    intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy, pixels of the file
     to_world: np.ndarray,
     lens: Lens | None = None,
 ) -> tuple[View, Undistortion | None]:
     """Make the view of an image; also returns how maps of the averaged image's size are undistorted.
 
-    `intrinsics` are fx, fy, cx, cy in pixels of the file; `to_world` as in `View`. Raises InputError, which
-    begins with `where`, for an impossible focal length and for a lens that cannot be undone.
+    Raises InputError, which begins with `where`, for an impossible focal length or lens.
     """
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
@@ -171,9 +162,8 @@ def make_view(
         fx, fy = fx * straight.zoom, fy * straight.zoom
         image = replace(image, undistortion=straight)
     source = ImageSource(image, options.background, options.cache, image.has_alpha())
-    exposure, linear = log_exposure(image.path), options.images == "exr"
-    view = View(name, *image.size, fx, fy, cx, cy, to_world, source, exposure=exposure, file=file)
-    return replace(view, is_linear_radiance=linear), straight
+    known = {"is_linear_radiance": options.images == "exr", "exposure": log_exposure(image.path)}
+    return View(name, *image.size, fx, fy, cx, cy, to_world, source, file=file, **known), straight
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +179,7 @@ class Dataset:
     points: PointCloud | None = None  # on surfaces, where the data set has some
     region: Region | None = None  # of interest, for all splits; None where alpha segments the object
     notes: tuple[str, ...] = ()  # as in `Recording`
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What was subtracted from all positions of the files, scene units; see `FAR`."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # subtracted from all positions of the files
     unknown: PixelRays | None = None  # pixels whose depth stereo has not found; None: it has not been tried
 
     @property
@@ -205,10 +194,7 @@ class Dataset:
 
     @cached_property
     def scene_extent(self) -> float:
-        """1.1 × the largest distance of a camera to their mean, scene units (3DGS).
-
-        For a single camera, to the world's origin; 1 if it is there.
-        """
+        """1.1 × the largest distance of a camera to their mean (3DGS); of a single one, to the origin."""
         return _extent(self.views)
 
 
@@ -216,32 +202,27 @@ def read_dataset(
     path: str | Path,
     split: str,
     *,
-    downscale: int | None = None,
+    downscale: int = 1,
     background: str = "white",
     images: str = "png",
     truth: bool = True,
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
-    `downscale`: side of the blocks of pixels that are averaged, colour premultiplied by alpha; by default 1.
-        Pixels at the right and the bottom that fill no block are left out.
+    `downscale`: side of the blocks of pixels that are averaged; incomplete blocks are left out.
     `background`: "white" or "black", behind images with alpha.
     `images`: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
     `truth`: read ground-truth normals, depth and materials where there are any.
 
-    Images are decoded by `View.load`, and kept as far as `images.CACHE_BYTES` allows. Without a list of test
-    views, every eighth image in the order of paths is one. The region of interest is that of region.json, or
-    without alpha the one that the training cameras look at. Positions far from the world's origin, as in UTM
-    coordinates, are relative to `Dataset.offset`, the same for all splits.
-
-    Raises InputError for anything missing, unreadable or inconsistent; it names file, field and remedy.
+    Images are decoded by `View.load`. The region of interest is that of region.json, or without alpha the one
+    that the training cameras look at. Positions far from the world's origin, as in UTM coordinates, are
+    relative to `Dataset.offset`. Raises InputError for anything missing, unreadable or inconsistent.
     """
     path = Path(path)
     if background not in BACKGROUNDS:
         raise InputError(f"unknown value '{background}'", path, "background", "give white or black")
     if images not in ("png", "exr"):
         raise InputError(f"unknown value '{images}'", path, "images", "give png or exr")
-    downscale = 1 if downscale is None else downscale
     if downscale < 1:
         raise InputError(f"{downscale} is out of range", path, "downscale", "give a whole number from 1")
     options = ReadOptions(downscale, BACKGROUNDS[background], images, truth)
@@ -252,8 +233,7 @@ def read_dataset(
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
     require_few_sizes(found.source or path, "images", sizes, remedy)
 
-    # What depends on cameras depends on the training cameras in every split, so that a fit and its
-    # evaluation use the same region and the same offset.
+    # Region and offset are derived from the training cameras for every split.
     training = views
     if split != "train":
         with contextlib.suppress(InputError):  # a relit data set has none
@@ -284,9 +264,8 @@ def read_dataset(
         points = None if points is None else replace(points, position=points.position - offset)
         position = f"({x:.12g}, {y:.12g}, {z:.12g})"
         notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
-    colour = np.full(3, BACKGROUNDS[background], dtype=np.float32)
-    linear = images == "exr"
-    return Dataset(path, split, views, colour, linear, found.environment, points, region, notes, (x, y, z))
+    colour, light = np.full(3, BACKGROUNDS[background], dtype=np.float32), found.environment
+    return Dataset(path, split, views, colour, images == "exr", light, points, region, notes, (x, y, z))
 
 
 def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
@@ -296,8 +275,7 @@ def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, 
     """
     options = ReadOptions(images=images, truth=False)
     first = reader_of(Path(path)).read(Path(path), "train", options).views[0]
-    size = first.file or first
-    width, height = size.width, size.height
+    width, height = ((first.file or first).width, (first.file or first).height)
     factors = range(1, min(width, height))
     factor = next((k for k in factors if (width // k) * (height // k) <= pixels), min(width, height))
     return factor, width, height
@@ -309,7 +287,7 @@ def _own_alpha(view: View) -> bool:
 
 
 def _opaque(views: tuple[View, ...]) -> bool:
-    """Whether images with alpha have no transparent pixel; OPAQUE_CHECKED evenly spaced ones are examined."""
+    """Whether images with alpha have no transparent pixel; some of them are examined."""
     own = [view for view in views if _own_alpha(view)]
     loaded = (own[i].load().alpha for i in evenly_spread(len(own), OPAQUE_CHECKED))
     return bool(own) and all(alpha is None or alpha.min() >= 1 for alpha in loaded)
@@ -332,7 +310,6 @@ def _offset(views: tuple[View, ...]) -> np.ndarray:
 
 
 def _moved(view: View, offset: np.ndarray) -> View:
-    """The view with positions relative to an offset (3,)."""
     to_world = view.to_world.copy()
     to_world[:3, 3] -= offset
     return replace(view, to_world=to_world)

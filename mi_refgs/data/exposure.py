@@ -16,10 +16,7 @@ MAX_GAIN = 16.0  # gains are limited to this and its inverse, ± 4 stops: larger
 
 
 def log_exposure(path: Path) -> float | None:
-    """log(time · ISO / f-number²) from the EXIF data of an image; None unless it contains all three.
-
-    Sensor values are proportional to its exponential. Raises InputError for a file that is no image.
-    """
+    """log(time · ISO / f-number²) from the EXIF data of an image; None unless it contains all three."""
     if path.suffix.lower() == ".exr":
         return None
     with open_image(path) as image:
@@ -43,8 +40,8 @@ def fitted_gain(
     """Gains (3,) that fit a render to the image of a view.
 
     Per channel the least squares of g L - T over pixels, L and T the linear colours of the object in render
-    and image; pixels are weighted by their coverage in both and by the slope of the sRGB curve, so that
-    errors count as displayed. Clipped pixels of 8-bit images are left out. The gain of a black channel is 1.
+    and image, weighted by coverage and by the slope of the sRGB curve, so that errors count as displayed.
+    Clipped pixels of 8-bit images are left out. The gain of a black channel is 1.
     """
     view = view.load()
     covered = alpha if view.alpha is None else np.minimum(alpha, view.alpha)

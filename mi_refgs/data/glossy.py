@@ -2,8 +2,7 @@
 
 A camera is a pickled list of the pose (3 × 4, world to camera, OpenCV's axes) and the 3 × 3 matrix K. Depths
 along the viewing axis have 16 bits for 15 units; what is nearer than 14.5 is the object. Every eighth image
-by number is a test view, as in the splits made for 3DGS-DR and Ref-Gaussian. [NeRO, Liu et al., SIGGRAPH
-2023]
+by number is a test view, as for 3DGS-DR and Ref-Gaussian. [NeRO, Liu et al., SIGGRAPH 2023]
 """
 
 from __future__ import annotations
@@ -38,19 +37,17 @@ class GlossyReader:
     looks_for = "0-camera.pkl, beside 0.png and 0-depth.png"
 
     def recognises(self, folder: Path) -> bool:
-        """Whether the folder contains cameras."""
-        return any(CAMERA.fullmatch(path.name) for path in folder.glob("*-camera.pkl"))
+        return bool(_numbers(folder))
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        """Read the views of one split, with depths."""
         options.require_png(folder)
-        views = tuple(_view(folder, number, options) for number in _numbers(folder, split))
-        return Recording(views, source=folder)
+        numbers = held_out(_numbers(folder), split, folder)
+        return Recording(tuple(_view(folder, number, options) for number in numbers), source=folder)
 
 
-def _numbers(folder: Path, split: str) -> list[int]:
+def _numbers(folder: Path) -> list[int]:
     found = (CAMERA.fullmatch(path.name) for path in folder.glob("*-camera.pkl"))
-    return held_out(sorted({int(match[1]) for match in found if match}), split, folder)
+    return sorted({int(match[1]) for match in found if match})
 
 
 def _view(folder: Path, number: int, options: ReadOptions) -> View:
@@ -58,8 +55,7 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
     pose, matrix = _arrays(file)
     expected = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
     if not (np.abs(matrix) <= MAX_NUMBER).all() or (matrix != expected).any() or min(np.diag(matrix)) <= 0:
-        what = "no matrix of focal lengths and a principal point"
-        raise InputError(what, file=file, field="K", remedy="copy the file again")
+        raise InputError("no matrix of focal lengths and a principal point", file, "K", "copy the file again")
     to_world = from_world_to_camera(pose[:, :3], pose[:, 3], f"{file}: pose")
     image = ImageFile.of(folder / f"{number}.png", options.downscale, Mask(depths, BACKGROUND))
     pinhole = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
@@ -72,10 +68,7 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
 
 
 def _arrays(path: Path) -> list[np.ndarray]:
-    """The arrays of SHAPES in a pickle; raises InputError for a file with anything else.
-
-    A pickle is a program, which is not run: its text is searched for the types, shapes and bytes of arrays.
-    """
+    """The arrays of SHAPES in a pickle, a program that is not run: its instructions are searched for them."""
     arrays, code, by_columns, sides = list[np.ndarray](), "", False, list[int]()
     try:
         with path.open("rb") as file:
@@ -98,5 +91,5 @@ def _arrays(path: Path) -> list[np.ndarray]:
         if [array.shape for array in arrays] != [*SHAPES]:
             raise ValueError("no pose of 3 × 4 and matrix of 3 × 3 numbers")
     except Exception as error:  # what a broken file raises has no common type
-        raise InputError(str(error)[:100], file=path, field="pickle", remedy="copy the file again") from error
+        raise InputError(str(error)[:100], path, "pickle", "copy the file again") from error
     return arrays

@@ -11,8 +11,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file
 from mi_refgs.io.images import box_downscale, read_png, read_tiff
 
-NORMALS, DISPARITY, ALPHA = "_normal.png", "_disp.tiff", "_alpha.png"
-"""What follows the stem of an image's name in the names of its maps."""
+NORMALS, DISPARITY, ALPHA = "_normal.png", "_disp.tiff", "_alpha.png"  # after the stem of an image's name
 NORMAL_LENGTH = 0.5  # smallest length of an 8-bit normal: no normal is stored as (½, ½, ½)
 
 
@@ -31,7 +30,6 @@ def block_mean(
 
 
 def unit(normal: np.ndarray) -> np.ndarray:
-    """Normalise (H, W, 3); zeros stay."""
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
 
@@ -51,7 +49,7 @@ def shiny_blender_maps(
     """World normals (h, w, 3) and depths (h, w) beside an image of Shiny Blender, each None without a file.
 
     Normals n are stored as (n + 1) / 2 in 8 bits; depths z along the viewing axis as 1 / (1 + z), and 0 off
-    the object. [Ref-NeRF, Verbin et al. 2022] Raises InputError for a map of another size.
+    the object. [Ref-NeRF, Verbin et al. 2022]
     """
     normal = depth = None
     if file := beside(image, NORMALS):

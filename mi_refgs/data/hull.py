@@ -1,6 +1,6 @@
 """Initial points: on and in the visual hull of alpha masks, or in a box, and their colours.
 
-World positions in scene units. `bounds` is a (2, 3) array: the lowest and highest corner of a box.
+`bounds` is a (2, 3) array: the lowest and highest corner of a box.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
-HULL_RESOLUTION, HULL_LEAST = 96, 32
-"""Voxels per edge of the visual hull's grid, most and fewest: as many as pixels along the longer edge."""
+HULL_RESOLUTION, HULL_LEAST = 96, 32  # voxels per edge, most and fewest: as pixels along the longer edge
 HULL_LEVEL = 0.5  # mask level that bounds the hull
 HULL_CARVED = 0.05  # level of the blurred masks below which a voxel is carved and not looked at again
 HULL_SEEN = 0.25  # of the views must see a point of the hull: what hardly any camera sees was never carved
@@ -34,7 +33,7 @@ def axis_projectors(axes: np.ndarray) -> np.ndarray | None:
 def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """The point nearest to the axes of all cameras (3,), and the distance of each camera from it (V,).
 
-    Raises InputError if the view axes have no common point (one view, or parallel ones).
+    Raises InputError for one view and for parallel axes.
     """
     origins = np.array([view.to_world[:3, 3] for view in views], dtype=np.float64).reshape(-1, 3)
     axes = np.array([view.to_world[:3, 2] for view in views], dtype=np.float64).reshape(-1, 3)
@@ -49,10 +48,7 @@ def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def camera_bounds(views: Sequence[View]) -> np.ndarray:
-    """A cube around the point that all cameras look at, as wide as the widest view there: (2, 3).
-
-    Raises InputError if the view axes have no common point (one view, or parallel ones).
-    """
+    """A cube (2, 3) around the point that all cameras look at, as wide as the widest view there."""
     focus, distance = view_focus(views)
     reach = [max(v.width / v.fx, v.height / v.fy) / 2 for v in views]
     half = min(float(np.max(distance * reach)), float(distance.max()))
@@ -90,16 +86,12 @@ class Hull:
         return self.origin + grid * self.voxel, normals
 
     def inner_points(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Uniform points (≤ count, 3) in the volume where the trilinear field is above 0.5.
-
-        Fewer than `count` if the hull fills only a small part of the cells that it touches.
-        """
+        """Uniform points (≤ count, 3) in the hull; fewer if it is small beside the cells that it touches."""
         steps = np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         shape = np.array(self.field.shape) - 1
         parts = [self.field[tuple(slice(a, a + n) for a, n in zip(s, shape, strict=True))] for s in steps]
         cells = np.argwhere(np.max(parts, axis=0) > HULL_LEVEL)
         points = np.empty((0, 3))
-        # Uniform in the touched cells, then by rejection in the hull.
         for _ in range(HULL_DRAWS):
             if not (missing := count - len(points)):
                 break
@@ -113,7 +105,7 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
     """The set of points inside every mask (alpha > 0.5, blurred by half a voxel).
 
     `resolution`: voxels per edge. Only views that see a point carve it, and a quarter of the views must see
-    it. Raises InputError if nothing is inside every mask.
+    it. Raises InputError if it is empty.
     """
     low, high = np.asarray(bounds, dtype=np.float64)
     if resolution is None:
@@ -138,12 +130,11 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
         inside[alive[dead]] = 0
         alive = alive[~dead]
     inside[witnesses < HULL_SEEN * len(views)] = 0
-    # Padding by one voxel closes a hull that touches the bounds; sample 0 of the unpadded field is half a
-    # voxel inside the box.
+    # One voxel closes a hull that touches the bounds; centres of voxels are half a voxel inside the box.
     field = np.pad(inside.reshape((resolution,) * 3), 1)
     if not np.any(field > HULL_LEVEL):
-        remedy = "check cameras and masks, or do not use alpha"
-        raise InputError("no point is inside every mask", "views", "alpha", remedy)
+        what = "no point is inside every mask"
+        raise InputError(what, "views", "alpha", "check cameras and masks, or do not use alpha")
     return Hull(field, low - 0.5 * voxel, voxel)
 
 
@@ -152,8 +143,8 @@ def median_colours(
 ) -> np.ndarray:
     """Median linear colour (N, 3) of the points over at most 32 views that show them with alpha > 0.5.
 
-    `background` (3,) is that of the views. Points that no view shows are 0.5 grey. With `normals`, only views
-    in front of a point count. There is no occlusion test: the median of many views is robust to it.
+    Points that no view shows are 0.5 grey. With `normals`, only views in front of a point count. There is no
+    occlusion test: the median is robust to it.
     """
     if not views or not len(points):
         return np.full((len(points), 3), 0.5)

@@ -1,8 +1,7 @@
 """Images of a data set: where their files are, how a file becomes an image of a view, and a bounded cache.
 
 A file is decoded, its colour multiplied by alpha (its own, or that of a mask), averaged over blocks of
-`downscale` × `downscale` pixels, undistorted and composited onto the background. Rows and columns are those
-of the file: an orientation in its EXIF data is ignored, as in COLMAP.
+pixels, undistorted and composited onto the background. An orientation in EXIF data is ignored, as in COLMAP.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class Mask:
     below: int | None = None  # if given, alpha is 1 where the file's number (a 16-bit depth) is less, else 0
 
     def read(self) -> np.ndarray:
-        """Alpha (H, W) float32; raises InputError for a file that cannot be read."""
+        """Alpha (H, W) float32."""
         if self.below is None:
             return read_mask(self.path)
         return (read_grey(self.path)[0] < self.below).astype(np.float32)
@@ -63,10 +62,7 @@ class ImageFile:
 
     @classmethod
     def of(cls, path: Path, downscale: int, mask: Mask | None = None) -> ImageFile:
-        """The image in a file, of which only the header is read.
-
-        Raises InputError for a file that cannot be used or is smaller than one block of pixels.
-        """
+        """The image in a file, of which only the header is read."""
         width, height = image_size(path)
         if min(width, height) < downscale:
             what = f"{width} × {height} pixels are less than a block of {downscale}²"
@@ -75,7 +71,7 @@ class ImageFile:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the view's image."""
+        """Of the view's image."""
         return self.width // self.downscale, self.height // self.downscale
 
     @property
@@ -88,11 +84,8 @@ class ImageFile:
         return self.mask is not None or header(self.path)
 
     def decode(self) -> np.ndarray:
-        """Decode the file to what `compose` takes, (H, W, 3 or 4): uint8 where the view shows the numbers of
-        the file, else float32, averaged and premultiplied.
-
-        Raises InputError for a file that cannot be read and for a mask of another size.
-        """
+        """Decode the file for `compose`, (H, W, 3 or 4): uint8 where the view shows the numbers of the file,
+        else float32, averaged and premultiplied."""
         linear, factor = self.is_linear_radiance, 1
         if linear:
             pixels = read_exr_image(self.path)
@@ -104,11 +97,10 @@ class ImageFile:
                 return pixels
         mask = None if self.mask is None else self.mask.read()
         if mask is not None and self.mask is not None and mask.shape != (self.height, self.width):
-            what = f"{mask.shape[1]} × {mask.shape[0]} pixels, but {self.path.name} has "
-            what += f"{self.width} × {self.height}"
+            size = f"{mask.shape[1]} × {mask.shape[0]}"
+            what = f"{size} pixels, but {self.path.name} has {self.width} × {self.height}"
             raise InputError(what, self.mask.path, "mask", "make both of one size")
-        width, height = self.size
-        block = self.downscale // factor
+        (width, height), block = self.size, self.downscale // factor
         bands, step = [], max(BAND // block, 1)
         for top in range(0, height, step):
             rows = slice(top * block, min(top + step, height) * block)
@@ -143,7 +135,7 @@ class Pixels(NamedTuple):
 
 
 def compose(decoded: np.ndarray, background: float) -> Pixels:
-    """Composite what `ImageFile.decode` returned onto a background, a number from 0 to 1."""
+    """Composite a decoded image onto a background, a number from 0 to 1."""
     if decoded.dtype == np.uint8:
         decoded = decoded.astype(np.float32) / np.float32(255)
         if decoded.shape[-1] == 4:
@@ -157,10 +149,7 @@ def compose(decoded: np.ndarray, background: float) -> Pixels:
 
 
 class ImageCache:
-    """Decoded images of one data set, the most recently used ones, up to a number of bytes.
-
-    Threads may share it: an image that two of them need is decoded twice at worst.
-    """
+    """The most recently used decoded images of a data set, up to a number of bytes; threads may share it."""
 
     def __init__(self, budget: int | None = None) -> None:
         self.budget = CACHE_BYTES if budget is None else budget
@@ -169,7 +158,7 @@ class ImageCache:
         self._lock = threading.Lock()
 
     def pixels(self, file: ImageFile) -> np.ndarray:
-        """What `ImageFile.decode` returns, decoded unless it is kept; raises InputError as that does."""
+        """What `ImageFile.decode` returns, decoded unless it is kept."""
         with self._lock:
             if file in self._kept:
                 self._kept.move_to_end(file)
@@ -197,25 +186,20 @@ class ImageSource:
         return replace(self, has_alpha=False)
 
     def read(self) -> Pixels:
-        """Decode the image, unless it is in the cache; raises InputError as `ImageFile.decode` does."""
         pixels = compose(self.cache.pixels(self.file), self.background)
         return pixels if self.has_alpha else pixels.without_alpha()
 
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """The folder of images of COLMAP's and LLFF's layouts, `images`, and the folder `masks` beside it."""
+    """The folder `images` of COLMAP's and LLFF's layouts, and the folder `masks` beside it."""
 
     path: Path
     masks: Path | None
 
     @classmethod
     def of(cls, root: Path, flat: bool = False) -> ImageFolder:
-        """`images` below `root`, or if it is missing, the largest copies, such as `images_4`; `flat`: `root`
-        itself may contain the images if there are none.
-
-        Raises InputError if there is no folder of images.
-        """
+        """`images` below `root`, else the largest copies, such as `images_4`, else with `flat` `root`."""
         found = [root / name for name in (IMAGES, *COPIES) if (root / name).is_dir()]
         if not found and flat and any(map(_is_image, root.iterdir())):
             found = [root]
@@ -224,15 +208,12 @@ class ImageFolder:
         return cls(found[0], root / MASKS if (root / MASKS).is_dir() else None)
 
     def names(self) -> list[str]:
-        """Sorted paths of the images, those in subfolders included, unless masks and others are beside."""
+        """Sorted paths of the images, also in subfolders of a folder that contains nothing else."""
         pattern = "**/*" if self.path.name in (IMAGES, *COPIES) else "*"
         return sorted(str(path.relative_to(self.path)) for path in self.path.glob(pattern) if _is_image(path))
 
     def find(self, name: str) -> Path | None:
-        """The file of an image, which may have another ending than the name; None without a file.
-
-        Raises InputError for a name that leads out of the folder.
-        """
+        """The file of an image, which may have another ending than the name; None without a file."""
         file = inside(self.path, name)
         if file is None:
             what = f"{abbreviated(name)} names no file in {self.path.name}"
@@ -240,21 +221,16 @@ class ImageFolder:
         return file if is_file(file) else with_ending(file.with_suffix(""))
 
     def mask(self, name: str) -> Mask | None:
-        """The mask of an image; None without a folder of masks. Raises InputError as `mask_in`."""
         return None if self.masks is None else mask_in(self.masks, name)
 
 
 def mask_in(folder: Path, name: str) -> Mask:
-    """The mask of an image in a folder of masks: `a.jpg.png`, `a.jpg` or `a.png` of `a.jpg`.
-
-    Raises InputError if there is none although others have one.
-    """
+    """The mask of an image in a folder of masks: `a.jpg.png`, `a.jpg` or `a.png` of `a.jpg`."""
     for candidate in (f"{name}.png", name, str(Path(name).with_suffix(".png"))):
         file = inside(folder, candidate)
         if file is not None and is_file(file):
             return Mask(file)
-    remedy = "add it, or remove the folder of masks"
-    raise InputError("missing", folder / f"{name}.png", "mask", remedy)
+    raise InputError("missing", folder / f"{name}.png", "mask", "add it, or remove the folder of masks")
 
 
 def _is_image(path: Path) -> bool:

@@ -47,7 +47,7 @@ class Lens:
 
     @property
     def model(self) -> str:
-        """Name in COLMAP and nerfstudio; COLMAP's OPENCV has no k3."""
+        """Name in COLMAP, whose OPENCV has no k3, and nerfstudio."""
         return "OPENCV_FISHEYE" if self.fisheye else "OPENCV"
 
     @property
@@ -81,24 +81,22 @@ class Lens:
 class Undistortion:
     """Resampling of images of one lens: same size and principal point, focal length × zoom.
 
-    The zoom is the smallest one from 1 on for which every pixel of the result has data. What the lens shows
-    beyond the result's edges (barrel distortion, fisheye) is left out.
+    The zoom is the smallest from 1 on for which every pixel of the result has data.
     """
 
     lens: Lens
-    camera: tuple[int, int, float, float, float, float]  # of the distorted image: as in `undistortion`
+    camera: tuple[int, int, float, float, float, float]  # width, height, fx, fy, cx, cy; distorted image
     zoom: float
 
     def resample(self, image: np.ndarray, order: int = 3) -> np.ndarray:
         """Undistort an (H, W, C) image by splines of `order`, clipped to the range of each channel."""
         with _lock:  # else several threads would compute the same coordinates
             coordinates = _source_coordinates(self)
-
-        def resampled(plane: np.ndarray) -> np.ndarray:
+        result = np.empty((*coordinates.shape[1:], image.shape[-1]), image.dtype)
+        for i, plane in enumerate(np.moveaxis(image, -1, 0)):
             moved = ndimage.map_coordinates(plane, coordinates, order=order, mode="nearest")
-            return np.clip(moved, plane.min(), plane.max())
-
-        return np.stack([resampled(plane) for plane in np.moveaxis(image, -1, 0)], axis=-1)
+            result[..., i] = np.clip(moved, plane.min(), plane.max())
+        return result
 
     def source(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Columns and rows in the distorted image of those in the result; 0 is the first pixel's centre."""
@@ -124,11 +122,7 @@ def _source_coordinates(straight: Undistortion) -> np.ndarray:
 def undistortion(
     lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float
 ) -> Undistortion:
-    """The resampling of images of width × height pixels; fx, fy, cx, cy as in `View`.
-
-    Raises InputError, without a file's name, where no zoom up to MAX_ZOOM gives every pixel data.
-    """
-
+    """The resampling of images; raises InputError where no zoom up to MAX_ZOOM gives every pixel data."""
     camera = (width, height, fx, fy, cx, cy)
     across, down = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
     step = 1e-3  # pixels, for the derivatives

@@ -19,8 +19,7 @@ from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 
-POSES = "poses_bounds.npy"
-COLUMNS = 17
+POSES, COLUMNS = "poses_bounds.npy", 17
 
 
 class LlffReader:
@@ -30,11 +29,9 @@ class LlffReader:
     looks_for = "poses_bounds.npy, beside images"
 
     def recognises(self, folder: Path) -> bool:
-        """Whether the folder contains the poses."""
         return (folder / POSES).is_file()
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        """Read the views of one split."""
         options.require_png(folder)
         source, images = folder / POSES, ImageFolder.of(folder)
         rows, names = read_poses(source), images.names()
@@ -48,12 +45,11 @@ class LlffReader:
 def read_poses(path: Path) -> np.ndarray:
     """The (N, 17) float64 table; raises InputError for a file that cannot be used."""
     try:
-        # A memory map refuses a header that promises more numbers than the file has; `np.load` would
-        # also open archives and pickles.
+        # Unlike `np.load`, it opens no pickle, and refuses a header that promises more than the file has.
         table = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # NumPy raises half a dozen types for broken headers
-        what, again = f"cannot be read ({str(error)[:100]})", "copy the file again"
-        raise InputError(what, path, "NumPy", again) from error
+        what = f"cannot be read ({str(error)[:100]})"
+        raise InputError(what, path, "NumPy", "copy the file again") from error
     if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table) or table.dtype.kind not in "fiu":
         what = f"has shape {table.shape}, not N × {COLUMNS} numbers"
         raise InputError(what, path, remedy="export the poses again")
@@ -67,8 +63,8 @@ def _view(source: Path, images: ImageFolder, options: ReadOptions, name: str, ro
     image = ImageFile.of(images.path / name, options.downscale, images.mask(name))
     down, right, backwards, position, (height, width, focal) = row[:15].reshape(3, 5).T
     if min(height, width, focal) <= 0:
-        what = "height, width and focal length are not positive"
-        raise InputError(what, source, name, "export the poses again")
+        remedy = "export the poses again"
+        raise InputError("height, width and focal length are not positive", source, name, remedy)
     pose = np.eye(4)
     pose[:3] = np.stack([right, -down, backwards, position], axis=-1)
     to_world = rigid(pose, f"{source}: {name}") @ MITSUBA_FROM_OPENGL

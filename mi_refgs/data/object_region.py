@@ -1,10 +1,9 @@
 """The region of interest of an object, from points on the surfaces that images show.
 
-The surfaces that support the object, such as a table or a wall, are planes with all cameras on one side; the
-region ends there. The object is the group of close points above them that most views show. Before a fit there
-are points of stereo, or of structure from motion: the sphere estimated from the cameras grows until it
-contains that group. During a fit there are points everywhere: sphere and more planes enclose the group. World
-positions in scene units.
+The surfaces that support the object are planes with all cameras on one side; the region ends there. The
+object is the group of close points above them that most views show. Before a fit, with points of stereo or
+structure from motion, the sphere estimated from the cameras grows until it contains that group. During a fit,
+with points everywhere, a sphere and more planes enclose it.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from scipy.spatial.distance import cdist
 from mi_refgs.data.region import CAMERA_SHARE, Plane, Region
 from mi_refgs.data.view import View, evenly_spread
 
-# Support planes; lengths in radii of the region.
+# Support planes; lengths are in radii of the region.
 PLANE_REACH = 2.0  # distance from the centre up to which points determine them
 PLANE_MARGIN = 0.04  # height above at which the region begins; half leaves 4 % of the outline to the table
 PLANE_DRAWS = 2_000  # planes through three points: 30 good ones if a quarter of the points is on one
@@ -73,10 +72,9 @@ def support_planes(
     width: float = SPARSE.width,  # half the thickness of a plane, radii
     most: int = PLANE_COUNT,
 ) -> tuple[Plane, ...]:
-    """The planes that support an object in a sphere, at most so many.
+    """The planes that support an object in a sphere, at most so many, each a PLANE_MARGIN above the surface.
 
-    Each is a PLANE_MARGIN above the surface. There are none without enough points on a plane that nearly all
-    cameras look down at.
+    Enough points must be on a plane, and nearly all cameras above it.
     """
     rng = np.random.default_rng(0)
     radius, width = region.radius, width * region.radius
@@ -120,10 +118,7 @@ def support_planes(
 def object_region(
     region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen, scatter: Scatter = SPARSE
 ) -> Region:
-    """The region of an object, from the sphere that the cameras (V, 3) suggest and points (N, 3) on surfaces.
-
-    Without enough points it is that sphere.
-    """
+    """The region of an object, from the sphere that cameras (V, 3) suggest and points (N, 3) on surfaces."""
     region = replace(region, planes=support_planes(points, origins, region, scatter.width))
     group = object_points(region, points, seen, scatter)
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) >= WITHIN_SHARE:
@@ -144,14 +139,13 @@ def shown_whole(views: Sequence[View], region: Region, points: np.ndarray, scatt
 
 
 def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region | None:
-    """The region of an object from points (N, 3) on all surfaces of a fit; else as `object_region`.
+    """The region of an object from points (N, 3) on all surfaces of a fit; None without a group of points.
 
     It is a ball and a box around the object, above the planes of `region`, or, if it has none, above one of
-    these points: a table without texture has no sparse points. None if no group of points is the object.
+    these points: a table without texture has no sparse points.
     """
     if not region.planes:
-        plane = support_planes(points, origins, region, FITTED.width, most=1)
-        region = replace(region, planes=plane)
+        region = replace(region, planes=support_planes(points, origins, region, FITTED.width, most=1))
     group = object_points(region, points, seen, FITTED)
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
         return None
@@ -162,18 +156,14 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
     axes = np.linalg.svd(group - group.mean(axis=0), full_matrices=False)[2]
     normals = np.concatenate([axes, -axes])
     offsets = np.min(group @ normals.T, axis=0) - BOX_MARGIN * region.radius
-    box = tuple(
-        (float(a), float(b), float(c), float(d)) for (a, b, c), d in zip(normals, offsets, strict=True)
-    )
+    box = [(a, b, c, d) for a, b, c, d in np.column_stack([normals, offsets]).tolist()]
     return replace(region, planes=(*region.planes, *box))
 
 
 def _ball_beside_cameras(group: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre (3,) inside of a group (N, 3) around which the ball that cameras allow contains most of it; and
-    the radius that would contain all.
-
-    An object that cameras approach, such as a head on a wall, does not fit into a ball around its middle.
-    """
+    the radius that would contain all: an object that cameras approach, such as a head on a wall, does not fit
+    into a ball around its middle."""
     middle = group.mean(axis=0)
     outwards = group[evenly_spread(len(group), BALL_CENTRES)] - middle
     centres = np.concatenate([middle + share * outwards for share in BALL_SHARES])
@@ -199,12 +189,10 @@ def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatt
     near = np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * region.radius
     points = points[near & region.above(points, scatter.lift * region.radius)]
     points = np.random.default_rng(0).permutation(points)[: 2 * MOST_POINTS]
-    points = points[seen(points) >= SEEN_SHARE]
-    if not len(points):
-        return points
-    link = scatter.link * region.radius
-    number = KDTree(points).query_ball_point(points, link, return_length=True)
-    points = points[number >= LINK_COUNT]
+    points, link = points[seen(points) >= SEEN_SHARE], scatter.link * region.radius
+    if len(points):
+        number = KDTree(points).query_ball_point(points, link, return_length=True)
+        points = points[number >= LINK_COUNT]
     if not len(points):
         return points
     pairs = KDTree(points).query_pairs(link, output_type="ndarray")
@@ -230,8 +218,7 @@ def seen_share(views: Sequence[View], points: np.ndarray) -> np.ndarray:
 def in_free_space(views: Sequence[View], region: Region, points: np.ndarray) -> np.ndarray:
     """Mask (N,) of points (N, 3) that lie in an image, at less than FREE_SHARE of the object's depth.
 
-    Nothing is that close to the camera in a photograph of an object; surfels there fit one image and hide the
-    scene in others.
+    Photographs show nothing there; surfels there fit one image and hide the scene in others.
     """
     centre, found = np.array(region.centre), np.zeros(len(points), bool)
     for view in views:
@@ -240,5 +227,4 @@ def in_free_space(views: Sequence[View], region: Region, points: np.ndarray) -> 
 
 
 def camera_positions(views: Sequence[View]) -> np.ndarray:
-    """World positions (V, 3)."""
     return np.array([view.to_world[:3, 3] for view in views])

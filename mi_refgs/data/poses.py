@@ -10,17 +10,13 @@ import numpy as np
 from mi_refgs.constants import MAX_NUMBER, RIGID_TOLERANCE
 from mi_refgs.errors import InputError
 
-MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""OpenGL's camera: −z forward, +x right, +y up; the matrix is its own inverse."""
-MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""OpenCV's and COLMAP's camera: +z forward, +x right, +y down; the matrix is its own inverse."""
+MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])  # −z forward, +x right, +y up; its own inverse
+MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])  # +z forward, +x right, +y down; its own inverse
 
 
 def poses_around(outward: np.ndarray, centre: np.ndarray, distance: float | np.ndarray) -> np.ndarray:
-    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, of cameras that look at `centre`.
-
-    `outward` (N, 3) are unit directions from there, none of them ±z; `distance` is a number or (N, 1).
-    """
+    """World-from-camera matrices (N, 4, 4) in Mitsuba's frame, z up, of cameras that look at `centre` from
+    unit directions `outward` (N, 3), none of them ±z; `distance` is a number or (N, 1)."""
     left = np.cross([0.0, 0.0, 1.0], -outward)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     up = np.cross(-outward, left)
@@ -58,10 +54,7 @@ def world_to_camera(to_world: np.ndarray) -> np.ndarray:
 
 
 def from_world_to_camera(rotation: np.ndarray, translation: np.ndarray, field: str) -> np.ndarray:
-    """`View.to_world` of a camera with OpenCV's axes in which a world point x is at R x + t.
-
-    Raises InputError, starting with `field`, unless it is rigid.
-    """
+    """`View.to_world` of a camera with OpenCV's axes in which a world point x is at R x + t; as `rigid`."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     rigid(matrix, field)

@@ -1,8 +1,7 @@
-"""The region of interest: a sphere above planes, the contraction of space around it, a guess from cameras.
+"""The region of interest: a sphere above planes that support the object, such as a table or a wall.
 
-Planes are where a table or a wall supports the object. The contraction maps all of space into a ball of twice
-the sphere's radius, so that a grid or random samples in contracted space cover near and far. World positions
-in scene units. [Mip-NeRF 360, Barron et al. 2022, eq. 10]
+The contraction maps all of space into a ball of twice the sphere's radius, so that random samples in
+contracted space cover near and far. [Mip-NeRF 360, Barron et al. 2022, eq. 10]
 """
 
 from __future__ import annotations
@@ -20,8 +19,7 @@ from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import read_json, write_json
 
-REGION_FILE = "region.json"
-"""File in the folder of a data set: the `content` of its region, in scene units."""
+REGION_FILE = "region.json"  # in the folder of a data set: the `content` of its region
 REGION_SHARE = 0.8  # radius estimated from cameras over that of the sphere that the median view shows whole
 CAMERA_SHARE = 0.8  # its largest radius over the nearest camera's distance: cameras are outside of the region
 SAME = 1e-6  # difference of two regions, in radii, up to which they are the same: last digits of solvers
@@ -43,9 +41,7 @@ class Region:
     @staticmethod
     def of(content: object, source: Path | str) -> Region:
         """The region {"centre": [x, y, z], "radius": r, "planes": [[a, b, c, d], …]} of a JSON file or an
-        option, `source`; planes are optional.
-
-        Raises InputError for anything else, and for numbers that no scene has.
+        option, `source`; planes are optional. Raises InputError for anything else.
         """
         given: dict[str, Any] = content if isinstance(content, dict) else {}
         centre, remedy = _numbers(given.get("centre"), 3), "correct or remove them"
@@ -66,13 +62,12 @@ class Region:
 
     @property
     def content(self) -> dict[str, Any]:
-        """What `of` reads of it, for a JSON file."""
+        """What `of` reads."""
         found: dict[str, Any] = {"centre": list(self.centre), "radius": self.radius}
         found |= {"planes": [list(plane) for plane in self.planes]} if self.planes else {}
         return found | ({"estimated": True} if self.estimated else {})
 
     def moved(self, offset: np.ndarray) -> Region:
-        """The region moved by an offset (3,)."""
         x, y, z = (float(c) for c in np.array(self.centre) + offset)
         planes = tuple((a, b, c, d + float(np.dot((a, b, c), offset))) for a, b, c, d in self.planes)
         return replace(self, centre=(x, y, z), planes=planes)
@@ -123,8 +118,7 @@ def _numbers(value: object, count: int) -> list[float] | None:
 def region_of(views: Sequence[View]) -> Region:
     """The sphere around the point that all cameras look at, as large as the median view shows entirely.
 
-    Raises InputError if the view axes have no common point (one view, or parallel ones), if that point is
-    behind half of the cameras (they look outward), and if a camera is at that point.
+    Raises InputError if there is no such point, if it is behind half of the cameras, and if one is there.
     """
     focus, distance = view_focus(views)
     origins = np.array([view.to_world[:3, 3] for view in views])
@@ -132,8 +126,9 @@ def region_of(views: Sequence[View]) -> Region:
     half_angle = np.array([np.arctan(min(v.width / v.fx, v.height / v.fy) / 2) for v in views])
     radius = region_radius(distance, half_angle)
     if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):
-        what = "they do not look at one point in front of them"
-        raise InputError(what, "views", "cameras", "give a region.json")
+        raise InputError(
+            "they do not look at one point in front of them", "views", "cameras", "give a region.json"
+        )
     x, y, z = (float(c) for c in focus)
     return Region((x, y, z), radius, estimated=True)
 
@@ -174,14 +169,10 @@ def region_pixels(view: View, region: Region) -> np.ndarray:
 
 
 def read_region(folder: Path) -> Region | None:
-    """Read region.json of a data set's folder; None without the file.
-
-    Raises InputError for a file that cannot be used.
-    """
+    """The region in region.json of a data set's folder; None without the file."""
     path = folder / REGION_FILE
     return Region.of(read_json(path), path) if path.is_file() else None
 
 
 def write_region(folder: Path, region: Region) -> None:
-    """Write region.json into a data set's folder; raises InputError if it cannot be written."""
     write_json(folder / REGION_FILE, region.content)

@@ -27,7 +27,7 @@ Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a vi
 def registered(view: View, render: Render, distance: float) -> View:
     """The view with the pose whose render differs least from its image.
 
-    `distance`: of what the camera looks at, scene units. The pose stays if no other is better.
+    `distance`: of what the camera looks at, scene units.
     """
     view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
     while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:

@@ -1,8 +1,8 @@
 """Points on the surfaces that photographs with known cameras show, by plane sweep, and the other pixels.
 
-Each view is compared with its neighbours at a series of depths. [Collins 1996] Two patches are compared by
-their normalised cross-correlation, which a difference of exposure does not change. A pixel becomes a point if
-the patches at its best depth look alike, and if the best depths of other views agree with it.
+Each view is compared with its neighbours at a series of depths, by the normalised cross-correlation of
+patches. [Collins 1996] A pixel becomes a point if the patches at its best depth look alike, and if the best
+depths of other views agree with it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ NEAREST = 0.35  # the first of them, in distances of the cameras from the region
 FARTHEST = 20.0  # the last one, in radii of the region beyond its centre; random points end there, too
 PATCH = 5  # side of a compared patch, pixels
 CONTRAST = 0.0045  # standard deviation of a patch, 0 … 1, below which it has no texture: one level of 256
-SIMILAR = 0.75  # correlation from which a depth counts
-SIMILAR_CONFIRMING = 0.5  # the same of a view that confirms the depth
+SIMILAR, SIMILAR_CONFIRMING = 0.75, 0.5  # correlation from which a depth counts, and confirms another
 VOXEL = 0.03  # side of the voxels that are left with one point, in contracted space
 VOXEL_POINTS = 3  # fewest points in a voxel on a surface; stray ones are alone
 LEAST = 50  # points that are left: fewer are chance
@@ -52,8 +51,6 @@ class _Swept:
 
 @dataclass(frozen=True, eq=False)
 class Stereo:
-    """What a plane sweep finds."""
-
     points: PointCloud  # of some pixels, so that what all views show has the most
     spaced: np.ndarray  # (P, 3) evenly in the region, and farther apart with their distance from it
     unknown: PixelRays  # some of the pixels without a point
@@ -93,8 +90,7 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     spaced = points[first[count >= VOXEL_POINTS]]  # one in each voxel
     if len(spaced) < LEAST:
         return None
-    rays = [np.concatenate(parts) for parts in zip(*off, strict=True)]
-    rng = np.random.default_rng(0)
+    rays, rng = [np.concatenate(parts) for parts in zip(*off, strict=True)], np.random.default_rng(0)
     some, rest = rng.permutation(len(points))[:MOST], rng.permutation(len(rays[0]))[:MOST]
     return Stereo(PointCloud(points[some], colours[some]), spaced, PixelRays(*(part[rest] for part in rays)))
 
@@ -105,9 +101,7 @@ def _neighbours(views: Sequence[View], centre: np.ndarray) -> list[list[int]]:
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), NORM_FLOOR)
     away = abs(np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1))) - BASELINE)
     np.fill_diagonal(away, np.inf)
-    return [
-        [int(j) for j in row[: min(NEIGHBOURS, len(views) - 1)]] for row in np.argsort(away, kind="stable")
-    ]
+    return np.argsort(away, kind="stable")[:, : min(NEIGHBOURS, len(views) - 1)].tolist()
 
 
 def _sweep(
@@ -133,7 +127,7 @@ def _sweep(
         volume[~inside] = -1
     similarity = np.sort(volumes, axis=0)[-ALIKE:].mean(axis=0)
 
-    # The best depth that has two neighbours, and the maximum of the parabola through the three.
+    # The best depth, and the maximum of the parabola through it and its neighbours.
     best = np.argmax(similarity[1:-1], axis=0)[None] + 1
     before, there, after = (np.take_along_axis(similarity, best + k, axis=0)[0] for k in (-1, 0, 1))
     bend = before - 2 * there + after

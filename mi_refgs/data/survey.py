@@ -16,7 +16,7 @@ ONE_PLACE = 1e-4  # distance of cameras in one place from their mean, over that 
 
 
 def survey(folder: Path) -> dict[str, Any]:
-    """Survey a data set, reading small images; raises InputError as `read_dataset` and `View.load` do."""
+    """Survey a data set, reading small images."""
     _, width, height = fitting_downscale(folder, "png", 1)
     factor = max(min(width, height) // SMALL_SIDE, 1)
     train = read_dataset(folder, "train", downscale=factor, truth=False)
@@ -65,9 +65,8 @@ def survey_text(found: dict[str, Any]) -> str:
 
 def few_views(count: int) -> str | None:
     """A note if there are few training views, else None."""
-    if count >= FEW_VIEWS:
-        return None
-    return f"only {counted(count, 'training view')}; other views may look wrong"
+    views = counted(count, "training view")
+    return f"only {views}; other views may look wrong" if count < FEW_VIEWS else None
 
 
 def require_several_sides(data: Dataset) -> None:

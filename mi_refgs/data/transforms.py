@@ -4,12 +4,9 @@ Keys, per frame or for the whole file: `camera_angle_x` (radians) or `fl_x`, `ca
 `cy`, `w`, `h` (pixels), and of the lens `k1` … `k4`, `p1`, `p2`, `is_fisheye`, `camera_model`. `frames` have
 `file_path` (with or without extension), `transform_matrix` (camera to world, OpenGL axes) and optionally
 `exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along the viewing axis), `albedo_path` (R, G, B, A),
-`roughness_path`, `metallic_path` (Y, A; A: defined there), as `synthesis.make_dataset` writes them. Shiny
-Blender's maps are found by their names.
-
-nerfstudio's `mask_path` (bright: object) becomes alpha; without it, and without alpha, the file of the
-image's name in the folder `masks`. `ply_file_path` names points in the frame of the poses.
-`train_filenames` and `test_filenames` (or `val_filenames`) list the images of a split.
+`roughness_path`, `metallic_path` (Y, A; A: defined there), and `mask_path` (bright: object). Without it and
+without alpha, the file of the image's name in `masks` is the mask. `ply_file_path` names points in the frame
+of the poses; `train_filenames` and `test_filenames` (or `val_filenames`) list the images of a split.
 """
 
 from __future__ import annotations
@@ -34,15 +31,12 @@ from mi_refgs.io.files import inside, is_file, read_json, require_file
 from mi_refgs.io.images import ENDINGS, linear_from_srgb, with_ending
 from mi_refgs.io.ply import read_vertices
 
-SUFFIXES = (*ENDINGS, ".exr")
-"""Endings that `file_path` may have or omit, in the order in which they are tried."""
+SUFFIXES = (*ENDINGS, ".exr")  # that `file_path` may have or omit, in the order in which they are tried
 CAMERA_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 CAMERA_MODELS |= {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-"""Values of `camera_model`, as COLMAP and nerfstudio name them."""
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of unsupported lenses, refused unless they are 0 or false."""
-MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}
-"""Channels of the ground-truth maps."""
+MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}  # channels of ground truth
 
 
 class TransformsReader:
@@ -52,11 +46,9 @@ class TransformsReader:
     looks_for = "transforms_train.json or transforms.json"
 
     def recognises(self, folder: Path) -> bool:
-        """Whether the folder contains a transforms file."""
         return any(folder.glob("transforms*.json"))
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        """Read the views of one split; the environment map is `environment.exr`."""
         frames = _frames(folder, split)
         views = tuple(_view(frame, options) for frame in frames)
         light, file, points = folder / "environment.exr", frames[0].file, None
@@ -76,7 +68,6 @@ class Frame:
 
     @staticmethod
     def all_of(file: Path) -> list[Frame]:
-        """The frames of a file."""
         content = read_json(file)
         frames = content.get("frames")
         if not isinstance(frames, list):
@@ -88,12 +79,10 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """`file_path` as the file gives it; empty without one."""
         name = self.own.get("file_path")
         return name if isinstance(name, str) else ""
 
     def refuse(self, key: str, what: str, remedy: str) -> InputError:
-        """The InputError for the value of a key."""
         return InputError(what, self.file, f"{self.place}.{key}" if key in self.own else key, remedy)
 
     def path(self, key: str) -> Path | None:
@@ -102,7 +91,6 @@ class Frame:
         return None if name in (None, "") else _inside(self.file, f"{self.place}.{key}", name)
 
     def number(self, key: str, positive: bool = False) -> float | None:
-        """The number of a key; None without one."""
         value = self.given.get(key)
         if value is None:
             return None
@@ -119,8 +107,7 @@ class Frame:
         except (KeyError, TypeError, ValueError, OverflowError):
             matrix = np.empty(0)
         if matrix.shape != (4, 4):
-            remedy = "give the camera-to-world matrix"
-            raise InputError("missing or not 4 × 4 numbers", self.file, field, remedy)
+            raise InputError("missing or not 4 × 4 numbers", self.file, field, "give camera to world")
         return rigid(matrix, f"{self.file}: {field}") @ MITSUBA_FROM_OPENGL
 
     def lens(self) -> Lens | None:
@@ -140,7 +127,6 @@ class Frame:
         return Lens.of(fisheye, given)
 
     def focal_lengths(self, width: float, height: float) -> tuple[float, float]:
-        """fx and fy, pixels of an image of this size."""
         focal: list[float | None] = []
         for length, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
             pixels, radians = self.number(length, positive=True), self.number(angle, positive=True)
@@ -149,21 +135,18 @@ class Frame:
                     raise self.refuse(angle, f"{radians:g} is not between 0 and π", "give radians")
                 pixels = 0.5 * size / math.tan(radians / 2)
             focal.append(pixels)
-        fx, fy = focal
-        if fx is None:
+        if focal[0] is None:
             raise InputError("missing", self.file, "camera_angle_x", "give radians, or fl_x in pixels")
-        return fx, fy or fx
+        return focal[0], focal[1] or focal[0]
 
 
 def _frames(folder: Path, split: str) -> list[Frame]:
-    """The frames of a split."""
     own = folder / f"transforms_{split}.json"
     shared = [p for p in (folder / "transforms_train.json", folder / "transforms.json") if p.is_file()]
     # A training file beside a test file is used whole; alone, it is shared by both splits.
     whole = own.is_file() and (split != "train" or (folder / "transforms_test.json").is_file())
     if not whole and (split not in ("train", "test") or not shared):
-        remedy = "give a complete data set in the Blender convention"
-        raise InputError("missing", folder, own.name, remedy)
+        raise InputError("missing", folder, own.name, "give a complete data set in the Blender convention")
     file = own if whole else shared[0]
     frames = Frame.all_of(file)
     if not whole and frames:
@@ -183,8 +166,7 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
     for key in ("train", "val", "test"):
         names = frames[0].given.get(f"{key}_filenames") or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            field, remedy = f"{key}_filenames", "correct it, or remove it"
-            raise InputError("not a list of paths", frames[0].file, field, remedy)
+            raise InputError("not a list of paths", frames[0].file, f"{key}_filenames", "correct it")
         lists[key] = {*names}
     test = lists["test"] or lists["val"]
     if not test or split == "test":
@@ -193,7 +175,6 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
 
 
 def _inside(transforms: Path, field: str, name: object) -> Path:
-    """The file in the data set's folder that a transforms file names."""
     file = inside(transforms.parent, name)
     if file is None:
         what = f"{abbreviated(name)} names no file in the data set's folder"
@@ -204,8 +185,7 @@ def _inside(transforms: Path, field: str, name: object) -> Path:
 def read_points(path: Path) -> PointCloud | None:
     """Read points of a PLY file: x, y, z and red, green, blue of 8 bits or 0 … 1, sRGB-encoded.
 
-    Points without usable numbers are left out; None without any. Raises InputError for a file that is
-    missing or unusable.
+    Points without usable numbers are left out; None without any.
     """
     require_file(path)
     with path.open("rb") as file:
@@ -226,7 +206,6 @@ def read_points(path: Path) -> PointCloud | None:
 
 
 def _view(frame: Frame, options: ReadOptions) -> View:
-    """The view of a frame, with its ground truth."""
     file = _image(frame, options.images)
     image = ImageFile.of(file, options.downscale)
     image = replace(image, mask=_mask(frame, image))
@@ -266,7 +245,6 @@ def _mask(frame: Frame, image: ImageFile) -> Mask | None:
 
 
 def _image(frame: Frame, images: str) -> Path:
-    """The image file of a frame; `images` as in `ReadOptions`."""
     path = frame.path("file_path")
     if path is None:
         raise InputError("missing", frame.file, f"{frame.place}.file_path", "name the image")
@@ -285,7 +263,6 @@ def _image(frame: Frame, images: str) -> Path:
 
 
 def _intrinsics(frame: Frame, image: ImageFile) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels of the image file."""
     width, height = image.width, image.height
     for key, size in (("w", width), ("h", height)):
         wanted = frame.number(key, positive=True)
@@ -301,8 +278,7 @@ def _map(
 ) -> np.ndarray:
     """A map of `expected` shape, at the view's size: per pixel the mean over the surface in its block.
 
-    The last of two or four channels says where the others are defined; it becomes the fraction of the block
-    where they are.
+    The last of two or four channels, where the others are defined, becomes the fraction of the block.
     """
     pixels = read_exr_image(file, vectors=True)
     if pixels.shape != expected:

@@ -16,8 +16,7 @@ from mi_refgs.io.images import box_downscale, linear_from_srgb, srgb_from_linear
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera
 
-ALPHA_FLOOR = 1e-3
-"""Alpha by which colour is divided at least: 8 bits do not resolve the colour of fainter pixels."""
+ALPHA_FLOOR = 1e-3  # by which colour is divided at least: 8 bits do not resolve fainter pixels
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,7 @@ class FileCamera:
 class View:
     """One image and its camera.
 
-    Readers return views that are not loaded, because all images of a data set may not fit into memory: call
-    `load` before `image`, `alpha` and what depends on them, which raise RuntimeError otherwise.
+    Readers return views that are not loaded: call `load` before `image`, `alpha` and what depends on them.
     """
 
     name: str
@@ -53,17 +51,14 @@ class View:
     depth: np.ndarray | None = None  # (H, W) float32 along the viewing axis, 0 off the object
     is_linear_radiance: bool = False  # of `image`: EXR; else it is sRGB-encoded
     materials: dict[str, np.ndarray] = field(default_factory=dict)
-    """Those known of albedo, roughness, metallic: (H, W, C + 1) float32, the last the fraction of the pixel
-    that the others describe; all 0 where it is 0."""
+    """Known ones of albedo, roughness, metallic: (H, W, C + 1) float32, the last the fraction of the pixel
+    that the others describe."""
     exposure: float | None = None  # log(time · ISO / f-number²) from EXIF data
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
     file: FileCamera | None = None  # from which the image was read
 
     def load(self) -> View:
-        """The view with its image decoded, from the data set's cache if it is there; itself if it is loaded.
-
-        Raises InputError for a file that cannot be read, and for pixels whose shape is not that of the view.
-        """
+        """The view with its image decoded; raises InputError for an unreadable file or another size."""
         if isinstance(self.pixels, ImageSource):
             return replace(self, pixels=self.pixels.read()).load()
         for name, pixels, channels in (("image", self.pixels.image, (3,)), ("alpha", self.pixels.alpha, ())):
@@ -75,7 +70,7 @@ class View:
 
     @property
     def has_alpha(self) -> bool:
-        """Whether the image has alpha; the view need not be loaded."""
+        """The view need not be loaded."""
         return self.pixels.has_alpha
 
     @property
@@ -85,7 +80,7 @@ class View:
 
     @property
     def alpha(self) -> np.ndarray | None:
-        """Alpha (H, W) float32; None without any, for which the view need not be loaded."""
+        """Alpha (H, W) float32; None without any."""
         return self._loaded("alpha").alpha if self.has_alpha else None
 
     def _loaded(self, name: str) -> Pixels:
@@ -106,10 +101,7 @@ class View:
         return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
 
     def covered(self) -> np.ndarray:
-        """Coverage of each pixel by the object, (H, W): alpha, or 1 where ground truth has a surface.
-
-        It is 1 everywhere without alpha and ground truth.
-        """
+        """Coverage of pixels by the object, (H, W): alpha, or whether ground truth has a surface, or 1."""
         if self.alpha is not None:
             return self.alpha
         if self.normal is not None:
@@ -119,10 +111,9 @@ class View:
         return np.ones((self.height, self.width), np.float32)
 
     def averaged(self, block: int) -> View:
-        """The loaded view averaged over blocks of `block` × `block` pixels, without ground-truth maps.
+        """The loaded view averaged over `block` × `block` pixels, without ground-truth maps.
 
-        Pixels at the right and the bottom that fill no block are left out. Raises InputError for an image
-        smaller than one block.
+        Raises InputError for an image smaller than one block.
         """
         if min(self.width, self.height) < block:
             what = f"{self.width} × {self.height} pixels are less than a block of {block}²"
@@ -141,7 +132,7 @@ class View:
         return colour if self.is_linear_radiance else linear_from_srgb(np.clip(colour, 0, 1))
 
     def depth_of(self, points: np.ndarray) -> np.ndarray:
-        """Depth of world points (..., 3) along the viewing axis, scene units: (...)."""
+        """Depth (...) of world points (..., 3) along the viewing axis."""
         return np.asarray((points - self.to_world[:3, 3]) @ self.to_world[:3, 2])
 
     def rays(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:

@@ -143,7 +143,7 @@ def relight(
 def _true_views(method: Method, folder: Path, views: Dataset) -> Dataset:
     """Read the test views under a light of the data set; raises InputError unless they have its cameras."""
     found = read_dataset(
-        folder, "test", downscale=method.data.downscale, background="black", images="exr", truth=False
+        folder, "test", downscale=method.data.downscale or 1, background="black", images="exr", truth=False
     )
     if len(found.views) != len(views.views) or any(
         np.abs(a.to_world - b.to_world).max() > 1e-6 for a, b in zip(found.views, views.views, strict=True)

@@ -39,9 +39,9 @@ def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: No
 
 def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Dataset:
     """A split of a data set, read as a method says; raises InputError as `read_dataset` does."""
-    data = method.data
+    data, downscale = method.data, method.data.downscale or 1
     return read_dataset(
-        path, split, downscale=data.downscale, background=data.background, images=data.images, truth=truth
+        path, split, downscale=downscale, background=data.background, images=data.images, truth=truth
     )
 
 

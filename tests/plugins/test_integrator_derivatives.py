@@ -95,7 +95,8 @@ def test_a_parameter_that_changes_nothing_has_tangent_zero() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "derived", "most"), [("position", False, WIDTH * HEIGHT // 3), ("light", True, None)]
+    ("key", "derived", "most"),
+    [("position", False, WIDTH * HEIGHT // 3), ("light", True, None), ("albedo", False, None)],
 )
 def test_tangents_add_up_over_losses(
     key: str, derived: bool, most: int | None, monkeypatch: pytest.MonkeyPatch
