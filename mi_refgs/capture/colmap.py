@@ -244,21 +244,6 @@ class Solved:
         )
 
 
-def with_lens(model: Reconstruction, kind: str) -> tuple[Any, float]:
-    """Bundle-adjusted copy of a reconstruction with another lens model; mean reprojection error, pixels."""
-    pycolmap = load()
-    copy = pycolmap.Reconstruction(model)
-    for camera in copy.cameras.values():
-        focal = camera.focal_length_x, camera.focal_length_y
-        radial = camera.params[3] if camera.model_name == "SIMPLE_RADIAL" else 0.0
-        known = {"f": sum(focal) / 2, "fx": focal[0], "fy": focal[1], "k1": radial}
-        known |= {"cx": camera.principal_point_x, "cy": camera.principal_point_y}
-        camera.model = getattr(pycolmap.CameraModelId, kind)
-        camera.params = [known.get(name, 0.0) for name in MODELS[kind][1].split()]
-    adjust(copy)
-    return copy, float(copy.compute_mean_reprojection_error())
-
-
 def adjust(model: Reconstruction) -> None:
     """Bundle adjustment of everything but the principal points."""
     pycolmap = load()
@@ -273,10 +258,20 @@ def adjust(model: Reconstruction) -> None:
 
 
 def best_lens(model: Reconstruction) -> Reconstruction:
-    """The reconstruction with the simplest lens model that fits the observations."""
-    best, error = with_lens(model, LENS_MODELS[0])
-    for kind in LENS_MODELS[1:]:
-        richer, lower = with_lens(model, kind)
+    """The reconstruction with the simplest lens model that fits the observations, bundle-adjusted."""
+    pycolmap = load()
+    best, error = model, np.inf
+    for kind in LENS_MODELS:
+        copy = pycolmap.Reconstruction(model)
+        for camera in copy.cameras.values():
+            focal = camera.focal_length_x, camera.focal_length_y
+            radial = camera.params[3] if camera.model_name == "SIMPLE_RADIAL" else 0.0
+            known = {"f": sum(focal) / 2, "fx": focal[0], "fy": focal[1], "k1": radial}
+            known |= {"cx": camera.principal_point_x, "cy": camera.principal_point_y}
+            camera.model = getattr(pycolmap.CameraModelId, kind)
+            camera.params = [known.get(name, 0.0) for name in MODELS[kind][1].split()]
+        adjust(copy)
+        lower = float(copy.compute_mean_reprojection_error())
         if lower < (1 - LENS_GAIN) * error:
-            best, error = richer, lower
+            best, error = copy, lower
     return best

@@ -157,7 +157,7 @@ def _solve(
 def _groups(
     photographs: Sequence[Photograph], images: Path, model: str
 ) -> list[tuple[list[str], str, list[float]]]:
-    """Images, lens model and, with EXIF data, parameters of each camera: of equal size, device and focal length."""
+    """Images, lens model and, with EXIF data, parameters per camera: of one size, device, focal length."""
     cameras: dict[Any, list[Photograph]] = {}
     for photograph in photographs:
         cameras.setdefault((photograph.kept_size, photograph.device, photograph.focal), []).append(photograph)

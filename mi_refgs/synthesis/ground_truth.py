@@ -1,11 +1,9 @@
 """Ground truth from a Mitsuba scene: materials of its BSDFs at surface points, and its surface as a mesh.
 
 Which of them a BSDF defines follows from the names of its parameters, see RULES. Albedo is the reflectance of
-the diffuse base, or F0 of a metal; a texture counts where it is. The base of a nonlinear plastic multiplies
-the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). Roughness is √α, for an anisotropic metal of the geometric mean
-of both; that of `diffuse` is undefined. `twosided`, `mask`, `bumpmap` and `normalmap` have the materials of
-their nested BSDF, a `blendbsdf` those of the one with all the weight. Everything else (glass, hair, measured,
-a `principled` that transmits) is unknown: A = 0.
+the diffuse base, or F0 of a metal; the base of a nonlinear plastic multiplies the light inside by
+ρ (1 - Fᵢ) / (1 - ρ Fᵢ). Roughness is √α, for an anisotropic metal of the geometric mean of both; that of
+`diffuse` is undefined. Everything else (glass, hair, measured, a `principled` that transmits) is unknown.
 """
 
 from __future__ import annotations
@@ -43,7 +41,6 @@ class Materials(NamedTuple):
         return Materials(pair(mi.Color3f, albedo), pair(mi.Float, roughness), pair(mi.Float, metallic))
 
     def where(self, mask: Bool, other: Materials) -> Materials:
-        """These materials under the mask, the others elsewhere."""
         import drjit as dr
 
         pairs = zip(self, other, strict=True)
@@ -64,10 +61,7 @@ class Materials(NamedTuple):
 
 
 def materials_at(scene: Scene, si: Any) -> Materials:
-    """Materials of the scene's shapes at their surface interactions `si`.
-
-    Instances of shape groups are unknown: their BSDFs are not listed in the scene.
-    """
+    """Materials of the scene's shapes at surface interactions `si`; of instances of groups unknown."""
     import mitsuba as mi
 
     found, here = Materials.of(), si.bsdf()
@@ -115,7 +109,6 @@ class _Parameters:
         return mi.Color3f(default if texture is None else texture.eval(self.si, self.active))
 
     def nested(self, name: str, si: Any = None) -> Materials:
-        """The materials of a nested BSDF."""
         return _of(self.children[name], self.si if si is None else si, self.active)
 
 
@@ -187,12 +180,10 @@ RULES: tuple[tuple[tuple[str, ...], Callable[[_Parameters], Materials]], ...] = 
 def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 and faces (F, 3) of shapes of a scene, concatenated.
 
-    Spheres, disks and cylinders are tessellated with vertices on the surface. Raises InputError that names a
-    shape of any other kind but meshes.
+    Spheres, disks and cylinders are tessellated. Raises InputError that names another shape but a mesh.
     """
     vertices, faces, count = [], [], 0
-    for shape in shapes:
-        points, triangles = _triangles(shape)
+    for points, triangles in map(_triangles, shapes):
         vertices.append(points)
         faces.append(triangles + count)
         count += len(points)
@@ -208,32 +199,26 @@ def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     name = shape.class_name()
     params = mi.traverse(shape)
     if name not in UNIT_SHAPES or "to_world" not in params:
-        what, remedy = f"a {name} cannot be tessellated", "use a mesh, sphere, disk or cylinder"
-        raise InputError(what, field=f"shape '{shape.id()}'", remedy=remedy)
+        remedy = "use a mesh, sphere, disk or cylinder"
+        raise InputError(f"a {name} cannot be tessellated", field=f"shape '{shape.id()}'", remedy=remedy)
     unit = UNIT_SHAPES[name]()
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     return np.asarray(unit.vertices) @ matrix[:3, :3].T + matrix[:3, 3], np.asarray(unit.faces)
 
 
-def _disk() -> trimesh.Trimesh:
-    """The unit disk around the origin, across z."""
-    disk = _cylinder(wall=False)
-    disk.vertices *= (1, 1, 0)
-    return disk
-
-
-def _cylinder(wall: bool = True) -> trimesh.Trimesh:
-    """The open cylinder of radius 1 from z = 0 to z = 1; without the wall, its upper cap."""
+def _cylinder(wall: bool) -> trimesh.Trimesh:
+    """The open cylinder of radius 1 from z = 0 to z = 1; without the wall, the unit disk."""
     closed = trimesh.creation.cylinder(radius=1, segment=[(0, 0, 0), (0, 0, 1)], sections=ROUND_SIDES)
     up = closed.face_normals[:, 2]
     closed.update_faces(np.abs(up) < 0.5 if wall else up > 0.5)
     closed.remove_unreferenced_vertices()
+    closed.vertices *= (1, 1, wall)
     return closed
 
 
 UNIT_SHAPES = {
     "Sphere": lambda: trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS),
-    "Disk": _disk,
-    "Cylinder": _cylinder,
+    "Disk": lambda: _cylinder(wall=False),
+    "Cylinder": lambda: _cylinder(wall=True),
 }
 """Tessellations of the unit shapes that Mitsuba transforms by `to_world`."""

@@ -47,14 +47,7 @@ from mi_refgs.synthesis.pathtrace import (
     incident_image,
     reach,
 )
-from mi_refgs.synthesis.settings import (
-    RELIGHT,
-    SURFACE,
-    load_scene,
-    prepare_folder,
-    under_light,
-    without,
-)
+from mi_refgs.synthesis.settings import RELIGHT, SURFACE, load_scene, prepare_folder, under_light, without
 from mi_refgs.types import Scene
 
 SURFACE_VOXELS = 2048  # along the diameter of surface.ply: rays start 2 off, ten times a sphere's error
@@ -72,21 +65,15 @@ def make_dataset(
 ) -> Path:
     """Path-trace a data set of a Mitsuba scene into the folder `out`, which is returned.
 
-    Cameras are on a sphere around the scene's bounding sphere and look at its centre, z up; training and test
-    views are two lattices, evenly spread over the band of elevations, rotated and jittered by the seed. The
-    pixel filter is a box, and emitters are hidden from the camera (alpha 0).
+    Cameras are on a sphere around the scene's bounding sphere and look at its centre, z up, evenly spread
+    over the band of elevations. The pixel filter is a box, and emitters are hidden from the camera (alpha 0).
 
     `options`: those of `DatasetOptions`, such as `views`, `size`, `spp`.
-    `relight`: maps (or one) under which the test views are traced again, each in a folder of its name without
-    suffix.
+    `relight`: maps (or one) under which the test views are traced again, each in a folder of its name.
     `overwrite`: remove the views in the folder.
 
-    A folder that the same settings left unfinished is continued. Files are written atomically. A Dr.Jit
-    variant must be set.
-
-    Raises InputError if an option is unknown or out of range, the scene or a light cannot be loaded, a shape
-    cannot be tessellated, a camera is at the object, the folder cannot be written, or it contains a
-    data set of other settings or foreign files and `overwrite` is false.
+    A folder that the same settings left unfinished is continued. A Dr.Jit variant must be set. Raises
+    InputError for options, scenes and lights that cannot be used, and for a folder with other files.
     """
     # Settings.
     scene, out = Path(scene), Path(out)
@@ -98,7 +85,7 @@ def make_dataset(
     lights = [relight] if isinstance(relight, str | Path) else relight
     settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
 
-    # The scene under each light, and its surface; all input is read before anything is written.
+    # The scene under each light, and its surface.
     loaded = load_scene(scene, whole=bool(given.objects))
     about = named_shapes(loaded, given.objects, scene)
     shapes = about or loaded.shapes()
@@ -134,7 +121,6 @@ def make_dataset(
 
 
 def named_shapes(scene: Scene, ids: Sequence[str], file: Path) -> list[Any]:
-    """The shapes of a scene with these ids; raises InputError for an id that none has."""
     found = {shape.id(): shape for shape in scene.shapes()}
     missing = [name for name in ids if not name or name not in found]
     if missing:
@@ -148,9 +134,7 @@ def write_views(
 ) -> None:
     """Write the environment map, the views with `maps`, and then the transforms of some splits."""
     cameras = tracer.cameras
-    views = {
-        split: [(f"{split}/r_{i:03d}", *job) for i, job in enumerate(cameras.of(split))] for split in splits
-    }
+    views = {s: [(f"{s}/r_{i:03d}", *job) for i, job in enumerate(cameras.of(s))] for s in splits}
     light, height = out / "environment.exr", cameras.options.environment_height
     if height and cameras.objects and not light.exists():
         room = without(tracer.scene, cameras.objects)

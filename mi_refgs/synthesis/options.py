@@ -21,11 +21,7 @@ from mi_refgs.io.files import require_file
 optional = partial(arg, help_behavior_hint="")
 Count = Annotated[int, arg(metavar="N")]
 Range = tuple[float, float]
-OPTIONS = {
-    "spp": "--samples",
-    "test_views": "--test-views",
-    "resolution": "--size",
-}  # of `refgs dataset`, of another name
+OPTIONS = {"spp": "--samples", "test_views": "--test-views", "resolution": "--size"}  # of `refgs dataset`
 WHOLE = (lambda n: n >= 1 and n % 1 == 0, "give a whole number of at least 1")
 RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("views", "spp", "max_depth", "test_views"), WHOLE),
@@ -76,7 +72,6 @@ class DatasetOptions:
 
     @property
     def resolution(self) -> tuple[int, int]:
-        """Width and height, pixels."""
         return (self.size, self.size) if isinstance(self.size, int) else self.size
 
     @property
@@ -85,13 +80,11 @@ class DatasetOptions:
         return 0.5 * min(self.resolution) / math.tan(math.radians(self.fov) / 2)
 
     def count(self, split: str) -> int:
-        """Number of views of a split."""
         if split == "train":
             return self.views
         return max(1, self.views // 4) if self.test_views is None else self.test_views
 
     def check(self, scene: Path) -> None:
-        """Raise InputError for an option of a wrong type or out of range."""
         for field, (good, remedy) in RANGES.items():
             value = getattr(self, field)
             try:
@@ -103,7 +96,7 @@ class DatasetOptions:
                 raise InputError(f"{abbreviated(value)} is out of range", scene, option, remedy)
 
     def record(self, scene: Path) -> dict[str, Any]:
-        """The content of dataset.json; raises InputError for a scene or light that cannot be read."""
+        """The content of dataset.json."""
         light = None if self.light is None else LightFile.of(Path(self.light))
         width, height = self.resolution
         values = vars(self) | {
@@ -130,7 +123,6 @@ class LightFile:
 
     @staticmethod
     def of(path: Path) -> LightFile:
-        """Hash a file; raises InputError if it is missing."""
         require_file(path)
         name = re.sub(r"[^0-9A-Za-z_-]+", "_", path.stem).strip("_") or "light"
         return LightFile(path, name, hashlib.sha256(path.read_bytes()).hexdigest())

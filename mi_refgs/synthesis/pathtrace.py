@@ -28,9 +28,8 @@ MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "met
 def bounding_sphere(shapes: Sequence[Any]) -> tuple[np.ndarray, float]:
     """Centre (3,) of the shapes' bounding box, and the radius around it that contains every surface."""
     boxes = [shape.bbox() for shape in shapes]
-    low = np.min([np.array(box.min, dtype=np.float64) for box in boxes], axis=0)
-    high = np.max([np.array(box.max, dtype=np.float64) for box in boxes], axis=0)
-    centre = (low + high) / 2
+    low, high = np.min([box.min for box in boxes], axis=0), np.max([box.max for box in boxes], axis=0)
+    centre = (low.astype(np.float64) + high) / 2
     return centre, reach(shapes, centre)
 
 
@@ -61,9 +60,8 @@ def camera_poses(
 ) -> np.ndarray:
     """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up.
 
-    A spherical Fibonacci lattice over the band of elevations (degrees): equal areas, rotated by a random
-    azimuth and jittered by a third of its spacing, then compressed into the range of azimuths (degrees).
-    Distances from the centre are uniform between the two.
+    A spherical Fibonacci lattice over the band of elevations (degrees), rotated by a random azimuth, jittered
+    by a third of its spacing, and compressed into the range of azimuths (degrees).
     """
     low, high = (math.sin(math.radians(e)) for e in elevation)
     jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
@@ -79,9 +77,8 @@ def camera_poses(
 def environment_image(scene: Scene, height: int) -> np.ndarray:
     """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`.
 
-    An `envmap` with an identity `to_world` shows the same radiance: first row at +y, last at -y; column 0
-    beside −z, turning to +x. An `envmap` of this size that is not rotated is returned unchanged; finer ones
-    are averaged (`shade.lobe_matrices.resample`).
+    First row at +y, last at -y; column 0 beside −z, turning to +x. An `envmap` of this size that is not
+    rotated is returned unchanged; finer ones are averaged.
     """
     import drjit as dr
     import mitsuba as mi
@@ -102,10 +99,7 @@ def environment_image(scene: Scene, height: int) -> np.ndarray:
 
 
 def incident_image(scene: Scene, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
-    """Path-traced radiance (h, 2 h, 3) that arrives at a point (3,), h = `environment_height`.
-
-    Emitters are visible; the grid is that of `environment_image`.
-    """
+    """Path-traced radiance that arrives at a point (3,), on the grid of `environment_image`."""
     import drjit as dr
     import mitsuba as mi
 
@@ -152,15 +146,12 @@ class Cameras:
 
     @property
     def distance(self) -> tuple[float, float]:
-        """Distance from the centre to the nearest and the farthest camera."""
+        """Of the nearest and the farthest camera from the centre."""
         filling = self.radius / (FILL * math.sin(math.radians(self.options.fov) / 2))
         return self.options.distance or (filling, filling)
 
     def of(self, split: str) -> list[tuple[np.ndarray, int]]:
-        """Pose and seed of each view of a split.
-
-        Random streams are independent: one per split for the cameras, one per view for its paths.
-        """
+        """Pose and seed of each view of a split, from independent random streams."""
         options, index = self.options, ("train", "test").index(split)
         rng, count = np.random.default_rng([options.seed, index]), options.count(split)
         poses = camera_poses(count, self.centre, self.distance, options.elevation, rng, options.azimuth)
@@ -171,8 +162,8 @@ class Cameras:
 class Tracer:
     """One sensor that moves from view to view, so that each kernel is compiled once.
 
-    Images have alpha, and emitters are hidden, unless `cameras` have the objects of an open scene: then
-    images show everything, and maps are of those shapes only.
+    If `cameras` have the objects of an open scene, images show everything, also emitters, without alpha, and
+    maps are of those shapes only.
     """
 
     def __init__(self, scene: Scene, cameras: Cameras) -> None:
@@ -214,11 +205,7 @@ class Tracer:
         return image
 
     def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
-        """The maps of MAPS at pixel centres, where `covered` (H, W), which excludes hidden emitters.
-
-        Maps of an open scene are those of its objects. They are not averaged per pixel: a mean across an edge
-        would belong to no surface.
-        """
+        """The maps of MAPS at pixel centres, where `covered` (H, W), which excludes hidden emitters."""
         import drjit as dr
         import mitsuba as mi
 

@@ -26,41 +26,32 @@ FILES = (
     *(f"{split}/*.{ending}" for split in ("train", "test") for ending in ("png", "exr")),
 )
 """Files of a data set, and of its views under another map, which overwriting removes."""
-Z_UP = (1, 0, 0), 90.0
-"""Axis and angle in degrees that rotate y of a lat-long map to z, in scenes without an `envmap`."""
 
 
 def load_scene(scene: Path, whole: bool = False) -> Any:
-    """Load a Mitsuba scene; raises InputError if that fails, or the scene has no shape or no emitter.
-
-    `whole`: keep shapes and their ids; otherwise Mitsuba merges meshes of one material.
-    """
+    """Load a Mitsuba scene; `whole`: keep shapes and their ids, else meshes of one material are merged."""
     import mitsuba as mi
 
     try:
         with mitsuba_exr():
             loaded = mi.load_file(str(scene), optimize=not whole)
     except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
-        what = f"Mitsuba cannot load it: {error}"
-        raise InputError(what, scene, "scene", "correct the scene") from error
-    if not loaded.shapes():
-        raise InputError("the scene has none", scene, "shapes", "add an object to look at")
-    if not loaded.emitters():
-        raise InputError("the scene has none", scene, "emitters", "add an environment emitter")
+        raise InputError(f"Mitsuba cannot load it: {error}", scene, "scene", "correct the scene") from error
+    for kind, there in (("shapes", loaded.shapes()), ("emitters", loaded.emitters())):
+        if not there:
+            raise InputError("the scene has none", scene, kind, "add an object and a light")
     return loaded
 
 
 def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
     """The scene with a lat-long map (EXR, HDR) in place of its environment; its other emitters are kept.
 
-    `objects`: shapes that are lit alone, without the other shapes and emitters.
-
-    The map is rotated as the scene's own `envmap` is; without one, its y becomes z, which is up. Raises
-    InputError for a file that contains no such map.
+    `objects`: shapes that are lit alone, without the other shapes and emitters. The map is rotated as the
+    scene's own `envmap` is; without one, its y becomes z, which is up.
     """
     import mitsuba as mi
 
-    turned: Any = mi.ScalarTransform4f().rotate(*Z_UP)
+    turned: Any = mi.ScalarTransform4f().rotate((1, 0, 0), 90)  # y to z
     environment = scene.environment()
     if environment is not None:
         params = mi.traverse(environment)
@@ -71,7 +62,6 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
 
 
 def without(scene: Scene, objects: Sequence[Any]) -> Any:
-    """The scene without some of its shapes."""
     environment = scene.environment()
     return _scene_of([*_all_but(scene, objects), *([] if environment is None else [environment])])
 
@@ -97,8 +87,7 @@ def prepare_folder(
 ) -> None:
     """Make the folders and record the settings `wanted`.
 
-    Raises InputError for a folder that contains anything but a data set with a RECORD, and for one of other
-    settings, which `overwrite` removes.
+    Raises InputError for a folder with other files, or of other settings, which `overwrite` removes.
     """
     names = [light.name for light in relight]
     if len({*names}) < len(names):
@@ -133,7 +122,7 @@ def prepare_folder(
 
 
 def _option(field: str) -> str:
-    """What sets a field: an option of `refgs dataset`, or the scene file."""
+    """The option of `refgs dataset` that sets a field, or the scene file."""
     names = {"scene": "the scene file", "scene_sha256": "the scene file", "height": "--size"}
     names |= {"light_sha256": "--light", "objects": "--shapes", "spp": "--samples"}
     return names.get(field) or f"--{field.replace('_', '-')}"
@@ -141,8 +130,7 @@ def _option(field: str) -> str:
 
 def recorded_lights(record: Path) -> dict[str, str]:
     """Name and SHA-256 of the other environment maps in a dataset.json; empty without that file."""
-    try:
+    lights: Any = {}
+    with contextlib.suppress(InputError):
         lights = read_json(record).get(RELIGHT)
-    except InputError:
-        return {}
     return {k: v for k, v in lights.items() if isinstance(v, str)} if isinstance(lights, dict) else {}

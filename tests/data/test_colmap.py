@@ -91,6 +91,8 @@ def test_copies_are_used_without_images(tmp_path: Path) -> None:
     view = read_dataset(data, "train").views[0]
     assert (view.width, view.height) == (49, 37)
     assert (view.fx, view.cy) == pytest.approx((110 * 49 / 97, 34.6 * 37 / 73))
+    replace(SHOTS[1], width=72, height=96).write(data / "images_2")  # as turned upright by its EXIF data
+    refused(lambda: read_dataset(data, "train"), "b.png: size: 72 × 96 pixels are no copy of 97 × 73")
 
 
 def test_unreliable_points_are_left_out(tmp_path: Path) -> None:
@@ -125,7 +127,7 @@ def test_cameras_and_images_without_each_other_are_noted(tmp_path: Path) -> None
     shutil.rmtree(data / "images")
     refused(lambda: read_dataset(data, "train"), "images: no such folder")
     (data / "images").mkdir()
-    refused(lambda: read_dataset(data, "train"), "images.bin: none of its 9 images is in", "images; put")
+    refused(lambda: read_dataset(data, "train"), "images.bin: none of its 9 images is in")
 
 
 def test_names_outside_of_the_folder_are_refused(tmp_path: Path) -> None:
@@ -145,16 +147,10 @@ def test_names_outside_of_the_folder_are_refused(tmp_path: Path) -> None:
         ("images", "1 1 0 0 0 0 0 3 7", "COLMAP: broken"),
         ("images", "1 1 0 0 0 0 0 3 7 a.png\n\n2 1 0 0 0 0 0 3 7 a.png", "occurs twice"),
         ("images", "1 1 0 0 0 0 0 3 7 a.png\n2 1 0 0 0 0 0 3 7 b.png", "not followed by a line of points"),
-        ("images", "", "none of its 0 images"),
         ("cameras", "7 PINHOLE 96 72 1 2 3", "cameras.txt: camera 7: PINHOLE needs 4 numbers"),
         ("cameras", "7 PINHOLE 96 72 -1 2 3 4", "cameras.txt: camera 7: its size and focal length"),
-        ("cameras", "7 PINHOLE 96", "cameras.txt: COLMAP: broken"),
         ("cameras", f"7 PINHOLE {'9' * 5000} 1 1 1 1 1", "cameras.txt: COLMAP: broken"),
-        (
-            "cameras",
-            "7 PINHOLE 96 72 1e-10 104 50 34",
-            "focal length: 1e-10 pixels is out of range",
-        ),
+        ("cameras", "7 PINHOLE 96 72 1e-10 104 50 34", "focal length: 1e-10 pixels is out of range"),
     ],
 )
 def test_broken_text_files_are_refused(file: str, line: str, said: str, tmp_path: Path) -> None:
@@ -166,19 +162,10 @@ def test_broken_text_files_are_refused(file: str, line: str, said: str, tmp_path
 def test_region_of_both_splits_is_that_of_the_training_cameras(tmp_path: Path) -> None:
     """Also a split of one view, whose camera alone looks at no point."""
     data = write_colmap(tmp_path)
-    train, test = read_dataset(data, "train"), read_dataset(data, "test")
-    assert train.region is not None and test.region == train.region
-    assert train.region == region_of(train.views) != region_of(test.views)
-    (data / "sparse/0/test.txt").write_text("d.png\n")
-    train, test = read_dataset(data, "train"), read_dataset(data, "test")
-    assert len(test.views) == 1 and test.region == train.region == region_of(train.views)
-
-
-def test_image_of_other_aspect_ratio_is_refused(tmp_path: Path) -> None:
-    """As turned upright by its EXIF data, after COLMAP saw it."""
-    data = write_colmap(tmp_path)
-    replace(SHOTS[1], width=72, height=96).write(data / "images")
-    refused(lambda: read_dataset(data, "train"), "b.png: size: 72 × 96 pixels are no copy of 96 × 72")
+    for count in (2, 1):
+        train, test = read_dataset(data, "train"), read_dataset(data, "test")
+        assert len(test.views) == count and test.region == train.region == region_of(train.views)
+        (data / "sparse/0/test.txt").write_text("d.png\n")
 
 
 def test_truncated_binary_files_are_refused(tmp_path: Path) -> None:
@@ -202,21 +189,18 @@ def test_truncated_binary_files_are_refused(tmp_path: Path) -> None:
 def test_files_written_by_colmap_are_read(tmp_path: Path) -> None:
     """Its own library writes our text as binary, and our reader finds the same in both."""
     pycolmap = pytest.importorskip("pycolmap")
-    write_text(tmp_path / "a", SHOTS, "OPENCV", LENSES["OPENCV"][0])
-    (tmp_path / "b").mkdir()
-    images = (tmp_path / "a/images.txt").read_text().replace("1.5 2.5 3 10.0 20.0 -1", "")
-    (tmp_path / "a/images.txt").write_text(images)
-    points = (tmp_path / "a/points3D.txt").read_text().replace(" 1 0 2 0 3", "")
-    lines = [line[: line.find("0.5 ") + 3] for line in points.splitlines()]
-    (tmp_path / "a/points3D.txt").write_text("\n".join(lines))
-    pycolmap.Reconstruction(str(tmp_path / "a")).write_binary(str(tmp_path / "b"))
-    assert read_cameras(tmp_path / "a/cameras.txt") == read_cameras(tmp_path / "b/cameras.bin")
-    ours, theirs = read_images(tmp_path / "a/images.txt"), read_images(tmp_path / "b/images.bin")
-    for a, b in zip(ours, theirs, strict=True):
+    ours, theirs = tmp_path / "a", tmp_path / "b"
+    write_text(ours, SHOTS, "OPENCV", LENSES["OPENCV"][0])
+    theirs.mkdir()
+    images, points = ours / "images.txt", ours / "points3D.txt"  # without tracks, which are made up
+    images.write_text(images.read_text().replace("1.5 2.5 3 10.0 20.0 -1", ""))
+    points.write_text("\n".join(x[: x.find("0.5 ") + 3] for x in points.read_text().splitlines()))
+    pycolmap.Reconstruction(str(ours)).write_binary(str(theirs))
+    assert read_cameras(ours / "cameras.txt") == read_cameras(theirs / "cameras.bin")
+    for a, b in zip(read_images(images), read_images(theirs / "images.bin"), strict=True):
         assert (a.name, a.camera) == (b.name, b.camera)
         np.testing.assert_allclose(a.rotation, b.rotation, atol=1e-12)
         np.testing.assert_allclose(a.translation, b.translation, atol=1e-12)
-    text, binary = read_points(tmp_path / "a/points3D.txt"), read_points(tmp_path / "b/points3D.bin")
-    order, other = np.argsort(text.position[:, 0]), np.argsort(binary.position[:, 0])
-    np.testing.assert_allclose(text.position[order], binary.position[other])
-    np.testing.assert_array_equal(text.colour[order], binary.colour[other])
+    found = (read_points(points), read_points(theirs / "points3D.bin"))
+    text, binary = (x.position[np.argsort(x.position[:, 0])] for x in found)
+    np.testing.assert_allclose(text, binary)

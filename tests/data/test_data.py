@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.data.dataset import Dataset, fitting_downscale
+from mi_refgs.data.dataset import fitting_downscale
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, write_png
 from tests.helpers import read_loaded, refused
@@ -46,16 +48,9 @@ def folder(tmp_path: Path, rng: np.random.Generator) -> Path:
             rgba[..., :3] *= 3 * rgba[..., 3:]
             write_exr(tmp_path / split / f"r_{i}.exr", rgba)
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose(0.7 * i).tolist()})
-        write(tmp_path, split, {"camera_angle_x": ANGLE, "frames": frames})
+        content = json.dumps({"camera_angle_x": ANGLE, "frames": frames})
+        (tmp_path / f"transforms_{split}.json").write_text(content)
     return tmp_path
-
-
-def read(folder: Path, split: str = "train") -> dict[str, Any]:
-    return json.loads((folder / f"transforms_{split}.json").read_text())
-
-
-def write(folder: Path, split: str, content: Any) -> None:
-    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
 
 
 def test_png_is_composited_as_displayed(folder: Path) -> None:
@@ -105,23 +100,14 @@ def test_camera_frame_is_that_of_mitsuba(folder: Path) -> None:
     """Mitsuba's frame: +z forward, +x left, +y up; what lies right of the axis lands right."""
     view = read_loaded(folder, "train").views[1]
     opengl = pose(0.7)
-    np.testing.assert_allclose(view.to_world[:3, 2], -opengl[:3, 2])
-    np.testing.assert_allclose(view.to_world[:3, 0], -opengl[:3, 0])
-    np.testing.assert_allclose(view.to_world[:3, [1, 3]], opengl[:3, [1, 3]])
-    camera = view.camera()
-
-    def pixel(point: np.ndarray) -> np.ndarray:
-        import mitsuba as mi
-
-        local = camera.to_camera(mi.Point3f(*(float(x) for x in point)))
-        pixels = [camera.fx * local.x / local.z + camera.cx, camera.fy * local.y / local.z + camera.cy]
-        return np.array([float(p[0]) for p in pixels])
-
+    np.testing.assert_allclose(view.to_world[:3], opengl[:3] * [-1, 1, -1, 1])
     focus = np.array([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(pixel(focus), [WIDTH / 2, HEIGHT / 2], atol=1e-4)
-    focal = 0.5 * WIDTH / math.tan(ANGLE / 2)
-    step = pixel(focus + 0.3 * opengl[:3, 0] + 0.6 * opengl[:3, 1]) - pixel(focus)
-    np.testing.assert_allclose(step, [0.1 * focal, -0.2 * focal], atol=1e-4)
+    points = np.stack([focus, focus + 0.3 * opengl[:3, 0] + 0.6 * opengl[:3, 1]])
+    camera, focal = view.camera(), 0.5 * WIDTH / math.tan(ANGLE / 2)
+    local = camera.to_camera(mi.Point3f(points.T.astype(np.float32)))
+    pixels = [camera.fx * local.x / local.z + camera.cx, camera.fy * local.y / local.z + camera.cy]
+    expected = WIDTH / 2 + np.array([0, 0.1 * focal]), HEIGHT / 2 - np.array([0, 0.2 * focal])
+    np.testing.assert_allclose(np.array(pixels), expected, atol=1e-4)
 
 
 def test_scene_extent_is_that_of_3dgs(folder: Path) -> None:
@@ -129,27 +115,25 @@ def test_scene_extent_is_that_of_3dgs(folder: Path) -> None:
     origins = np.array([pose(0.7 * i)[:3, 3] for i in range(8)])
     extent = 1.1 * max(np.linalg.norm(origins - origins.mean(axis=0), axis=1))
     assert data.scene_extent == pytest.approx(extent)
-    lone = Dataset(folder, "train", data.views[:1], data.background, False, None)
+    lone = replace(data, views=data.views[:1])
     assert lone.scene_extent == pytest.approx(1.1 * np.linalg.norm(pose(0)[:3, 3]))
 
 
 def test_intrinsics_per_file_and_per_frame(folder: Path) -> None:
-    content = read(folder)
-    del content["camera_angle_x"]
-    content |= {"fl_x": 9.0, "fl_y": 8.0, "cx": 2.5, "cy": 1.5, "w": WIDTH, "h": HEIGHT}
-    content["frames"][1] |= {"fl_x": 10.0, "cx": 3.25}
-    write(folder, "train", content)
+    def change(content: dict[str, Any]) -> None:
+        del content["camera_angle_x"]
+        content |= {"fl_x": 9.0, "fl_y": 8.0, "cx": 2.5, "cy": 1.5, "w": WIDTH, "h": HEIGHT}
+        content["frames"][1] |= {"fl_x": 10.0, "cx": 3.25}
+
+    edit(change)(folder)
     first, second = read_loaded(folder, "train").views[:2]
     assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 2.5, 1.5)
     assert (second.fx, second.fy, second.cx, second.cy) == (10, 8, 3.25, 1.5)
 
 
 def test_holdout_without_a_test_file(folder: Path) -> None:
-    content = read(folder)
-    content["frames"] = content["frames"] + [
-        {**f, "file_path": f["file_path"].replace("train", "test")} for f in content["frames"][:2]
-    ]
-    write(folder, "train", content)
+    more = [{"file_path": f"./test/r_{i}", "transform_matrix": pose(i).tolist()} for i in range(2)]
+    edit(lambda content: content["frames"].extend(more))(folder)
     (folder / "transforms_test.json").unlink()
     names = {split: [v.name for v in read_loaded(folder, split).views] for split in ("train", "test")}
     assert names["test"] == ["test/r_0", "train/r_6"]  # sorted: test/r_0, test/r_1, train/r_0 … train/r_7
@@ -165,18 +149,6 @@ def test_relative_names_inside_the_folder_are_accepted(folder: Path) -> None:
     edit(lambda content: content.update(frames=frames))(folder)
     views = read_loaded(folder, "train").views
     np.testing.assert_array_equal(views[0].image, views[1].image)
-
-
-def test_extension_may_be_given(folder: Path) -> None:
-    content = read(folder)
-    content["frames"][0]["file_path"] += ".png"
-    content["frames"][1]["file_path"] = "train/take.1"
-    (folder / "train/r_1.png").rename(folder / "train/take.1.png")
-    write(folder, "train", content)
-    views = read_loaded(folder, "train").views
-    assert [v.name for v in views[:2]] == ["train/r_0", "train/take.1"]
-    (folder / "train/take.1.exr").write_bytes((folder / "train/r_1.exr").read_bytes())
-    assert read_loaded(folder, "train", images="exr").views[1].is_linear_radiance
 
 
 def test_ground_truth_maps(folder: Path, rng: np.random.Generator) -> None:
@@ -207,10 +179,6 @@ def named(key: str, value: Any) -> Callable[[Path], None]:
     return edit(lambda content: content["frames"][0].update({key: value}))
 
 
-def diagonal(x: float, y: float, z: float) -> list[list[float]]:
-    return np.diag([x, y, z, 1.0]).tolist()
-
-
 def resize(folder: Path) -> None:
     """One image more than there may be sizes."""
     for i in range(1, 6):
@@ -221,15 +189,6 @@ def nan(folder: Path) -> None:
     broken = np.ones((HEIGHT, WIDTH, 4))
     broken[1, 2, 0] = np.nan
     write_exr(folder / "train/r_4.exr", broken)
-
-
-def sixteen_bits(folder: Path) -> None:
-    Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(folder / "train/r_0.png")
-
-
-def truncate(folder: Path) -> None:
-    file = folder / "train/r_0.png"
-    file.write_bytes(file.read_bytes()[:60])
 
 
 def only_exr(folder: Path) -> None:
@@ -248,18 +207,16 @@ def only_exr(folder: Path) -> None:
         (edit(lambda c: c.update(camera_angle_x="wide")), {}, ["camera_angle_x", "'wide'"]),
         (edit(lambda c: c.update(w=800)), {}, ["r_0.png", "w = 800"]),
         (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),
-        (edit(lambda c: c["frames"][1].update(file_path="train/none")), {}, ["none.png", "missing"]),
+        (named("file_path", "train/none"), {}, ["none.png", "missing"]),
         (only_exr, {}, ["r_0.exr: images: an EXR file", "data.images=exr"]),
         (edit(lambda c: c["frames"][1].pop("transform_matrix")), {}, ["frames[1].transform_matrix", "4 × 4"]),
-        (edit(lambda c: c["frames"][2].update(transform_matrix=diagonal(1, 1, 2))), {}, ["scale"]),
-        (edit(lambda c: c["frames"][0].update(depth_path="train/r_1.exr")), {}, ["[0].depth_path", "size"]),
+        (named("transform_matrix", np.diag([1.0, 1, 2, 1]).tolist()), {}, ["scale"]),
+        (named("depth_path", "train/r_1.exr"), {}, ["[0].depth_path", "size"]),
         (named("file_path", "../r_0.png"), {}, ["frames[0].file_path", "'../r_0.png'", "folder"]),
         (named("file_path", "/etc/passwd"), {}, ["frames[0].file_path", "folder"]),
         (named("file_path", "\ud800"), {}, ["missing"]),
-        (named("exr_path", "../a.exr"), {"images": "exr"}, ["frames[0].exr_path", "folder"]),
         (named("cx", math.inf), {}, ["cx", "inf"]),
-        (truncate, {}, ["r_0.png", "readable"]),
-        (sixteen_bits, {}, ["r_0.png", "8-bit"]),
+        (lambda f: (f / "train/r_0.png").write_bytes(b"\x89PNG"), {}, ["r_0.png", "readable"]),
         (resize, {}, ["6 different sizes", "one size"]),
         (nan, {"images": "exr"}, ["r_4.exr", "NaN", "row 1, column 2"]),
         (lambda f: None, {"downscale": 5}, ["r_0.png", "downscale", "smaller"]),

@@ -15,8 +15,7 @@ from PIL import Image
 
 from mi_refgs.data.dataset import fitting_downscale, read_dataset
 from mi_refgs.data.lens import Lens
-from mi_refgs.io.exr import write_exr
-from mi_refgs.io.images import linear_from_srgb, read_png, write_png
+from mi_refgs.io.images import linear_from_srgb, write_png
 from tests.helpers import read_loaded, refused
 from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import (
@@ -68,25 +67,21 @@ def test_filenames_define_splits(tmp_path: Path) -> None:
     assert names["test"] == ["images/c"] and len(names["train"]) == 7
     change_transforms(data, lambda content: content.update(train_filenames=["images/a.png", "images/b.png"]))
     assert [v.name for v in read_dataset(data, "train").views] == ["images/a", "images/b"]
-    change_transforms(data, lambda content: content.update(test_filenames=["images/no.png"]))
-    refused(lambda: read_dataset(data, "test"), "zero test views")
-    change_transforms(data, lambda content: content.update(test_filenames=[3]))
-    refused(lambda: read_dataset(data, "test"), "test_filenames: not a list of paths")
+    for names_given, words in ((["images/no.png"], "zero test views"), ([3], "not a list of paths")):
+        change_transforms(data, partial(dict.update, test_filenames=names_given))
+        refused(partial(read_dataset, data, "test"), words)
 
 
-@pytest.mark.parametrize("name", ["a.PNG", "a.Png", "a.JPG", "a.jpeg", "a.b.JPEG", "a"])
-@pytest.mark.parametrize("written", [True, False])
-def test_file_path_matches_any_ending(name: str, written: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["a.PNG", "a.Png", "a.JPG", "a.jpeg", "a.b.JPEG"])
+@pytest.mark.parametrize("ending", [".png", ""])
+def test_file_path_matches_any_ending(name: str, ending: str, tmp_path: Path) -> None:
     """With the file's ending, in other letters or of another kind, or without; a dot may be in the name."""
     data = write_nerfstudio(tmp_path)
-    stem = name.rpartition(".")[0] or name
-    (data / "images/b.png").rename(data / "images" / (name if name != stem else f"{stem}.jpg"))
-    named = f"images/{stem}.png" if written else f"images/{stem}"
-    (data / "images/a.png").unlink(missing_ok=True)
-    change_transforms(data, lambda content: content["frames"][1].update(file_path=named))
-    change_transforms(data, lambda content: content.update(frames=content["frames"][2:0:-1]))
-    [view] = read_dataset(data, "test" if named < "images/c.png" else "train").views
-    check(view, SHOTS[1])
+    (data / "images/a.png").unlink()
+    (data / "images/b.png").rename(data / "images" / name)
+    frame = {"file_path": f"images/{Path(name).stem}{ending}"}
+    change_transforms(data, lambda content: content.update(frames=[content["frames"][1] | frame]))
+    check(read_dataset(data, "test").views[0], SHOTS[1])
 
 
 @pytest.mark.parametrize("write", [write_nerfstudio, write_llff, write_colmap])
@@ -103,41 +98,23 @@ def test_masks_become_alpha(write: Callable[[Path], Path], tmp_path: Path) -> No
     view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
     assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
     assert not view.image[:18].any() and view.image[18:].max() > 0.9
-    if write is write_nerfstudio:
-        for path in (data / "images").glob("*.png"):
-            write_exr(path.with_suffix(".exr"), read_png(path)[..., :3])
-        linear = read_dataset(data, "train", downscale=2, images="exr").views[0].load()
-        np.testing.assert_array_equal(linear.alpha, view.alpha)
     (data / "masks/b.png").unlink()
     refused(lambda: read_loaded(data, "train"), "masks/b.png", "missing")
 
 
 @pytest.mark.parametrize("images", ["images_4", "train"])
 def test_masks_beside_transforms_become_alpha(images: str, tmp_path: Path) -> None:
-    """By the path of the image, without its folder if that is one of `images`; `mask_path` comes first."""
+    """By the path of the image, without its folder if that is one of `images`."""
     data = write_nerfstudio(tmp_path)
     (data / "images").rename(data / images)
     masks = data / "masks" / ("train" if images == "train" else "")
     masks.mkdir(parents=True)
     for i, shot in enumerate(SHOTS):
         write_png(masks / shot.name, np.repeat((np.indices((72, 96))[0] < 8 * i)[..., None], 3, axis=2))
-
-    def rename(made: dict[str, Any]) -> None:
-        for frame in made["frames"]:
-            frame["file_path"] = f"{images}/{Path(frame['file_path']).name}"
-
-    def rows() -> list[int]:
-        alphas = [view.load().alpha for view in read_dataset(data, "train").views]
-        return [int((alpha == 1).all(axis=1).sum()) for alpha in alphas if alpha is not None]
-
-    change_transforms(data, rename)
-    assert rows() == [8 * i for i in range(1, 8)]
-    named = str((masks / "c.png").relative_to(data))
-    change_transforms(data, lambda made: [f.update(mask_path=named) for f in made["frames"]])
-    assert rows() == [16] * 7
-    change_transforms(data, lambda made: [f.pop("mask_path") for f in made["frames"]])
-    (masks / "b.png").unlink()
-    refused(rows, "b.png.png: mask: missing", "remove the folder")
+    file = data / "transforms.json"
+    file.write_text(file.read_text().replace('"images/', f'"{images}/'))
+    alphas = [view.load().alpha for view in read_dataset(data, "train").views]
+    assert [int((a == 1).all(axis=1).sum()) for a in alphas if a is not None] == [8 * i for i in range(1, 8)]
 
 
 # ---------------- Shiny Blender ----------------
@@ -191,8 +168,6 @@ def test_shiny_blender_disparity_formats(tmp_path: Path) -> None:
     refused(lambda: read_dataset(data, "test"), "r_0_disp.tiff: size: 32 × 20 pixels")
     Image.fromarray(np.zeros((24, 32, 3), dtype=np.uint8)).save(file)
     refused(lambda: read_dataset(data, "test"), "r_0_disp.tiff: pixels: not one channel")
-    file.write_bytes(b"II*\0")
-    refused(lambda: read_dataset(data, "test"), "r_0_disp.tiff: pixels: not a readable image")
 
 
 # ---------------- LLFF ----------------
@@ -215,11 +190,10 @@ def test_broken_llff_poses_are_refused(tmp_path: Path) -> None:
     data = write_llff(tmp_path)
     path = data / "poses_bounds.npy"
     good, whole = np.load(path), path.read_bytes()
-    for length in range(0, len(whole), 101):
-        path.write_bytes(whole[:length])
+    huge = whole.replace(b"(9, 17)", b"(10000000000, 17)").replace(b" " * 10, b"", 1)
+    for content in (huge, *(whole[:length] for length in range(0, len(whole), 101))):
+        path.write_bytes(content)
         refused(partial(read_dataset, data, "train"), "poses_bounds.npy: NumPy")
-    path.write_bytes(whole.replace(b"(9, 17)", b"(10000000000, 17)").replace(b" " * 10, b"", 1))
-    refused(lambda: read_dataset(data, "train"), "poses_bounds.npy: NumPy")
     infinite, sheared, flat = good.copy(), good.copy(), good.copy()
     infinite[3, 2], sheared[1, 0], flat[1, 14] = np.inf, 7, 0
     for array, said in (
@@ -232,9 +206,6 @@ def test_broken_llff_poses_are_refused(tmp_path: Path) -> None:
     ):
         np.save(path, array, allow_pickle=True)
         refused(partial(read_dataset, data, "train"), said)
-    with path.open("wb") as file:
-        np.savez(file, good)
-    refused(lambda: read_dataset(data, "train"), "poses_bounds.npy: NumPy: cannot be read")
 
 
 class Code:
@@ -267,9 +238,8 @@ def test_glossy_synthetic_is_read(protocol: int, tmp_path: Path) -> None:
 
 def test_hostile_pickles_are_refused(tmp_path: Path) -> None:
     """Nothing in them is run, and a file without the arrays of a camera is refused."""
-    data, path, good = write_glossy(tmp_path), tmp_path / "1-camera.pkl", b""
+    data, path, array = write_glossy(tmp_path), tmp_path / "1-camera.pkl", np.eye(3)
     good = path.read_bytes()
-    array = np.eye(3)
     hostile = {
         "code": pickle.dumps([Code(), array]),
         "object array": pickle.dumps([np.array([Code()], dtype=object)]),
@@ -280,8 +250,7 @@ def test_hostile_pickles_are_refused(tmp_path: Path) -> None:
         "other shape": pickle.dumps([np.eye(4)[:, :3], array]),
         "empty": b"",
     } | {f"cut at {i}": good[:i] for i in range(0, len(good) - 9, 40)}
-    for name, content in hostile.items():
-        print(name)
+    for content in hostile.values():
         path.write_bytes(content)
         refused(partial(read_dataset, data, "train"), "1-camera.pkl: pickle: ")
     path.write_bytes(good[:-2] + pickle.dumps(Code())[2:])  # after the arrays; it would run if it were loaded
@@ -301,7 +270,6 @@ def test_transposed_pose_is_read_by_columns(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("pose", "matrix", "said"),
     [
-        (np.ones((3, 4)), np.eye(3), "not a rotation"),
         (np.full((3, 4), np.nan), np.eye(3), "not a rotation"),
         (np.eye(4)[:3], np.zeros((3, 3)), "K: no matrix"),
         (np.eye(4)[:3], np.diag([np.inf, 1, 1]), "K: no matrix"),

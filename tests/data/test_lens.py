@@ -37,14 +37,12 @@ def seen_by(lens: dict[str, Any], x: float, y: float) -> tuple[float, float]:
     r = math.hypot(x, y)
     if lens.get("is_fisheye") or lens.get("camera_model") == "OPENCV_FISHEYE":
         t = math.atan(r)
-        factor = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8) / r if r else 1.0
-        x, y = x * factor, y * factor
+        factor, dx, dy = (t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8) / r if r else 1.0), 0.0, 0.0
     else:
-        radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
-        x, y = (
-            x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
-            y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
-        )
+        factor = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
+        dx = 2 * p1 * x * y + p2 * (r**2 + 2 * x**2)
+        dy = p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y
+    x, y = x * factor + dx, y * factor + dy
     return PINHOLE["fl_x"] * x + PINHOLE["cx"], PINHOLE["fl_y"] * y + PINHOLE["cy"]
 
 
@@ -79,7 +77,6 @@ def test_undistorted_points_are_those_of_a_pinhole(tmp_path: Path, name: str) ->
     view = data.views[0].load()
     assert (view.width, view.height, view.cx, view.cy) == (WIDTH, HEIGHT, PINHOLE["cx"], PINHOLE["cy"])
     assert view.fx / PINHOLE["fl_x"] == pytest.approx(view.fy / PINHOLE["fl_y"])
-    assert view.fx >= PINHOLE["fl_x"]
     image, measured = view.image[..., 0], 0
     for x, y in DOTS:
         u, v = view.fx * x + view.cx, view.fy * y + view.cy
@@ -87,10 +84,8 @@ def test_undistorted_points_are_those_of_a_pinhole(tmp_path: Path, name: str) ->
             assert math.dist(centroid(image, u, v), (u, v)) < 0.1
             measured += 1
     assert measured >= 12
-    if name in ("barrel", "equidistant"):
-        assert view.fx == PINHOLE["fl_x"]
-    if name == "pincushion":
-        assert 1.02 < view.fx / PINHOLE["fl_x"] < 1.2
+    low, high = {"barrel": (1, 1), "equidistant": (1, 1), "pincushion": (1.02, 1.2)}.get(name, (1, 2))
+    assert low <= view.fx / PINHOLE["fl_x"] <= high
 
 
 def test_alpha_and_maps_are_undistorted_like_the_image(tmp_path: Path) -> None:

