@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.lens import Lens
-from mi_refgs.data.poses import world_to_camera
+from mi_refgs.data.poses import MITSUBA_FROM_OPENCV
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import write_bytes
 
@@ -224,7 +224,7 @@ def _text_points(lines: Iterator[str]) -> Records:
 
 
 def _without_comments(lines: Iterator[str]) -> Iterator[str]:
-    """Lines that are neither empty nor comments; the caller may read the line after one from `lines`."""
+    """Lines that are neither empty nor comments; a caller may read the line after one from `lines`."""
     return (line for line in lines if line and not line.startswith("#"))
 
 
@@ -245,9 +245,9 @@ def write_model(
         coefficients = [given.get(name, 0.0) for name in MODELS[model][1].split()[4:]]
         rows.append(f"{i} {model} {' '.join(map(repr, (*numbers, *coefficients)))}")
     for i, (name, pose, camera) in enumerate(zip(names, poses, camera_of, strict=True), 1):
-        matrix = world_to_camera(pose)
-        x, y, z, w = Rotation.from_matrix(matrix[:, :3]).as_quat(canonical=True)
-        values = " ".join(repr(float(value)) for value in (w, x, y, z, *matrix[:, 3]))
+        rotation = (pose[:3, :3] @ MITSUBA_FROM_OPENCV[:3, :3]).T
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
+        values = " ".join(repr(float(value)) for value in (w, x, y, z, *(-rotation @ pose[:3, 3])))
         images += [f"{i} {values} {camera} {name}", ""]
     files = {
         "cameras.txt": ["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY, and coefficients", *rows],

@@ -162,8 +162,9 @@ def make_view(
         fx, fy = fx * straight.zoom, fy * straight.zoom
         image = replace(image, undistortion=straight)
     source = ImageSource(image, options.background, options.cache, image.has_alpha())
-    known = {"is_linear_radiance": options.images == "exr", "exposure": log_exposure(image.path)}
-    return View(name, *image.size, fx, fy, cx, cy, to_world, source, file=file, **known), straight
+    view = View(name, *image.size, fx, fy, cx, cy, to_world, source, file=file)
+    linear, exposure = options.images == "exr", log_exposure(image.path)
+    return replace(view, is_linear_radiance=linear, exposure=exposure), straight
 
 
 @dataclass(frozen=True, eq=False)

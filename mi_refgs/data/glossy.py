@@ -16,8 +16,7 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.dataset import ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.ground_truth import block_mean
-from mi_refgs.data.images import ImageFile, Mask
+from mi_refgs.data.images import ImageFile, Mask, block_mean
 from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError

@@ -235,3 +235,17 @@ def mask_in(folder: Path, name: str) -> Mask:
 
 def _is_image(path: Path) -> bool:
     return path.suffix.lower() in ENDINGS and not path.name.startswith(".")
+
+
+def block_mean(
+    pixels: np.ndarray,  # (H, W, C)
+    covered: np.ndarray,  # (H, W, 1), 0 … 1
+    downscale: int,
+    straight: Undistortion | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over what is covered in each block, (h, w, C), 0 without coverage; covered fraction (h, w, 1)."""
+    covered = covered.astype(np.float32)
+    fraction, total = box_downscale(covered, downscale), box_downscale(pixels * covered, downscale)
+    if straight is not None:  # linear interpolation, so that no weight is negative
+        fraction, total = straight.resample(fraction, order=1), straight.resample(total, order=1)
+    return np.where(fraction > 0, total / np.maximum(fraction, 1e-12), 0).astype(np.float32), fraction

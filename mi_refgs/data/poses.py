@@ -47,12 +47,6 @@ def rigid(matrix: np.ndarray, field: str) -> np.ndarray:
     return matrix
 
 
-def world_to_camera(to_world: np.ndarray) -> np.ndarray:
-    """Camera from world, (3, 4) with OpenCV's axes, of `View.to_world`."""
-    rotation = (to_world[:3, :3] @ MITSUBA_FROM_OPENCV[:3, :3]).T
-    return np.concatenate([rotation, -rotation @ to_world[:3, 3:]], axis=1)
-
-
 def from_world_to_camera(rotation: np.ndarray, translation: np.ndarray, field: str) -> np.ndarray:
     """`View.to_world` of a camera with OpenCV's axes in which a world point x is at R x + t; as `rigid`."""
     matrix = np.eye(4)

@@ -20,15 +20,14 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.ground_truth import ALPHA, beside, block_mean, shiny_blender_maps, unit
-from mi_refgs.data.images import IMAGES, MASKS, ImageFile, Mask, mask_in
+from mi_refgs.data.images import IMAGES, MASKS, ImageFile, Mask, block_mean, mask_in
 from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import inside, is_file, read_json, require_file
-from mi_refgs.io.images import ENDINGS, linear_from_srgb, with_ending
+from mi_refgs.io.images import ENDINGS, linear_from_srgb, read_png, read_tiff, with_ending
 from mi_refgs.io.ply import read_vertices
 
 SUFFIXES = (*ENDINGS, ".exr")  # that `file_path` may have or omit, in the order in which they are tried
@@ -37,6 +36,8 @@ CAMERA_MODELS |= {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of unsupported lenses, refused unless they are 0 or false."""
 MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}  # channels of ground truth
+NORMALS, DISPARITY, ALPHA = "_normal.png", "_disp.tiff", "_alpha.png"  # after the stem of an image's name
+NORMAL_LENGTH = 0.5  # smallest length of an 8-bit normal: no normal is stored as (½, ½, ½)
 
 
 class TransformsReader:
@@ -127,6 +128,7 @@ class Frame:
         return Lens.of(fisheye, given)
 
     def focal_lengths(self, width: float, height: float) -> tuple[float, float]:
+        """fx and fy, pixels of an image of this size."""
         focal: list[float | None] = []
         for length, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
             pixels, radians = self.number(length, positive=True), self.number(angle, positive=True)
@@ -222,10 +224,11 @@ def _view(frame: Frame, options: ReadOptions) -> View:
     }
     normal, depth = maps.pop("normal", None), maps.pop("depth", None)
     if normal is depth is None:
-        normal, depth = shiny_blender_maps(file, size, options.downscale, straight)
-    else:
-        normal = None if normal is None else unit(normal)
-        depth = None if depth is None else depth[..., 0]
+        normal, depth = _shiny_blender_maps(file, size, options.downscale, straight)
+    if normal is not None:
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        normal = np.where(length > 0, normal / np.maximum(length, 1e-12), 0).astype(np.float32)
+    depth = None if depth is None else depth[..., 0]
     return replace(view, normal=normal, depth=depth, materials=maps)
 
 
@@ -236,7 +239,7 @@ def _mask(frame: Frame, image: ImageFile) -> Mask | None:
     if image.has_alpha():
         return None
     file, masks = image.path, frame.file.parent / MASKS
-    if (found := beside(file, ALPHA)) is not None:
+    if (found := _beside(file, ALPHA)) is not None:
         return Mask(found)
     if not masks.is_dir():
         return None
@@ -263,6 +266,7 @@ def _image(frame: Frame, images: str) -> Path:
 
 
 def _intrinsics(frame: Frame, image: ImageFile) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels of the image file."""
     width, height = image.width, image.height
     for key, size in (("w", width), ("h", height)):
         wanted = frame.number(key, positive=True)
@@ -291,6 +295,42 @@ def _map(
 
 
 def _stem(name: str) -> str:
-    """A file's name without an ending of SUFFIXES; any other dot is part of the name."""
-    path = Path(name)
-    return str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else name
+    """A file's name without an ending of SUFFIXES."""
+    return str(Path(name).with_suffix("")) if Path(name).suffix.lower() in SUFFIXES else name
+
+
+def _beside(image: Path, ending: str) -> Path | None:
+    """The map of an image whose name has this ending; None without one."""
+    file = image.with_name(image.stem + ending)
+    return file if is_file(file) else None
+
+
+def _shiny_blender_maps(
+    image: Path,
+    shape: tuple[int, int],  # of the image file
+    downscale: int,
+    straight: Undistortion | None,
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """World normals (h, w, 3) and depths (h, w, 1) beside an image of Shiny Blender, None without a file.
+
+    Normals n are stored as (n + 1) / 2 in 8 bits; depths z along the viewing axis as 1 / (1 + z), and 0 off
+    the object. [Ref-NeRF, Verbin et al. 2022]
+    """
+    normal = depth = None
+    if file := _beside(image, NORMALS):
+        pixels = 2 * _of_shape(file, read_png(file)[..., :3], shape) - 1
+        stored = np.linalg.norm(pixels, axis=-1, keepdims=True) > NORMAL_LENGTH
+        normal = block_mean(pixels, stored, downscale, straight)[0]
+    if file := _beside(image, DISPARITY):
+        disparity = _of_shape(file, read_tiff(file), shape)[..., None]
+        covered = (disparity > 0) & (disparity < 1)
+        depths = np.where(covered, 1 / np.where(covered, disparity, 1) - 1, 0).astype(np.float32)
+        depth = block_mean(depths, covered, downscale, straight)[0]
+    return normal, depth
+
+
+def _of_shape(file: Path, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    if pixels.shape[:2] != shape:
+        what = f"{pixels.shape[1]} × {pixels.shape[0]} pixels, but the image has {shape[1]} × {shape[0]}"
+        raise InputError(what, file, "size", "restore the map, or remove it")
+    return pixels

@@ -18,6 +18,7 @@ from mi_refgs.synthesis.options import LightFile
 from mi_refgs.types import Scene
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
+Z_UP = (1, 0, 0), 90.0  # axis and degrees that rotate y of a lat-long map to z
 RELIGHT = "relight"  # folder of the test views under other environment maps
 FILES = (
     "transforms_*.json",
@@ -51,7 +52,7 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
     """
     import mitsuba as mi
 
-    turned: Any = mi.ScalarTransform4f().rotate((1, 0, 0), 90)  # y to z
+    turned: Any = mi.ScalarTransform4f().rotate(*Z_UP)
     environment = scene.environment()
     if environment is not None:
         params = mi.traverse(environment)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -161,8 +162,8 @@ def _read_scene(path: Path) -> list[Any]:
 
 
 def _colmap(kind: str) -> Callable[[Path], object]:
-    lens = {"camera": "OPENCV", "values": (*layouts.VALUES, 0.03, -0.01, 1e-3, -1e-3)}
-    return lambda folder: layouts.write_colmap(folder, kind, layouts.SHOTS[:3], **lens)
+    values = (*layouts.VALUES, 0.03, -0.01, 1e-3, -1e-3)
+    return partial(layouts.write_colmap, kind=kind, shots=layouts.SHOTS[:3], camera="OPENCV", values=values)
 
 
 READERS = {

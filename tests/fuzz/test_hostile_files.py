@@ -55,7 +55,7 @@ def test_mesh_reader_opens_no_other_file(tmp_path: Path, monkeypatch: pytest.Mon
     text = "mtllib ../secret.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     (tmp_path / "in" / "a.obj").write_text(text)
     opened: list[str] = []
-    monkeypatch.setattr(FilePathResolver, "get", lambda _, name: opened.append(name) or b"")
+    monkeypatch.setattr(FilePathResolver, "get", lambda _, name: opened.append(name))
     assert len(read_mesh(tmp_path / "in" / "a.obj").faces) == 1 and not opened
     refuse_file(read_mesh, tmp_path / "a.glb", b"glTF", "ply, obj, stl, off")
 
