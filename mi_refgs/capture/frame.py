@@ -35,6 +35,10 @@ class Similarity:
     def apply(self, points: np.ndarray) -> np.ndarray:
         return self.scale * points @ self.rotation.T + self.translation
 
+    def moved(self, solved: Solved) -> Solved:
+        rotation, points = solved.rotation @ self.rotation.T, self.apply(solved.points)
+        return replace(solved, rotation=rotation, origin=self.apply(solved.origin), points=points)
+
 
 def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
     """The direction (3,) against gravity; `up` (V, 2): (right, down) of the upward direction in each image.
@@ -118,9 +122,3 @@ def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
     region = region_of_interest(solved)
     scale = 1 / region.radius
     return Similarity(scale, rotation, -scale * rotation @ np.array(region.centre))
-
-
-def moved(solved: Solved, to: Similarity) -> Solved:
-    """Cameras and points in the new world."""
-    turned, points = solved.rotation @ to.rotation.T, to.apply(solved.points)
-    return replace(solved, rotation=turned, origin=to.apply(solved.origin), points=points)

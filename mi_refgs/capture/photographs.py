@@ -6,7 +6,6 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,8 @@ import numpy as np
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.data.images import mask_in
-from mi_refgs.errors import InputError
-from mi_refgs.io.files import replace_file
+from mi_refgs.errors import InputError, counted
 from mi_refgs.io.images import ENDINGS, exif_tags, image_size, open_image, read_mask, to_8_bits
-from mi_refgs.progress import with_bar
 
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()  # for a message
 FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point
@@ -118,10 +115,10 @@ def find_photographs(folder: Path) -> list[Photograph]:
     paths = [path for path in files if path.suffix.lower() in ENDINGS]
     if len(paths) < FEWEST:
         other = Counter(path.suffix for path in files if path.suffix.lower() in OTHER_ENDINGS).most_common(1)
-        remedy = "photograph the object from all sides, 30 to 100 times"
-        remedy = f"convert its {other[0][0]} files to JPEG" if other else remedy
-        found = {0: "no JPEG or PNG file", 1: "one image"}.get(len(paths), f"{len(paths)} images")
-        raise InputError(found, folder, "photographs", remedy)
+        remedy = (
+            f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"
+        )
+        raise InputError(f"contains {counted(len(paths), 'JPEG or PNG file')}", folder, "photographs", remedy)
     kept = [replace(_photograph(path), number=i) for i, path in enumerate(paths)]
     most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]
     kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in kept]
@@ -151,16 +148,6 @@ def _positive(value: object) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if 0 < number < np.inf else None
-
-
-def write_copies(photographs: Sequence[Photograph], folder: Path, longest: int) -> None:
-    """Write missing working copies of at most `longest` pixels per side."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for photograph in with_bar(photographs, "images"):
-        file = folder / photograph.copy
-        if not file.is_file():
-            image = photograph.load(longest)
-            replace_file(file, partial(image.save, format="PNG", compress_level=1))
 
 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:

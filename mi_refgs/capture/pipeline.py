@@ -12,6 +12,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,16 @@ import numpy as np
 
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import Solved
-from mi_refgs.capture.frame import moved, upright_unit
+from mi_refgs.capture.frame import upright_unit
 from mi_refgs.capture.output import REPORT, SPARSE, WORK
-from mi_refgs.capture.photographs import Photograph, find_masks, find_photographs, write_copies
+from mi_refgs.capture.photographs import Photograph, find_masks, find_photographs
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.object_region import support_planes
 from mi_refgs.data.region import Region, write_region
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import read_json, replace_file, write_json
 from mi_refgs.io.images import image_size
+from mi_refgs.progress import with_bar
 
 PLOT = "capture.png"
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
@@ -79,7 +81,7 @@ def capture(
     straight = output.straighten(model, copies)
     solved = Solved.of(model)
     similarity = upright_unit(solved, np.array([copies[name].up for name in solved.names]))
-    world = moved(solved, similarity)
+    world = similarity.moved(solved)
     found = region or Region((0.0, 0.0, 0.0), 1.0, estimated=True)
     found = replace(found, planes=support_planes(world.points, world.origin, found))
 
@@ -127,24 +129,30 @@ def _solve(
 ) -> None:
     """Write work/model: the reconstruction of the largest group."""
     images, database, names = work / "pictures", work / "features.db", sorted(copies)
-    # Features.
-    write_copies([*copies.values()], images, colmap.WORKING_SIZE)
+    # Features of working copies.
+    images.mkdir(exist_ok=True)
+    for name, photograph in with_bar([*copies.items()], "images"):
+        if not (images / name).is_file():
+            image = photograph.load(colmap.WORKING_SIZE)
+            replace_file(images / name, partial(image.save, format="PNG", compress_level=1))
     if not database.is_file():
         colmap.begin(database, images, _groups([*copies.values()], images, camera or FIRST_MODEL))
     colmap.extract(database, images, names)
     found = colmap.features(database)
-    require_features(source, [len(found[name]) for name in names])
+    counts = [len(found[name]) for name in names]
+    if (median := int(np.median(counts))) < FEW_FEATURES:
+        what = f"half of them have no more than {median} features: they are blurred, or without texture"
+        remedy = "hold still, use more light, put a patterned ground below the object"
+        raise InputError(what, source, "photographs", remedy)
     # Matches.
     pairs = colmap.pairs_to_match(found)
-    features_found = sum(map(len, found.values()))
-    tell(f"{len(names)} photographs, {features_found} features, {len(pairs)} pairs to match")
+    tell(f"{len(names)} photographs, {sum(counts)} features, {len(pairs)} pairs to match")
     colmap.match(database, pairs)
     # Cameras and lens.
     raw = work / "unfinished"
     shutil.rmtree(raw, ignore_errors=True)
     models = colmap.reconstruct(database, images, raw, len(names))
-    groups = [Solved.of(model).names for model in models]
-    require_placed(source, len(names), groups)
+    require_placed(source, len(names), [model.num_reg_images() for model in models])
     if camera:
         colmap.adjust(models[0])
     best = models[0] if camera else colmap.best_lens(models[0])
@@ -217,22 +225,13 @@ def draw(path: Path, world: Solved, region: Region) -> None:
     replace_file(path, lambda temporary: figure.savefig(temporary, dpi=100))
 
 
-def require_features(folder: Path, counts: Sequence[int]) -> None:
-    """Raise InputError if the median image has hardly any features."""
-    if (median := int(np.median(counts))) < FEW_FEATURES:
-        what = f"half of them have no more than {median} features: they are blurred, or without texture"
-        remedy = "hold still, use more light, put a patterned ground below the object"
-        raise InputError(what, folder, "photographs", remedy)
-
-
-def require_placed(folder: Path, count: int, groups: Sequence[Sequence[str]]) -> None:
-    """Raise InputError unless the largest group has half of the images."""
+def require_placed(folder: Path, count: int, groups: Sequence[int]) -> None:
+    """Raise InputError unless the largest group, the first, has half of the images."""
     if not groups:
         what = f"no two of the {count} show the same points from different sides"
         remedy = "walk around the object; each image must show two thirds of the one before"
         raise InputError(what, folder, "photographs", remedy)
-    if len(groups[0]) < LEAST_PLACED * count:
-        sizes = ", ".join(str(len(group)) for group in groups)
+    if groups[0] < LEAST_PLACED * count:
+        sizes = ", ".join(map(str, groups))
         what = f"of {count}, only {sizes} could be placed together, in {counted(len(groups), 'group')}"
-        remedy = "take images that lead from one group to the next in small steps"
-        raise InputError(what, folder, "photographs", remedy)
+        raise InputError(what, folder, "photographs", "take images that lead from one group to the next")

@@ -48,7 +48,6 @@ from mi_refgs.synthesis.pathtrace import (
     reach,
 )
 from mi_refgs.synthesis.settings import RELIGHT, SURFACE, load_scene, prepare_folder, under_light, without
-from mi_refgs.types import Scene
 
 SURFACE_VOXELS = 2048  # along the diameter of surface.ply: rays start 2 off, ten times a sphere's error
 REGION_MARGIN = 1.2  # radius of the region over that of the object's bounding sphere: adjacent surfaces
@@ -87,7 +86,11 @@ def make_dataset(
 
     # The scene under each light, and its surface.
     loaded = load_scene(scene, whole=bool(given.objects))
-    about = named_shapes(loaded, given.objects, scene)
+    named = {shape.id(): shape for shape in loaded.shapes() if shape.id()}
+    for name in {*given.objects} - {*named}:
+        remedy = f"give one of {', '.join(sorted(named)) or 'none'}"
+        raise InputError(f"no shape has the id '{name}'", scene, "--shapes", remedy)
+    about = [named[name] for name in dict.fromkeys(given.objects)]
     shapes = about or loaded.shapes()
     lit = loaded if given.light is None else under_light(loaded, Path(given.light))
     try:
@@ -120,15 +123,6 @@ def make_dataset(
     return out
 
 
-def named_shapes(scene: Scene, ids: Sequence[str], file: Path) -> list[Any]:
-    found = {shape.id(): shape for shape in scene.shapes()}
-    missing = [name for name in ids if not name or name not in found]
-    if missing:
-        known = ", ".join(sorted(name for name in found if name)) or "none"
-        raise InputError(f"no shape has the id '{missing[0]}'", file, "--shapes", f"give one of {known}")
-    return [found[name] for name in dict.fromkeys(ids)]
-
-
 def write_views(
     out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str, str], progress: bool
 ) -> None:
@@ -146,15 +140,11 @@ def write_views(
         _trace_view(tracer, out / name, pose, seed, maps)
     intrinsics = pinhole(*cameras.options.resolution, cameras.options.focal)
     for split in splits:
-        frames = [
-            {
-                "file_path": f"./{name}",
-                "exr_path": f"./{name}.exr",
-                **{f"{kind}_path": f"./{name}_{kind}.exr" for kind in maps},
-                "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist(),
-            }
-            for name, pose, _ in views[split]
-        ]
+        frames = []
+        for name, pose, _ in views[split]:
+            files = {"file_path": f"./{name}", "exr_path": f"./{name}.exr"}
+            files |= {f"{kind}_path": f"./{name}_{kind}.exr" for kind in maps}
+            frames.append({**files, "transform_matrix": (pose @ MITSUBA_FROM_OPENGL).tolist()})
         write_json(out / f"transforms_{split}.json", {**intrinsics, "frames": frames})
 
 
