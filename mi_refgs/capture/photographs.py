@@ -115,9 +115,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
     paths = [path for path in files if path.suffix.lower() in ENDINGS]
     if len(paths) < FEWEST:
         other = Counter(path.suffix for path in files if path.suffix.lower() in OTHER_ENDINGS).most_common(1)
-        remedy = (
-            f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"
-        )
+        remedy = f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"
         raise InputError(f"contains {counted(len(paths), 'JPEG or PNG file')}", folder, "photographs", remedy)
     kept = [replace(_photograph(path), number=i) for i, path in enumerate(paths)]
     most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -69,8 +68,8 @@ def capture(
     copies = {photograph.copy: photograph for photograph in photographs}
 
     # Cameras of the largest group, transformed to an upright world.
-    began, work = time.perf_counter(), folder / WORK
-    mark, given = work / "key", _hash(inputs)
+    work, given = folder / WORK, _hash(inputs)
+    mark = work / "key"
     if not mark.is_file() or mark.read_text() != given:
         shutil.rmtree(work)
         work.mkdir()
@@ -99,7 +98,7 @@ def capture(
 
     # The report.
     registered = {copies[name].name for name in world.names}
-    cameras, pinholes = model.cameras.values(), {(s.size, s.focal): s for s in straight.values()}
+    cameras = model.cameras.values()
     report = {
         "key": key,
         "photographs": len(photographs),
@@ -112,9 +111,7 @@ def capture(
             "model": next(iter(cameras)).model_name,
             "cameras": [{"width": c.width, "height": c.height, "parameters": [*c.params]} for c in cameras],
         },
-        "pinholes": [{"size": s.size, "focal": s.focal, "centre": s.centre} for s in pinholes.values()],
         "region": found.content,
-        "seconds": round(time.perf_counter() - began, 1),
     }
     write_json(last, report)
     return report

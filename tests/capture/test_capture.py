@@ -169,9 +169,9 @@ def test_distorted_lens_is_estimated_and_undone(tmp_path: Path, monkeypatch: pyt
     report = json.loads((tmp_path / "data" / "capture.json").read_text())
     assert report["lens"]["model"] == "SIMPLE_RADIAL" and report["placed"] == 10
     assert report["lens"]["cameras"][0]["parameters"][3] == pytest.approx(-0.15, abs=0.03)
-    [pinhole] = report["pinholes"]
+    [pinhole] = _model(tmp_path / "data").cameras.values()
     # The image is what a pinhole sees whose focal length is longer by the same factor.
-    zoom = pinhole["focal"][0] / report["lens"]["cameras"][0]["parameters"][0]
+    zoom = pinhole.focal_length_x / report["lens"]["cameras"][0]["parameters"][0]
     monkeypatch.setattr(scene, "FOCAL", scene.FOCAL * zoom)
     wanted = scene.photograph(shots[3], samples=2) / 255
 

@@ -29,16 +29,12 @@ from tests.scenes.layouts import (
     write_transforms,
 )
 
-# ---------------- nerfstudio and instant-ngp ----------------
-
 
 @pytest.mark.parametrize("fisheye", [False, True])
 def test_nerfstudio_intrinsics_per_frame(fisheye: bool, tmp_path: Path) -> None:
     lens = Lens(fisheye, (0.05, -0.02, 0.0, 0.0)[: 4 if fisheye else 3])
-    shots = [
-        replace(shot, lens=lens, focal=(110.0 + shot.index, 104.0), centre=(49.0 + 0.3 * shot.index, 35.0))
-        for shot in SHOTS[:4]
-    ]
+    frames = [((110.0 + i, 104.0), (49.0 + 0.3 * i, 35.0)) for i in range(4)]
+    shots = [replace(SHOTS[i], lens=lens, focal=f, centre=c) for i, (f, c) in enumerate(frames)]
     model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
     data = write_nerfstudio(tmp_path, shots, camera_model=model, k1=0.05, k2=-0.02, p1=0.0, p2=0.0)
     views = read_dataset(data, "train").views
@@ -51,8 +47,8 @@ def test_ply_file_path_gives_points(kind: str, tmp_path: Path) -> None:
     """Poses and points share a frame: `applied_transform` was applied to both."""
     moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
     data = write_nerfstudio(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=moved)
-    columns = dict(zip("xyz", POINTS.T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), COLOURS.T.astype(np.uint8), strict=True))
+    names = ("x", "y", "z", "red", "green", "blue")
+    columns = dict(zip(names, [*POINTS.T, *COLOURS.T.astype(np.uint8)], strict=True))
     (data / "sparse_pc.ply").write_bytes(ply_bytes(columns, kind))
     found = read_dataset(data, "train")
     assert found.points is not None and found.points.colour is not None
@@ -117,9 +113,6 @@ def test_masks_beside_transforms_become_alpha(images: str, tmp_path: Path) -> No
     assert [int((a == 1).all(axis=1).sum()) for a in alphas if a is not None] == [8 * i for i in range(1, 8)]
 
 
-# ---------------- Shiny Blender ----------------
-
-
 def shiny(folder: Path, alpha: bool = True) -> Path:
     """A disc whose normals and depths vary, with nothing around it."""
     y, x = np.mgrid[:24, :32]
@@ -170,9 +163,6 @@ def test_shiny_blender_disparity_formats(tmp_path: Path) -> None:
     refused(lambda: read_dataset(data, "test"), "r_0_disp.tiff: pixels: not one channel")
 
 
-# ---------------- LLFF ----------------
-
-
 @pytest.mark.parametrize("factor", [1, 4])
 def test_llff_cameras_project_points_onto_images(factor: int, tmp_path: Path) -> None:
     data = write_llff(tmp_path, factor)  # focal lengths are those of the original images, however large
@@ -213,9 +203,6 @@ class Code:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (exec, ("raise SystemExit('code was run')",))
-
-
-# ---------------- NeRO ----------------
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
@@ -260,10 +247,10 @@ def test_hostile_pickles_are_refused(tmp_path: Path) -> None:
 
 
 def test_transposed_pose_is_read_by_columns(tmp_path: Path) -> None:
-    data = write_glossy(tmp_path)
-    pose, matrix = pickle.loads((data / "1-camera.pkl").read_bytes())
+    data, file = write_glossy(tmp_path), tmp_path / "1-camera.pkl"
+    pose, matrix = pickle.loads(file.read_bytes())
     before = read_dataset(data, "train").views[0].to_world
-    (data / "1-camera.pkl").write_bytes(pickle.dumps([np.asfortranarray(pose), matrix]))
+    file.write_bytes(pickle.dumps([np.asfortranarray(pose), matrix]))
     np.testing.assert_array_equal(read_dataset(data, "train").views[0].to_world, before)
 
 

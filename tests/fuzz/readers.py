@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
+from shutil import copytree
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -114,11 +115,6 @@ def _read_image(path: Path) -> list[Any]:
     return [EnvironmentLight.from_file(path).radiance().numpy()]
 
 
-def _methods(folder: Path) -> None:
-    for path in sorted(resource_dir("variants").glob("*.toml")):
-        (folder / path.name).write_bytes(path.read_bytes())
-
-
 def _read_method(path: Path) -> list[Any]:
     method = methods.load(str(path), "quick", ["loss.ssim=0.3"])
     assert methods.dump(method)
@@ -142,9 +138,7 @@ def _read_run(path: Path) -> list[Any]:
 
 def _scenes(folder: Path) -> None:
     _surfels(folder)
-    strings = {"filename": "a.ply", "shade_at": "pixel", "aovs": "n:normal,d:depth"}
-    strings |= {"reflectance": "split_sum", "diffuse": "sh"}
-    inner = "".join(f'<string name="{name}" value="{value}"/>' for name, value in strings.items())
+    inner = '<string name="filename" value="a.ply"/><string name="aovs" value="n:normal,d:depth"/>'
     inner += '<boolean name="dominant" value="true"/><rgb name="background" value="1, 0.5, 0"/>'
     scene = f'<scene version="3.0.0"><integrator type="refgs">{inner}</integrator></scene>'
     (folder / "a.xml").write_text(scene)
@@ -178,7 +172,7 @@ READERS = {
     "exr": Reader(_images, "*.exr", _read_image),
     "image": Reader(_images, "*.[pj]*", _read_image),
     "light, disparity": Reader(_images, "*.[ht]*", _read_image),
-    "method": Reader(_methods, "*.toml", _read_method),
+    "method": Reader(partial(copytree, resource_dir("variants"), dirs_exist_ok=True), "*.toml", _read_method),
     "model": Reader(_run, "model.json", lambda path: [TrainedScene.read(path.parent).seconds]),
     "run-data": Reader(_run, "dataset.json", _read_run),
     "scene": Reader(_scenes, "*.xml", _read_scene),

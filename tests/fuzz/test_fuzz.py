@@ -13,7 +13,7 @@ import pytest
 
 from mi_refgs.errors import InputError
 from tests.fuzz.mutate import mutate
-from tests.fuzz.readers import READERS, Reader
+from tests.fuzz.readers import READERS
 from tests.helpers import slow
 
 SEED, SECONDS, MEBIBYTES = 7, 60, 500
@@ -25,18 +25,28 @@ sys.addaudithook(lambda event, _: events.append(event) if event in CODE else Non
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 
-def fuzz(reader: Reader, folder: Path, files: int) -> dict[str, int]:
-    """Number of files that were read, and refused; SEED and index of a file make it again."""
-    reader.make(folder)
-    paths = sorted(folder.glob(reader.mutated))
-    whole = {path: path.read_bytes() for path in paths}
-    for path in paths:
+def _ring(*_: object) -> None:
+    raise TimeoutError
+
+
+def peak() -> int:
+    """Largest memory of this process, MiB."""
+    return int(re.findall(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[0]) // 1024
+
+
+@pytest.mark.parametrize("files", [6, slow(400)])
+@pytest.mark.parametrize("name", READERS)
+def test_mutated_files_are_read_or_refused(name: str, files: int, tmp_path: Path) -> None:
+    """SEED and the index of a file make it again."""
+    reader, found = READERS[name], {"right": 0, "refused": 0}
+    reader.make(tmp_path)
+    whole = {path: path.read_bytes() for path in sorted(tmp_path.glob(reader.mutated))}
+    for path in whole:
         [*reader.read(path)]  # the samples are accepted
-    found = {"right": 0, "refused": 0}
     signal.signal(signal.SIGALRM, _ring)
     for index in range(files):
         rng = random.Random(f"{SEED} {index}")
-        path = rng.choice(paths)
+        path = rng.choice([*whole])
         others = [data for other, data in whole.items() if other.suffix == path.suffix]
         path.write_bytes(mutate(whole[path], others, path.suffix == ".json", rng))
         events.clear()
@@ -53,20 +63,4 @@ def fuzz(reader: Reader, folder: Path, files: int) -> dict[str, int]:
             signal.alarm(0)
         assert peak() - before < MEBIBYTES and not events, f"file {index}: {peak() - before} MB, {events}"
         path.write_bytes(whole[path])
-    return found
-
-
-def _ring(*_: object) -> None:
-    raise TimeoutError
-
-
-def peak() -> int:
-    """Largest memory of this process, MiB."""
-    return int(re.findall(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[0]) // 1024
-
-
-@pytest.mark.parametrize("files", [6, slow(400)])
-@pytest.mark.parametrize("name", READERS)
-def test_mutated_files_are_read_or_refused(name: str, files: int, tmp_path: Path) -> None:
-    found = fuzz(READERS[name], tmp_path, files)
     assert files < 400 or (found["refused"] and (found["right"] or name == "run-data"))
