@@ -55,15 +55,7 @@ class TableReader:
 
 
 @pytest.fixture
-def reader() -> Iterator[None]:
-    table = TableReader()
-    register_reader(table)
-    yield
-    READERS.unregister(table.name)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path) -> Iterator[Path]:
     """The views of the tiny ball in the new layout: 9 training images and 2 test images, no alpha."""
     views = read_dataset(write_data(tmp_path / "ball", views=11, truth=False), "train").views
     out = tmp_path / "table"
@@ -75,18 +67,15 @@ def folder(tmp_path: Path) -> Path:
     (out / "cameras.txt").write_text("\n".join(lines))
     directions = np.random.default_rng(0).normal(size=(300, 3))
     np.savetxt(out / "points.txt", RADIUS * directions / np.linalg.norm(directions, axis=1, keepdims=True))
-    return out
+    register_reader(TableReader())
+    yield out
+    READERS.unregister(TableReader.name)
 
 
-def test_registered_layout_is_recognised_and_read(folder: Path, reader: None) -> None:
+def test_registered_layout_is_read_and_fitted(folder: Path, tmp_path: Path) -> None:
     train, test = read_dataset(folder, "train"), read_dataset(folder, "test", downscale=2)
-    assert next(iter(READERS)) == TableReader.name
     assert (len(train.views), len(test.views)) == (9, 2) and test.views[0].width == train.views[0].width // 2
-    assert train.points is not None and train.points.position.shape == (300, 3)
     assert fitting_downscale(folder, "png", 100) == (2, 20, 20)
-
-
-def test_fit_starts_from_points_of_the_reader(folder: Path, tmp_path: Path, reader: None) -> None:
     run = tmp_path / "run"
     assert main(train_command(folder, run, write_method(tmp_path))) == 0
     position = read_ply(run / "surfels.ply").to_numpy()["position"]

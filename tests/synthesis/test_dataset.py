@@ -41,11 +41,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(folder / "ball.xml", folder / "out", **OPTIONS)
 
 
-@pytest.fixture
-def train(made: Path) -> Dataset:
-    return read_loaded(made, "train")
-
-
 def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
@@ -66,8 +61,8 @@ def test_depth_and_normals_are_those_of_the_sphere(made: Path) -> None:
             np.testing.assert_array_equal(view.alpha.ravel()[hit] > 0, True)
 
 
-def test_radiance_is_that_of_the_lit_sphere(train: Dataset) -> None:
-    data = read_loaded(train.path, "train", images="exr", background="black")
+def test_radiance_is_that_of_the_lit_sphere(made: Path) -> None:
+    data = read_loaded(made, "train", images="exr", background="black")
     check_brightness(data, data, pathtrace.environment_image(mi.load_string(SCENE), 16))
 
 
@@ -85,9 +80,10 @@ def check_brightness(radiance: Dataset, shape: Dataset, light: np.ndarray) -> No
         np.testing.assert_allclose(view.image[inside].mean(0), expected.mean(0), rtol=0.04)
 
 
-def test_environment_in_mitsuba_orientation(made: Path, train: Dataset) -> None:
-    assert train.environment == made / "environment.exr"
-    copy = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(train.environment)}})
+def test_environment_in_mitsuba_orientation(made: Path) -> None:
+    light = read_loaded(made, "train").environment
+    assert light == made / "environment.exr"
+    copy = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(light)}})
     scene = mi.load_string(SCENE)
     random = np.random.default_rng(0).normal(size=(2000, 3))
     directions = np.concatenate([np.eye(3), -np.eye(3), random])
@@ -157,8 +153,6 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_unfinished_folder_is_continued(made: Path, traced: list[int]) -> None:
     scene, before = made.parent / "ball.xml", files(made)
-    make_dataset(scene, made, **OPTIONS)
-    assert not traced
     (made / "train/r_001.png").unlink()
     (made / "test/r_000_depth.exr").unlink()
     (made / "transforms_train.json").unlink()
@@ -175,7 +169,7 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
     scene.write_text(SCENE.replace("0.7", "0.6"))
     refused(lambda: make_dataset(scene, out, **{**tiny, "views": 2}), "dataset.json: the scene file:")
     make_dataset(scene, out, **tiny, overwrite=True)
-    assert not (out / "train/r_001.png").exists() and len(read_loaded(out, "train").views) == 1
+    assert not (out / "train/r_001.png").exists()
     (out / "dataset.json").write_text("[]")
     refused(lambda: make_dataset(scene, out, **tiny, overwrite=True), "not empty, and no data set")
 
@@ -224,8 +218,7 @@ def test_bad_scene(tmp_path: Path, text: str | None, words: str) -> None:
     scene = tmp_path / "scene.xml"
     if text is not None:
         scene.write_text(text)
-    message = refused(lambda: make_dataset(scene, tmp_path / "out", **OPTIONS), words)
-    assert message.startswith(str(scene))
+    refused(lambda: make_dataset(scene, tmp_path / "out", **OPTIONS), scene, words)
 
 
 @pytest.mark.parametrize("name", ["mixed", slow("mirror_ring"), slow("patched_ball"), slow("diffuse")])
@@ -261,11 +254,9 @@ def test_rooms_are_closed_and_show_the_whole_object(name: str, tmp_path: Path) -
     tiny = OPTIONS | {"views": 12, "size": (18, 32), "spp": 1, "environment_height": 0}
     tiny |= {"objects": objects, "distance": distance, "azimuth": azimuth, "elevation": (8, 55), "fov": 42}
     data = read_loaded(make_dataset(SCENES / f"{name}.xml", tmp_path, **tiny), "train")
-    inner = np.zeros((32, 18), bool)
-    inner[1:-1, 1:-1] = True
     masks = [view.depth > 0 for view in data.views if view.depth is not None]
     assert len(masks) == 12 and all(mask.mean() > 0.03 for mask in masks)
-    assert sum(mask[~inner].any() for mask in masks) <= 1
+    assert sum(mask.sum() > mask[1:-1, 1:-1].sum() for mask in masks) <= 1
     known = [view.materials["albedo"][..., -1] for view in data.views]
     np.testing.assert_array_equal(known, masks)  # each material is one that the method can represent
 

@@ -144,8 +144,12 @@ def test_refusals(made: Path, tmp_path: Path, options: dict, words: str) -> None
 
 def test_size_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-    make = "mi_refgs.synthesis.make_dataset.make_dataset"
-    monkeypatch.setattr(make, lambda *_, size, **__: made.append(size))
+
+    def make(*_: object, size: Any, **__: object) -> Path:
+        made.append(size)
+        return tmp_path
+
+    monkeypatch.setattr("mi_refgs.synthesis.make_dataset.make_dataset", make)
     for size in ("10x6", "12"):
         assert main(["dataset", "room.xml", "-o", str(tmp_path), "--size", size]) == 0
     assert made == [(10, 6), 12]
