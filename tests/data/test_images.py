@@ -202,7 +202,7 @@ def test_cached_image_equals_decoded_image(budget: int, tmp_path: Path, rng: np.
         for _ in range(2):
             found = source.read()
             np.testing.assert_array_equal(found.image, expected.image)
-            np.testing.assert_array_equal(found.alpha, expected.alpha)  # type: ignore[arg-type]
+            np.testing.assert_array_equal(found.alpha, expected.alpha)
             found.image[:] = 0  # a copy, which the caller may change
         assert cache.pixels(file).dtype == (np.uint8 if name in ("rgb.png", "rgba.png") else np.float32)
     assert cache.bytes <= budget
