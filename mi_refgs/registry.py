@@ -11,11 +11,10 @@ from mi_refgs.errors import InputError, UnknownNameError, abbreviated
 
 
 class Named(Protocol):
-    """What a registry contains."""
+    """An item of a registry; its name is unique there."""
 
     @property
-    def name(self) -> str:
-        """Unique in its registry."""
+    def name(self) -> str: ...
 
 
 T = TypeVar("T", bound=Named)
@@ -24,9 +23,8 @@ T = TypeVar("T", bound=Named)
 class Registry(Mapping[str, T], Generic[T]):
     """Objects of one kind by name, in the order of registration.
 
-    `check(item)` raises InputError for an item that cannot be used, so that it is refused at once
-    and not at its first use. With a `package`, the first look-up imports its modules, which register theirs:
-    a module may so read a registry whose items are on a floor above it.
+    `check(item)` raises InputError for an unusable item. With a `package`, the first look-up imports its
+    modules, which register theirs: a module can read a registry whose items are on a floor above it.
     """
 
     def __init__(
@@ -52,20 +50,18 @@ class Registry(Mapping[str, T], Generic[T]):
         """
         name = getattr(item, "name", "")
         if not name or name in self._registered:
-            raise InputError(
-                f"'{name}': the name is empty or in use", self.kind, remedy="choose another name"
-            )
+            what = f"'{name}': the name is empty or in use"
+            raise InputError(what, self.kind, remedy="choose another name")
         self._check(item)
         added = {name: item}
         self._registered = added | self._registered if first else self._registered | added
         return item
 
     def unregister(self, name: str) -> None:
-        """Remove an item."""
         del self._items[name]
 
     def find(self, name: str, field: str) -> T:
-        """Return an item by name; raises UnknownNameError that starts with `field` and lists the names."""
+        """Return an item by name; raises UnknownNameError that names `field` and lists the names."""
         if name not in self._items:
             remedy = f"use {' or '.join(self._items)}; or register it first"
             raise UnknownNameError(f"{abbreviated(name)} is unknown", field, remedy=remedy)

@@ -1,7 +1,6 @@
-"""Names of Mitsuba's and Dr.Jit's types for annotations.
+"""Names of Mitsuba's and Dr.Jit's types for annotations, `Any` for a type checker.
 
-The types exist only once a variant is set (`mi.Float` of `llvm_ad_rgb` is not that of `cuda_ad_rgb`): a
-type checker sees `Any`, a reader sees what the value is. Shapes are written on the line of the argument:
+The types exist only once a variant is set. Shapes are comments on the line of the argument:
 
     weight: Float,  # (N,)
     radiance: Color3f,  # (H*W,) linear, premultiplied

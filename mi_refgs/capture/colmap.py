@@ -20,7 +20,7 @@ from scipy.cluster.vq import kmeans2, vq
 
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.errors import InputError
-from mi_refgs.progress import progress_bar
+from mi_refgs.io.progress import progress_bar
 
 SEED = 0  # seed of all random numbers; a second run gives the same result
 WORKING_SIZE = 1600  # longest side of the images, pixels; twice takes four times as long for few matches more

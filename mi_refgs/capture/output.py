@@ -21,7 +21,7 @@ from mi_refgs.data.colmap_model import MODELS, Camera
 from mi_refgs.data.lens import Undistortion, undistortion
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import cannot_write, read_json, replace_file
-from mi_refgs.progress import with_bar
+from mi_refgs.io.progress import with_bar
 
 QUALITY = 95  # quality of JPEG files; lower ones make a fit reproduce their block edges
 WRITERS = 4  # images undistorted at once, at most: with images of 12 Mpx 1.3 GB, with one 0.5 GB

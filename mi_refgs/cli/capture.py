@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mi_refgs.cli.command import Common, Output, Result, optional
-from mi_refgs.progress import say
+from mi_refgs.io.progress import say
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from mi_refgs.cli.command import (
 )
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError
-from mi_refgs.progress import say
+from mi_refgs.io.progress import say
 
 if TYPE_CHECKING:
     from mi_refgs.compare.jobs import Job

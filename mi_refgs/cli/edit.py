@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from mi_refgs.cli.command import Flag, OtherData, Output, Rendering, Result, RunFolder, joined
 from mi_refgs.editing.options import Change, Selection
 from mi_refgs.errors import InputError
-from mi_refgs.progress import say
+from mi_refgs.io.progress import say
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from mi_refgs.cli.command import (
     separated,
 )
 from mi_refgs.errors import InputError, SceneError
-from mi_refgs.progress import say
+from mi_refgs.io.progress import say
 
 MOST_LISTED = 12
 """Files that are named one by one; the default export writes 10."""

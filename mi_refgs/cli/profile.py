@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from mi_refgs.cli.command import MethodName, OtherData, Preset, Rendering, Result, Settings, joined
 from mi_refgs.errors import InputError
-from mi_refgs.progress import say
+from mi_refgs.io.progress import say
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from tyro.conf import arg
 
 from mi_refgs.cli.command import Flag, OptionalOutput, OtherData, Rendering, Result, RunFolder, Samples
 from mi_refgs.evaluation.scores import caption_lines
-from mi_refgs.progress import warn
+from mi_refgs.io.progress import warn
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result, RunFolder
-from mi_refgs.progress import say
+from mi_refgs.io.progress import say
 
 HOST = "127.0.0.1"
 Port = Annotated[int, arg(metavar="P", help="port of the page")]

@@ -25,8 +25,8 @@ from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
 from mi_refgs.fitting.image_error import displayed_of, image_of, with_gain
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
+from mi_refgs.io.progress import with_bar
 from mi_refgs.kernels.device import machine
-from mi_refgs.progress import with_bar
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import Run

@@ -27,8 +27,7 @@ def machine() -> dict[str, Any]:
     """Processor, threads and versions, for reports of times."""
     found = None
     with contextlib.suppress(OSError):
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-        found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text("utf-8"), re.MULTILINE)
     return {
         "cpu": found.group(1) if found else platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -41,27 +40,21 @@ def machine() -> dict[str, Any]:
 
 
 def is_supported(variant: str | None) -> bool:
-    """Whether the renderer supports a variant: it requires arrays with derivatives and RGB colour."""
+    """Whether the renderer supports a variant: arrays with derivatives, and RGB colour."""
     return variant is not None and variant.endswith("_ad_rgb")
 
 
 def require_supported_variant(what: str) -> None:
     """Raise InputError that starts with `what` under a variant that is not supported."""
-    variant = mi.variant()
-    if not is_supported(variant):
-        raise InputError(
-            f"'{variant}' is not supported",
-            what,
-            "variant",
-            "call mi.set_variant('llvm_ad_rgb') or mi.set_variant('cuda_ad_rgb') first",
-        )
+    if not is_supported(mi.variant()):
+        remedy = "call mi.set_variant('llvm_ad_rgb') or mi.set_variant('cuda_ad_rgb') first"
+        raise InputError(f"'{mi.variant()}' is not supported", what, "variant", remedy)
 
 
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
     """A flat copy in memory aligned to SIMD vectors, LOOK_AHEAD zeros after its end.
 
-    Dr.Jit compiles one kernel for aligned and another for unaligned memory. NumPy's memory is either by
-    chance, and cached kernels would fit only some of the later processes.
+    Dr.Jit compiles one kernel for aligned and another for unaligned memory; NumPy's is either by chance.
     """
     size, count = np.dtype(dtype).itemsize, np.size(values)
     whole: np.ndarray = np.zeros((count + LOOK_AHEAD) * size + ALIGNMENT, np.uint8)
@@ -74,11 +67,9 @@ def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
 def upload(values: np.ndarray, kind: Any = None) -> Any:
     """A flat mi.Float (or another `kind`) with the values, in memory that Dr.Jit has allocated.
 
-    `mi.Float(values)` wraps NumPy's memory on the CPU. A kernel reads whole SIMD vectors, and so beyond its
-    end: the process crashes if the next page is not mapped. That memory may also be aligned to vectors or
-    not: each array has two kernels, and which one a training step compiles changes from view to view. Dr.Jit
-    copies arrays of vectors, such as `mi.Point3f(points.T)`, element by element: they need none of this.
-    Raises InputError under a variant that is not supported.
+    `mi.Float(values)` wraps NumPy's memory on the CPU: kernels read whole SIMD vectors beyond its end, and
+    the process crashes if the next page is not mapped. Arrays of vectors, such as `mi.Point3f(points.T)`, are
+    copied by Dr.Jit. Raises InputError under a variant that is not supported.
     """
     require_supported_variant("mi_refgs")
     kind = mi.Float if kind is None else kind
@@ -95,7 +86,7 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
 
 
 def upload_tensor(values: np.ndarray, kind: Any = None) -> Any:
-    """The same as an mi.TensorXf (or another `kind` of tensor) of their shape."""
+    """The same as an mi.TensorXf (or another `kind` of tensor)."""
     require_supported_variant("mi_refgs")
     kind = mi.TensorXf if kind is None else kind
     return kind(upload(values, dr.array_t(kind)), shape=values.shape)
@@ -104,8 +95,7 @@ def upload_tensor(values: np.ndarray, kind: Any = None) -> Any:
 def replayed(function: Callable[..., Any], limit: int | None = None) -> Callable[..., Any]:
     """Trace a function by `dr.freeze` per kind of arguments (at most `limit` are kept) and replay it.
 
-    Python's garbage collector is off meanwhile: it could free a scene of the user, which Dr.Jit cannot
-    record, and the process would abort.
+    Python's garbage collector is off meanwhile: to free a scene while recording aborts the process.
     """
     frozen = dr.freeze(function, limit=limit, warn_after=10**9)
 

@@ -1,10 +1,8 @@
-"""Memory that a computation needs, memory that is available, and the refusal of what would not fit.
-
-Numbers are upper bounds of the resident memory of the process, measured by `python -m benchmarks.memory`.
-"""
+"""Memory that a computation needs and that is available; upper bounds, measured by `benchmarks.memory`."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from pathlib import Path
@@ -23,8 +21,7 @@ PER_TEXEL = 400  # of a texture while it is baked
 PER_PATH = 100  # of Mitsuba's path tracer
 PER_PLY_BYTE = 4  # of the vertices of a PLY file: read, checked, and as arrays
 
-CGROUPS = Path("/sys/fs/cgroup")
-PROC = Path("/proc")
+CGROUPS, PROC = Path("/sys/fs/cgroup"), Path("/proc")
 
 
 def of_image(pixels: int, samples: int, surfels: int, channels: int, derivatives: bool = False) -> float:
@@ -53,18 +50,14 @@ def of_fit(pixels: int, surfels: int, images: float) -> float:
 
 
 def require(needed: float, what: str, remedy: str) -> None:
-    """Raise InputError if a process that needs so many bytes in all would not fit into memory.
+    """Raise InputError if a process that needs so many bytes in all, with those it has, would not fit.
 
-    `what` names the computation and its size, `remedy` what to do. Memory that the process already has counts
-    as available.
+    `what` names the computation and its size, `remedy` what to do.
     """
     there = available() + resident()
     if needed > there:
-        raise InputError(
-            f"needs {needed / 1e9:.2g} GB of memory, {there / 1e9:.2g} GB are available",
-            what,
-            remedy=remedy,
-        )
+        numbers = f"needs {needed / 1e9:.2g} GB of memory, {there / 1e9:.2g} GB are available"
+        raise InputError(numbers, what, remedy=remedy)
 
 
 def available() -> float:
@@ -75,27 +68,22 @@ def available() -> float:
 def resident() -> float:
     """Bytes that this process has allocated; 0 if the system does not report them."""
     try:
-        pages = int((PROC / "self/statm").read_text().split()[1])
+        return int((PROC / "self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
         return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _machine() -> float:
-    try:
-        for line in (PROC / "meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return 1024 * float(line.split()[1])
-    except (OSError, ValueError, IndexError):
-        pass
-    try:  # other systems: all installed memory
+    with contextlib.suppress(OSError, ValueError, IndexError, StopIteration):
+        lines = (PROC / "meminfo").read_text().splitlines()
+        return next(1024 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    with contextlib.suppress(AttributeError, ValueError, OSError):  # other systems: all installed memory
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return math.inf
+    return math.inf
 
 
 def _groups() -> list[float]:
-    """Bytes that the control groups (version 2) of this process leave, without page cache."""
+    """Bytes that the control groups (version 2) of this process leave."""
     try:
         lines = (PROC / "self/cgroup").read_text().splitlines()
     except OSError:

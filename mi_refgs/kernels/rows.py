@@ -9,16 +9,14 @@ import mitsuba as mi
 
 from mi_refgs.types import Float
 
-ACCESS = 8
-"""Floats per access: Dr.Jit's LLVM code splits wider ones into these."""
+ACCESS = 8  # floats per access: Dr.Jit's LLVM code splits wider ones
 
 
 def columns_of(array: Float, width: int) -> list[Float]:
     """Columns (N,) of N · width floats without padding, under AD.
 
-    The adjoint is computed in memory of its own and then added to that of `array`. The adjoint of a gather
-    would write into the gradient of `array` itself, where other terms of a loss write in another mode: one of
-    the two would be lost.
+    The adjoint of a gather would write into the gradient of `array`, where other terms of a loss write in
+    another mode, and one of the two would be lost: this one is computed in memory of its own.
     """
     return list(dr.custom(_Columns, array, width))
 
@@ -39,23 +37,19 @@ class _Columns(dr.CustomOp):
     def name(self) -> str:
         return "columns"
 
-    @property
-    def access(self) -> int:
-        """Floats per access: the most that divide a row."""
-        return math.gcd(self.width, ACCESS)
-
     def _split(self, array: Float) -> list[Float]:
-        count, accesses = dr.width(array) // self.width, self.width // self.access
+        access = math.gcd(self.width, ACCESS)
+        count, accesses = dr.width(array) // self.width, self.width // access
         row = dr.arange(mi.UInt32, count) * accesses
-        if self.access == 1:
+        if access == 1:
             return [dr.gather(mi.Float, array, row + i) for i in range(self.width)]
-        shape = (self.access, count)
+        shape = (access, count)
         return [x for i in range(accesses) for x in dr.gather(mi.ArrayXf, array, row + i, shape=shape)]
 
     def _join(self, columns: list[Float]) -> Float:
         if self.width == 1:
             return columns[0]
-        size = self.access
+        size = math.gcd(self.width, ACCESS)
         if size == 1 and self.width > ACCESS:
             # To write column by column, 16 cache lines each time, takes four times as long.
             size, columns = ACCESS, columns + [mi.Float(0)] * (-self.width % ACCESS)
@@ -75,10 +69,7 @@ class _Columns(dr.CustomOp):
 
 
 def joined(first: list[Float], second: list[Float]) -> list[Float]:
-    """Concatenate the arrays of two lists pair by pair, under AD.
-
-    The adjoints are arrays of their own, into which no other reader of the inputs writes.
-    """
+    """Concatenate the arrays of two lists pair by pair, under AD; the adjoints have memory of their own."""
     return list(dr.custom(_Joined, first, second))
 
 
@@ -106,14 +97,11 @@ class _Joined(dr.CustomOp):
         return "joined"
 
     def _join(self, first: list[Float], second: list[Float]) -> list[Float]:
-        out = []
+        out, promise = [], dr.ReduceMode.NoConflicts  # without it every array would be a kernel of its own
         for a, b, width, other in zip(first, second, *self.widths, strict=True):
-            whole = dr.empty(mi.Float, width + other)
-            place, begin = dr.arange(mi.UInt32, width), dr.opaque(mi.UInt32, width)
-            # Without the promise of no conflicts every array would be a kernel of its own.
-            dr.scatter(whole, dr.detach(a), place, mode=dr.ReduceMode.NoConflicts)
-            place = dr.arange(mi.UInt32, other) + begin
-            dr.scatter(whole, dr.detach(b), place, mode=dr.ReduceMode.NoConflicts)
+            whole, begin = dr.empty(mi.Float, width + other), dr.opaque(mi.UInt32, width)
+            dr.scatter(whole, dr.detach(a), dr.arange(mi.UInt32, width), mode=promise)
+            dr.scatter(whole, dr.detach(b), dr.arange(mi.UInt32, other) + begin, mode=promise)
             out.append(whole)
         dr.eval(out)
         return out

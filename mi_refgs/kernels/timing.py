@@ -1,8 +1,6 @@
-"""Named phases of a step, for a listener that times them.
+"""Named phases of a step, for a listener that times them; without one, all functions here do nothing.
 
-`phase` marks a function as a phase, `boundary` a value at which the backward pass enters another phase.
-Without a listener both do nothing: no kernel, no launch, no node of the AD graph. Names of phases are those
-of `evaluation.profile`.
+Names of phases are those of `evaluation.profile`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Functions of arrays, applied to what contains arrays."""
+"""Functions of arrays, applied to lists, dictionaries and dataclasses of arrays."""
 
 from __future__ import annotations
 

@@ -16,9 +16,9 @@ from mi_refgs.fitting import runner
 from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import write_png
+from mi_refgs.io.progress import progress_bar, say, warn
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
-from mi_refgs.progress import progress_bar, say, warn
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
 
 PSNR_MEMORY = 0.9

@@ -30,8 +30,8 @@ from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
 from mi_refgs.io.ownership import own_folder
+from mi_refgs.io.progress import with_bar
 from mi_refgs.methods.method import Method
-from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.new_light import NewLight, truth_under
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.render.samples import samples_per_axis

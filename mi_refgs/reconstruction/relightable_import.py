@@ -19,8 +19,8 @@ from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
 from mi_refgs.io.ownership import RUN, own_folder, owner_of
+from mi_refgs.io.progress import with_bar
 from mi_refgs.methods.read import PRESETS
-from mi_refgs.progress import with_bar
 from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.reconstruction import Reconstruction, import_splats
 from mi_refgs.runs.run import Run

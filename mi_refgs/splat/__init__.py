@@ -15,12 +15,11 @@ from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
-Tables = Surfels | Sequence[Surfels]
-"""One table of surfels, or several that are splatted in one sort, such as an object and its surroundings."""
+Tables = Surfels | Sequence[Surfels]  # one table, or several in one sort: an object and its surroundings
 
 
 def tables_of(surfels: Tables) -> list[Surfels]:
-    """The tables."""
+    """Return the tables as a list."""
     return [surfels] if isinstance(surfels, Surfels) else list(surfels)
 
 
@@ -31,20 +30,13 @@ def surfel_count(surfels: Tables) -> int:
 
 @phase("project")
 def project(surfels: Tables, camera: Camera) -> Footprints:
-    """Footprints of surfels in a camera, one table after the other.
-
-    Raises InputError for tables of primitives that are not splatted together.
-    """
+    """Footprints of tables, one after the other; raises InputError if they are not splatted together."""
     tables = tables_of(surfels)
     tables = [table for table in tables if table.count] or tables[:1]
     return reduce(Footprints.followed_by, (table.primitive.project(table, camera) for table in tables))
 
 
-def splat(
-    surfels: Tables,
-    features: list[Float],  # K × (N,)
-    camera: Camera,
-) -> Composited:
+def splat(surfels: Tables, features: list[Float], camera: Camera) -> Composited:
     """Splat features of surfels to maps of H·W pixels in raster order; derivatives as in `composite`."""
     if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera)
@@ -54,7 +46,7 @@ def splat(
 
 
 def splat_compact(surfels: Tables, features: list[Float], camera: Camera, depth: bool) -> Composited:
-    """Splat features of surfels as `composite_compact` does: only pixels near surfels, no derivatives."""
+    """Splat as `composite_compact` does: only pixels near surfels, no derivatives."""
     if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera, depth)
     return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth)

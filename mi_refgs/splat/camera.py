@@ -20,9 +20,8 @@ from mi_refgs.types import Float, Point2f, Point3f, Sensor, UInt32, Vector3f
 class Camera:
     """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
 
-    In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. All numbers but the image size
-    are opaque Dr.Jit values, so that every view of a data set uses one compiled kernel. Poses have no
-    derivatives; a camera that was `displaced` or `attached` under AD has those of its `motion`.
+    In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. Numbers but the image size are
+    opaque Dr.Jit values: all views share kernels. If `displaced` or `attached` under AD, it has a `motion`.
     """
 
     width: int  # pixels
@@ -85,9 +84,8 @@ class Camera:
         rotation = matrix[:3, :3]
         finite = np.isfinite(matrix).all()
         if not finite or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
-            raise InputError(
-                "must be a rotation and a translation", "camera", "to_world", "remove scale and shear"
-            )
+            what, remedy = "must be a rotation and a translation", "remove scale and shear"
+            raise InputError(what, "camera", "to_world", remedy)
 
         def opaque(*numbers: float) -> list[Float]:
             return [dr.opaque(mi.Float, float(x)) for x in numbers]
@@ -111,24 +109,19 @@ class Camera:
     ) -> Camera:
         """Camera at `origin` that looks at `target`, both in the world, with `up` upwards in the image.
 
-        fov: degrees across the width of the image, as in Mitsuba's `perspective`. size: width and height, or
-        both as one number, pixels. near: depth of the near plane, scene units; 1/1000 of the distance to the
-        target by default. Raises InputError for values that define no view.
+        fov: degrees across the width. size: width and height, or both as one number, pixels. near: depth,
+        scene units; 1/1000 of the distance by default. Raises InputError for values that define no view.
         """
         width, height = (size, size) if isinstance(size, int) else size
         eye, forward, top = (np.asarray(x, dtype=np.float64) for x in (origin, target, up))
         forward = forward - eye
         distance, left = float(np.linalg.norm(forward)), np.cross(top, forward)
         if not (0 < fov < 180 and width > 0 and height > 0):
-            raise InputError(
-                f"fov, size: {fov:g} degrees on {width} × {height} pixels",
-                "camera",
-                remedy="give an angle below 180, and pixels",
-            )
+            what = f"fov, size: {fov:g} degrees on {width} × {height} pixels"
+            raise InputError(what, "camera", remedy="give an angle below 180, and pixels")
         if not (distance > 0 and np.linalg.norm(left) > 1e-9 * distance * np.linalg.norm(top)):
-            raise InputError(
-                "no direction besides that of the view", "camera", "up", "move `origin`, or turn `up`"
-            )
+            what, remedy = "no direction besides that of the view", "move `origin`, or turn `up`"
+            raise InputError(what, "camera", "up", remedy)
         left, forward = left / np.linalg.norm(left), forward / distance
         pose = np.eye(4)
         pose[:3] = np.stack([left, np.cross(forward, left), forward, eye], axis=1)
@@ -138,16 +131,11 @@ class Camera:
 
     @staticmethod
     def from_sensor(sensor: Sensor) -> Camera:
-        """Camera of a Mitsuba `perspective` sensor, with its crop window and principal-point offset.
-
-        It has no derivatives unless it is `attached`. Raises InputError for every other sensor.
-        """
+        """Camera of a Mitsuba `perspective` sensor; raises InputError for every other sensor."""
         params = mi.traverse(sensor)
         if "x_fov" not in params or "aperture_radius" in params:
-            raise InputError(
-                f"sensor '{sensor.id()}': type: refgs has pinhole cameras only",
-                remedy="use a `perspective` sensor",
-            )
+            what = f"sensor '{sensor.id()}': type: refgs has pinhole cameras only"
+            raise InputError(what, remedy="use a `perspective` sensor")
         width, height = (int(x) for x in sensor.film().crop_size())
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         # A uniform scale in to_world moves no ray of a pinhole; take it out before the rigidity check.
@@ -168,8 +156,7 @@ class Camera:
     def attached(self, sensor: Sensor) -> Camera:
         """The camera with derivatives of its sensor's `to_world` and `x_fov`, where gradients are enabled.
 
-        A change of `to_world` counts as that of the rigid matrix nearest to it: scale and shear have no
-        derivative.
+        Those of `to_world` are of the rigid matrix nearest to it: scale and shear have none.
         """
         camera, matrix, angle = self, sensor.world_transform().matrix, mi.traverse(sensor)["x_fov"]
         if dr.grad_enabled(matrix):
@@ -209,8 +196,7 @@ class Camera:
         return vector if self.motion is None else vector + dr.cross(self._motion(0, vector), vector)
 
     def _motion(self, first: int, vector: Vector3f) -> Vector3f:
-        """Three numbers of `motion` for each vector. Gathered: the adjoint is then one sum in the kernel of
-        the adjoints of the vectors, where that of a broadcast is a kernel per use."""
+        """Three numbers of `motion` per vector, gathered: the adjoint of a broadcast is a kernel per use."""
         assert self.motion is not None
         index = dr.full(mi.UInt32, first, dr.width(vector))
         mode = dr.ReduceMode.Expand
@@ -240,10 +226,7 @@ class Camera:
         return Camera.from_pose(self.width, self.height, fx, fy, cx, cy, to_world, near)
 
     def displaced(self, rotation: mi.Matrix3f, centre: Point3f, translation: Vector3f) -> Camera:
-        """The camera after a rotation of the world about `centre` and a translation, all of width 1.
-
-        Under AD, gradients of the new camera's images flow to both through its `motion`.
-        """
+        """The camera after a rotation of the world about `centre` and a translation, of width 1, under AD."""
         lever = -self.towards(centre)
         change = rotation @ lever - lever + translation  # of the origin; small, so it keeps its digits
         origin = dr.detach(mi.Point3f(self.origin + self.origin_rest + change))
@@ -255,10 +238,7 @@ class Camera:
         return replace(self, rotation=matrix, origin=origin, origin_rest=rest, motion=motion)
 
     def resized(self, size: int | tuple[int, int]) -> Camera:
-        """The same view with another resolution: width and height, or the longer side, pixels.
-
-        Raises InputError for a size without pixels.
-        """
+        """The same view with another size, or longer side, pixels; raises InputError if there are none."""
         if isinstance(size, int):
             ratio, least = size / max(self.width, self.height), min(size, 1)
             size = max(least, round(self.width * ratio)), max(least, round(self.height * ratio))
@@ -274,10 +254,9 @@ class Camera:
         )
 
     def window(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The part of the view from pixel (x, y), which may lie outside the image.
+        """The part of the view from pixel (x, y), which may lie outside; tiles and random numbers stay.
 
-        Tiles, random numbers and borders are those of the whole image. Kernels do not depend on x and y, if
-        these are multiples of PATCH_EDGE.
+        Kernels do not depend on x and y if these are multiples of PATCH_EDGE.
         """
         cx, cy = self.cx - dr.opaque(mi.Float, x), self.cy - dr.opaque(mi.Float, y)
         offset = self.offset[0] + x, self.offset[1] + y

@@ -33,37 +33,30 @@ from mi_refgs.types import Array, Arrays, Bool, Float, Point2f, UInt32
 
 SIDE = LANE_PIXELS_PER_AXIS
 LANE_PIXELS = SIDE**2
-"""Pixels of a lane."""
 PATCH_LANES = PATCH_EDGE**2 // LANE_PIXELS
-"""Lanes of a patch."""
-NOWHERE = 0xFFFFFFFF
-"""Slot of a patch that was not chosen."""
+NOWHERE = 0xFFFFFFFF  # slot of a patch that was not chosen
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Patches of tiles over an image, row by row."""
+    """Patches of tiles over an image, row by row; `lanes` per tile and `tiles` per patch along each axis."""
 
     camera: Camera
 
     @property
     def lanes(self) -> tuple[int, int]:
-        """Lanes of a tile along each axis."""
         return self.camera.tile[0] // SIDE, self.camera.tile[1] // SIDE
 
     @property
     def tiles(self) -> tuple[int, int]:
-        """Tiles of a patch along each axis."""
         return PATCH_EDGE // self.camera.tile[0], PATCH_EDGE // self.camera.tile[1]
 
     @property
     def columns(self) -> int:
-        """Patches per row of patches."""
         return -(-self.camera.tiles[0] // self.tiles[0])
 
     @property
     def patches(self) -> int:
-        """Number of patches."""
         return self.columns * -(-self.camera.tiles[1] // self.tiles[1])
 
 
@@ -132,10 +125,7 @@ class Lanes:
 
 @dataclass(frozen=True)
 class CompactedPixels:
-    """The P pixels of the patches that list a surfel, patch by patch and lane by lane.
-
-    What a SIMD vector reads is then a square of the image, not a line: neighbours' rays are traced together.
-    """
+    """The P pixels of the patches that list a surfel, patch by patch, lane by lane: squares of the image."""
 
     raster: UInt32  # (P,): index in the image
     index: UInt32  # (H·W,): which of the P each pixel of the image is
@@ -208,9 +198,8 @@ def walk(
 ) -> list[Any]:
     """Visit the surfels of each lane's tile in order, until the lane's last pixel has ended.
 
-    `start` has the state of each pixel of a lane; its first entry says whether the pixel goes on. `step` maps
-    a surfel, whether the lane goes on, and the states (one list per quantity) to states in the form of
-    `start`. Returns the last states, one list per quantity.
+    `start` has the state of each pixel, first whether it goes on. `step` maps a surfel, whether the lane goes
+    on, and the states to states in the form of `start`. States and result: one list per quantity.
     """
 
     def surfel_at(pair: UInt32, some: Bool) -> UInt32:
@@ -223,13 +212,9 @@ def walk(
         goes_on = any_of(active)
         # The next surfel is read while this one is worked on: its row waits for nothing then.
         following = surfel_at(pair + 1, goes_on)
-        return pair + 1, following, *_transposed(step(surfel, goes_on, active, *state))
+        after = step(surfel, goes_on, active, *state)
+        return pair + 1, following, *map(list, zip(*after, strict=True))
 
-    begin = (lanes.begin, surfel_at(lanes.begin, True), *_transposed(start))
+    begin = (lanes.begin, surfel_at(lanes.begin, True), *map(list, zip(*start, strict=True)))
     _, _, *state = dr.while_loop(begin, condition, body, label=label)
     return state
-
-
-def _transposed(rows: list[tuple[Any, ...]]) -> tuple[list[Any], ...]:
-    """One tuple per pixel of a lane to one list per quantity."""
-    return tuple(list(column) for column in zip(*rows, strict=True))

@@ -12,8 +12,7 @@ from mi_refgs.kernels.rows import ACCESS
 from mi_refgs.types import Bool, Float, UInt32
 
 COPIES_BYTES = 1 << 30
-"""Largest memory of the copies per thread that `PackedRows.add` makes; above it, additions are atomic. The
-gradient of a million surfels with 14 features, 24 floats per row, has 96 MB per copy: 11 threads fit."""
+"""Largest memory of the copies per thread that `PackedRows.add` makes; above it, additions are atomic."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +26,18 @@ class PackedRows:
     @property
     def accesses(self) -> int:
         """Accesses per row."""
-        return _padded(self.width) // ACCESS
+        return -(-self.width // ACCESS)
 
     @staticmethod
     def zeros(count: int, width: int) -> PackedRows:
         """Rows of zeros."""
-        return PackedRows(dr.zeros(mi.Float, count * _padded(width)), count, width)
+        return PackedRows(dr.zeros(mi.Float, count * -(-width // ACCESS) * ACCESS), count, width)
 
     @staticmethod
     def pack(columns: list[Float]) -> PackedRows:
         """Pack columns (N,)."""
         count, width = dr.width(columns[0]), len(columns)
-        rows = PackedRows(dr.empty(mi.Float, count * _padded(width)), count, width)
+        rows = PackedRows(dr.empty(mi.Float, count * -(-width // ACCESS) * ACCESS), count, width)
         values = [dr.detach(column) for column in columns]
         for place, group in rows._groups(dr.arange(mi.UInt32, count), values):
             # Without the promise of no conflicts every group would be a kernel of its own.
@@ -57,10 +56,7 @@ class PackedRows:
         return [value for group in groups for value in group]
 
     def add(self, row: UInt32, values: list[Float], active: Bool) -> None:
-        """Add values, one array per column, to rows.
-
-        On the CPU each thread has a copy until the rows are read, if all copies fit into COPIES_BYTES.
-        """
+        """Add values, one array per column, to rows; by copies per thread if they fit into COPIES_BYTES."""
         # Dr.Jit itself always adds atomically to more than a million entries.
         copies = 4 * dr.width(self.data) * dr.thread_count()
         mode = dr.ReduceMode.Expand if copies <= COPIES_BYTES else dr.ReduceMode.Local
@@ -71,8 +67,3 @@ class PackedRows:
         padded = values + [mi.Float(0)] * (self.accesses * ACCESS - len(values))
         groups = [padded[i : i + ACCESS] for i in range(0, len(padded), ACCESS)]
         return [(row * self.accesses + i, mi.ArrayXf(group)) for i, group in enumerate(groups)]
-
-
-def _padded(width: int) -> int:
-    """Floats of a row with its padding."""
-    return -(-width // ACCESS) * ACCESS

@@ -17,12 +17,8 @@ from mi_refgs.splat.rows import PackedRows
 from mi_refgs.surfels.primitives import Footprints, Primitive
 from mi_refgs.types import Bool, Float, Int32, UInt32, UInt64
 
-MAX_PAIR_BITS = 27
-"""Log₂ of the largest number of surfel-tile pairs: 40 bytes each, 5 GB in all."""
-
-CHUNK = 1 << 25
-"""Candidate pairs, the tiles in footprints' rectangles, that are tested together: 20 bytes each, 0.7 GB.
-A view of 50,000 surfels at 1024² has a million."""
+MAX_PAIR_BITS = 27  # log₂ of the largest number of surfel-tile pairs: 40 bytes each, 5 GB in all
+CHUNK = 1 << 25  # tiles in footprints' rectangles that are tested together: 20 bytes each, 0.7 GB
 
 
 @dataclass(frozen=True)
@@ -71,14 +67,10 @@ def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Floa
         kept = dr.compress(touches)
         count += dr.width(kept)
         if count > 1 << MAX_PAIR_BITS:
+            size = f"{tiles:,} tiles of {camera.width} × {camera.height} pixels"
+            remedy = "render fewer pixels, or remove the largest surfels"
             raise InputError(
-                (
-                    f"more than {1 << MAX_PAIR_BITS:,} surfels on the {tiles:,} tiles of {camera.width} × "
-                    f"{camera.height} pixels"
-                ),
-                "splat",
-                "surfels",
-                "render fewer pixels, or remove the largest surfels",
+                f"more than {1 << MAX_PAIR_BITS:,} surfels on the {size}", "splat", "surfels", remedy
             )
         if dr.width(kept):
             pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))
@@ -96,7 +88,7 @@ def _sorted(pairs: UInt64, depth: Float, tiles: int) -> tuple[UInt32, UInt32]:
     """Tiles and surfels of pairs (tile, surfel), sorted by tile, then by depth."""
     nearest_first = _nearest_first(depth)
     pairs = _sorted_by(dr.gather(mi.UInt64, pairs, nearest_first), 0, (tiles - 1).bit_length())
-    tile, surfel = _upper(pairs), _lower(pairs)
+    tile, surfel = mi.UInt32(pairs >> 32), _lower(pairs)
     dr.eval(tile, surfel)
     return tile, surfel
 
@@ -104,8 +96,8 @@ def _sorted(pairs: UInt64, depth: Float, tiles: int) -> tuple[UInt32, UInt32]:
 def _nearest_first(depth: Float) -> UInt32:
     """Indices that sort `depth`: a radix sort of 24 bits, where `dr.argsort` sorts 32.
 
-    The bits of positive floats are in the order of the floats. The differences to the smallest fit into 24
-    bits if the largest is up to four times as far; beyond, the last digits are dropped.
+    Bits of positive floats are in their order. If the largest is more than four times the smallest, the last
+    digits are dropped.
     """
     key = dr.reinterpret_array(mi.UInt32, depth)
     dr.eval(key)
@@ -122,17 +114,13 @@ def _join(upper: UInt32, lower: UInt32) -> UInt64:
     return mi.UInt64(upper) << 32 | mi.UInt64(lower)
 
 
-def _upper(joined: UInt64) -> UInt32:
-    return mi.UInt32(joined >> 32)
-
-
 def _lower(joined: UInt64) -> UInt32:
     return mi.UInt32(joined & 0xFFFFFFFF)
 
 
 def _sorted_by(joined: UInt64, shift: int, bits: int) -> UInt64:
     """Sort by some bits of the upper half: one pass of a stable counting sort."""
-    digit = (_upper(joined) >> shift) & ((1 << bits) - 1)
+    digit = mi.UInt32(joined >> (32 + shift)) & ((1 << bits) - 1)
     dr.eval(joined, digit)
     return dr.gather(mi.UInt64, joined, dr.detail.block_mkperm(digit, dr.width(digit), 1 << bits))
 

@@ -1,8 +1,4 @@
-"""Attributes of a surfel: the one place where they are declared.
-
-The surfel model, its PLY file, the optimiser, the method files, the AOVs and the plugin read these
-declarations. A new attribute is one `register`ed `Attribute`.
-"""
+"""Attributes of a surfel: the one place where they are declared. A new one is a `register`ed `Attribute`."""
 
 from __future__ import annotations
 
@@ -14,20 +10,11 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.registry import Registry
 
-MAX_SH_DEGREE = 3
-"""Highest spherical-harmonic degree that the 3DGS family stores; `shade.sh` evaluates no more."""
-
-ALBEDO_JITTER = 0.025
-"""Half the width of the initial albedo's noise: breaks ties between surfels. [Ref-Gaussian]"""
-
-SH_DC = 0.28209479177387814
-"""Y_0 = 1 / (2 √π): a constant coefficient c adds the colour Y_0 c. [3DGS]"""
-
-JITTER_RANGE = (0.001, 0.999)
-"""Range of initial values with noise: away from 0 and 1, where the sigmoid has no slope."""
-
-PROBABILITY_MARGIN = 1e-6
-"""Least distance of initial values from 0 and 1, where the logit is infinite."""
+MAX_SH_DEGREE = 3  # of the 3DGS family; `shade.sh` evaluates no more
+ALBEDO_JITTER = 0.025  # half the width of the initial albedo's noise: breaks ties. [Ref-Gaussian]
+SH_DC = 0.28209479177387814  # Y_0 = 1 / (2 √π): a constant coefficient c adds the colour Y_0 c. [3DGS]
+JITTER_RANGE = (0.001, 0.999)  # of initial values with noise: beyond, the sigmoid is flat
+PROBABILITY_MARGIN = 1e-6  # least distance of initial values from 0 and 1, where the logit is infinite
 
 Activation = Literal["identity", "quaternion", "exp", "sigmoid", "harmonics"]
 """Activation of a raw value. "quaternion": normalised (x, y, z, w); "sigmoid": logistic; `harmonics`: raw
@@ -59,7 +46,6 @@ class Attribute:
 
     @property
     def harmonics(self) -> bool:
-        """Whether it contains spherical harmonics."""
         return self.activation == "harmonics"
 
     @property
@@ -74,10 +60,9 @@ class Attribute:
     def start(
         self, count: int, width: int, rng: np.random.Generator, value: float | np.ndarray | None = None
     ) -> np.ndarray:  # (count, width) float64
-        """Initial raw values around the activated `value` (default: `initial`).
+        """Initial raw values around the activated `value`; for SH, what the constant coefficient adds.
 
-        For spherical harmonics, `value` is what the constant coefficient adds to a colour. Raises InputError
-        for a value that the activation cannot return.
+        Raises InputError for a value that the activation cannot return.
         """
         value = self.initial if value is None else value
         if self.activation == "sigmoid":
@@ -98,16 +83,13 @@ class Attribute:
 
 def _check(attribute: Attribute) -> None:
     if attribute.aov not in ("", "Y", "RGB", "XYZ") or len(attribute.aov) not in (0, *attribute.widths):
-        widths = " or ".join(map(str, attribute.widths))
-        raise InputError(
-            f"attribute '{attribute.name}': aov: {attribute.aov!r} does not fit {widths} columns",
-            remedy='use Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""',
-        )
+        what = f"aov: {attribute.aov!r} does not fit {' or '.join(map(str, attribute.widths))} columns"
+        remedy = 'use Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""'
+        raise InputError(f"attribute '{attribute.name}': {what}", remedy=remedy)
     for other in ATTRIBUTES.values():
         if {*other.properties} & {*attribute.properties}:
-            raise InputError(
-                f"attribute '{attribute.name}': '{other.name}' has its PLY property", remedy="rename it"
-            )
+            what = f"attribute '{attribute.name}': '{other.name}' has its PLY property"
+            raise InputError(what, remedy="rename it")
 
 
 ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check)
@@ -115,11 +97,7 @@ ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check)
 
 
 def register(attribute: Attribute) -> Attribute:
-    """Add an attribute, which is returned, to surfel models, PLY files, method files, AOVs and the plugin.
-
-    Raises InputError if another attribute has its name or one of its PLY properties, or if its AOV's suffixes
-    are not those of its columns.
-    """
+    """Add an attribute, which is returned; raises InputError if its name, properties or AOV do not fit."""
     return ATTRIBUTES.register(attribute)
 
 
@@ -139,12 +117,11 @@ def sigmoid(raw: float | np.ndarray) -> np.ndarray:
     return 0.5 * (1 + np.tanh(0.5 * np.asarray(raw, dtype=np.float64)))
 
 
-def _numbered(prefix: str, count: int = 3) -> tuple[str, ...]:
-    return tuple(f"{prefix}_{i}" for i in range(count))
+def _numbered(prefix: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}_{i}" for i in range(3))
 
 
-QUATERNION = ("rot_1", "rot_2", "rot_3", "rot_0")
-"""PLY properties of the raw columns (x, y, z, w): files have w first."""
+QUATERNION = ("rot_1", "rot_2", "rot_3", "rot_0")  # of the raw columns (x, y, z, w): files have w first
 
 # Rates as in 2DGS, those of materials and light as in Ref-Gaussian (appendix, implementation details); tint
 # and offset of the normal belong to GaussianShader (Jiang et al. 2024, §4).

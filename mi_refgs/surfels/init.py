@@ -13,10 +13,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, SH_DC, attrib
 from mi_refgs.surfels.primitives import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 
-DISTANCE_FLOOR = 1e-4
-"""Least distance to the neighbours, in extents of the points: keeps the log scale of doubled points finite.
-2DGS has 3e-4 scene units, whatever the unit."""
-
+DISTANCE_FLOOR = 1e-4  # least distance of neighbours, in extents of the points: keeps the log scale finite
 NEIGHBOURS = 3  # their mean squared distance gives the scale [3DGS]
 
 MORTON_BITS = 10  # log₂ of the cells along an axis: they are smaller than the distance of surfels
@@ -38,11 +35,10 @@ def from_points(
 ) -> Surfels:
     """Surfels at points: scale from the 3 nearest neighbours, normal as given or uniform at random.
 
-    largest: bound of the scales. The tangents are turned at random about the normal. attributes: those
-    beside the geometry (default: all). degree: of spherical harmonics by attribute, 0 by default. initial:
-    activated values by attribute, such as `roughness=0.3`; defaults are those of `surfels.attributes`.
-    `colours` fill the constant coefficient of radiance_sh (grey 0.5 by default). Raises InputError for wrong
-    shapes, NaN, unknown attributes, values out of range, and values of attributes that are not made of them.
+    largest: bound of the scales. attributes: those beside the geometry (default: all). degree: of spherical
+    harmonics by attribute, 0 by default. initial: activated values by attribute, such as `roughness=0.3`.
+    colours: of the constant coefficient of radiance_sh (grey 0.5 by default). Raises InputError for wrong
+    shapes, NaN, unknown attributes and values out of range.
     """
     points = _check("points", points, np.shape(points)[:1])
     count = len(points)
@@ -50,9 +46,8 @@ def from_points(
         attribute(name)
     for name, wanted in (degree or {}).items():
         if not 0 <= wanted <= MAX_SH_DEGREE:
-            raise InputError(
-                f"degree of {name}: {wanted} is not in 0 … {MAX_SH_DEGREE}", "surfels", remedy="choose one"
-            )
+            what = f"degree of {name}: {wanted} is not in 0 … {MAX_SH_DEGREE}"
+            raise InputError(what, "surfels", remedy="choose one")
     if normals is not None:
         normals = _check("normals", normals, (count,))
     kind = PRIMITIVES.find(primitive, "primitive")
@@ -74,10 +69,9 @@ def from_points(
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:
-    """Root mean squared distance (N,) of each point to its 3 nearest neighbours.
+    """Root mean squared distance (N,) of each point to its 3 nearest ones, above DISTANCE_FLOOR extents.
 
-    At least DISTANCE_FLOOR times the longest side of the points' box; if they are all at one place, times
-    its distance from the origin, or 1.
+    The extent of points at one place is their distance from the origin, or 1.
     """
     if not len(points):
         return np.zeros(0)
@@ -111,10 +105,7 @@ def quaternions(normals: np.ndarray | None, count: int, rng: np.random.Generator
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """Order (N,) of points (N, 3) along a Z-shaped space-filling curve; stable. [Morton 1966]
-
-    What a tile reads is then close together in memory.
-    """
+    """Order (N,) of points (N, 3) along a Z-shaped space-filling curve; stable. [Morton 1966]"""
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
     low, high = np.quantile(points, (MORTON_OUTLIERS, 1 - MORTON_OUTLIERS), axis=0)

@@ -23,15 +23,12 @@ from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, sh_columns
 from mi_refgs.surfels.primitives import nearest_primitive
 from mi_refgs.surfels.table import Surfels
 
-# ---------------- reading ----------------
-
 
 def read_ply(path: str | Path) -> Surfels:
     """Read surfels from a binary or ASCII PLY file; unknown properties are ignored.
 
-    Attributes without properties are absent. Raises InputError that names file, property and remedy if the
-    file is missing, truncated or no PLY, if a property of an attribute or an attribute of the primitive is
-    missing, or if a value is not finite.
+    Raises InputError that names file, property and remedy if the file cannot be read, or a property is
+    missing or not finite.
     """
     path = Path(path)
     try:
@@ -39,7 +36,6 @@ def read_ply(path: str | Path) -> Surfels:
             vertices = read_vertices(path, file)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
-
     names = vertices.dtype.names or ()
     arrays = {}
     for name, attribute in ATTRIBUTES.items():
@@ -62,17 +58,14 @@ def _columns(path: Path, vertices: np.ndarray, properties: tuple[str, ...]) -> n
     table = np.empty((len(vertices), len(properties)), dtype=np.float32)
     for column, name in enumerate(properties):
         if name not in (vertices.dtype.names or ()):
-            needed = ", ".join(sorted(properties))
-            remedy = f"export the file again with all of {needed}"
+            remedy = f"export the file again with all of {', '.join(sorted(properties))}"
             raise InputError("the property is missing", path, name, remedy)
-        # A double beyond float32 becomes infinite here and is reported below.
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
             table[:, column] = vertices[name]
         bad = int(np.count_nonzero(~np.isfinite(table[:, column])))
         if bad:
-            raise InputError(
-                f"{bad} values are NaN or infinite", path, name, "remove those surfels or export it again"
-            )
+            remedy = "remove those surfels or export it again"
+            raise InputError(f"{bad} values are NaN or infinite", path, name, remedy)
     return table
 
 
@@ -92,14 +85,10 @@ def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
     return (*(f"{prefix}_dc_{rgb}" for rgb in range(3)), *rest)
 
 
-# ---------------- writing ----------------
-
-
 def write_ply(path: str | Path, surfels: Surfels) -> None:
-    """Write surfels as binary little-endian float32 PLY, atomically (old file or whole new one).
+    """Write surfels as binary little-endian float32 PLY, atomically; reading it gives the same bits.
 
-    Reading it back gives the same bits. Raises InputError if a value is not finite or the path cannot be
-    written.
+    Raises InputError if a value is not finite or the path cannot be written.
     """
     write_bytes(path, encode_ply(surfels))
 
@@ -110,7 +99,9 @@ def encode_ply(surfels: Surfels) -> bytes:
     tables = surfels.to_numpy()
     columns: dict[str, np.ndarray] = {}
     names = ["x", "y", "z", "nx", "ny", "nz"]
-    for attribute in _file_order():
+    first = ["position", "radiance_sh", "opacity", "scale", "rotation"]  # 2DGS's order, ours, SH last
+    others = (name for name in ATTRIBUTES if name not in first)
+    for attribute in [*first, *sorted(others, key=lambda name: ATTRIBUTES[name].harmonics)]:
         if attribute in tables:
             properties = ATTRIBUTES[attribute].properties
             if ATTRIBUTES[attribute].harmonics:
@@ -125,10 +116,3 @@ def encode_ply(surfels: Surfels) -> bytes:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {surfels.count}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]
     return "\n".join(header).encode("ascii") + rows.tobytes()
-
-
-def _file_order() -> list[str]:
-    """Attributes in 2DGS's order, then ours, spherical harmonics last."""
-    first = ["position", "radiance_sh", "opacity", "scale", "rotation"]
-    others = (name for name in ATTRIBUTES if name not in first)
-    return [*first, *sorted(others, key=lambda name: ATTRIBUTES[name].harmonics)]

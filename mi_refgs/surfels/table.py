@@ -27,18 +27,10 @@ from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
 from mi_refgs.surfels.primitives import Primitive, primitive_of
 from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, UInt32, Vector3f
 
-QUATERNION_FLOOR = 1e-12
-"""Largest |component| of a quaternion that counts as zero: its gradient, in units of 1/|q|, is useless."""
-
-QUATERNION_LARGE = 1e37
-"""Above it the reciprocal is a subnormal number, which processors may flush to zero."""
-
-LOG_SCALE_LIMIT = 40.0
-"""e^±40 = 4e-18 … 2e17 scene units: float32 contains them and their squares. `primitives` bound the size of
-a surfel relative to its depth, on which images depend."""
-
-LOGIT_LIMIT = 40.0
-"""1 / (1 + e^-40) is 1 in float32, and e^40 squared is finite in float32 (the derivative needs it)."""
+QUATERNION_FLOOR = 1e-12  # largest |component| of a quaternion that counts as zero
+QUATERNION_LARGE = 1e37  # above it the reciprocal is subnormal, which processors may flush to zero
+LOG_SCALE_LIMIT = 40.0  # e^±40 = 4e-18 … 2e17 scene units: float32 contains them and their squares
+LOGIT_LIMIT = 40.0  # 1 / (1 + e^-40) is 1 in float32, and e^40 squared, as in the derivative, is finite
 
 
 def sigmoid(x: Float) -> Float:
@@ -55,9 +47,8 @@ def _exp(x: Float) -> Float:
 class Surfels:
     """N surfels, 3D Gaussians or other primitives: raw attributes by name, which decide the `primitive`.
 
-    `raw` is in the order of ATTRIBUTES; an attribute that a scene does not use is absent and costs nothing.
-    Accessors return activated values as Dr.Jit arrays of width N; gradients flow to the raw tensors in both
-    modes.
+    An attribute that a scene does not use is absent. Accessors return activated values as Dr.Jit arrays of
+    width N; gradients flow to the raw tensors in both modes.
     """
 
     raw: dict[str, TensorXf]  # (N, D) each, often leaves of the AD graph
@@ -65,8 +56,7 @@ class Surfels:
     def __init__(self, raw: Mapping[str, TensorXf], screened: bool = False) -> None:
         """Adopt raw tensors of shape (N, D); raises InputError for unknown names or wrong shapes.
 
-        `screened`: opacity is 0 where any value of a surfel is not `usable`. Checking all attributes takes
-        3 % of a training step, whose optimiser keeps values finite; values of another origin need it.
+        `screened`: opacity is 0 where a value of a surfel is not `usable`, at 3 % of a training step.
         """
         for name in raw:
             attribute(name)
@@ -85,15 +75,12 @@ class Surfels:
         """Raw attributes as float32 arrays (N, D): copies, since Dr.Jit's own view shares the memory."""
         return {name: np.array(tensor.numpy()).reshape(tensor.shape) for name, tensor in self.raw.items()}
 
-    # ---------------- shape ----------------
-
     @property
     def count(self) -> int:
         """Number of surfels N."""
         return int(next(iter(self.raw.values())).shape[0]) if self.raw else 0
 
     def has(self, name: str) -> bool:
-        """Whether an attribute is present."""
         return name in self.raw
 
     def sh_degree(self, name: str = "radiance_sh") -> int:
@@ -105,13 +92,11 @@ class Surfels:
         for name, tensor in self.raw.items():
             shape = tuple(tensor.shape)
             if len(shape) != 2 or shape[0] != rows:
-                raise InputError(
-                    f"shape {shape}, expected ({rows}, D)", "surfels", name, "one row per surfel"
-                )
+                found = f"shape {shape}, expected ({rows}, D)"
+                raise InputError(found, "surfels", name, "one row per surfel")
             if shape[1] not in attribute(name).widths:
                 choices = " or ".join(str(columns) for columns in attribute(name).widths)
-                found = f"{shape[1]} columns, expected {choices}"
-                raise InputError(found, "surfels", name, "fix the array's shape")
+                raise InputError(f"{shape[1]} columns, expected {choices}", "surfels", name, "fix the array")
 
     @property
     def primitive(self) -> Primitive:
@@ -121,17 +106,14 @@ class Surfels:
     def validate(self) -> None:
         """Raise InputError if a shape is wrong, an attribute missing, or a value not finite."""
         self._check_shapes()
-        primitive_of(self.raw)
+        primitive_of(self.raw)  # raises
         for name, tensor in self.raw.items():
             bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
             if bad:
                 raise InputError(f"{bad} values are NaN or infinite", "surfels", name, "remove those surfels")
 
     def usable(self) -> Bool:  # (N,)
-        """Whether each surfel has finite raw values, below RAW_LIMIT where the activation is unbounded.
-
-        If `screened`, the others cover no pixel and get zero gradient. Detached.
-        """
+        """Whether each surfel has finite raw values, below RAW_LIMIT where the activation is unbounded."""
         detached, rows = self.detach(), mi.Bool(True)
         for name in self.raw:
             rows &= dr.all(dr.abs(mi.ArrayXf(detached.columns(name))) < _limit(name))
@@ -153,8 +135,6 @@ class Surfels:
             raw[name] = mi.TensorXf(values, shape=tuple(tensor.shape))
         return Surfels(raw)
 
-    # ---------------- raw columns ----------------
-
     def columns(self, name: str) -> list[Float]:
         """Raw columns (N,) of an attribute, under AD."""
         tensor = self.raw[name]
@@ -166,11 +146,7 @@ class Surfels:
     # ---------------- activated values ----------------
 
     def value(self, name: str) -> Any:
-        """Activated values of an attribute.
-
-        mi.Float for one column, mi.Color3f for three, else a list: mi.Color3f per SH coefficient, or mi.Float
-        per column. Geometry has accessors of its own types.
-        """
+        """Activated mi.Float of one column, mi.Color3f of three, else a list (SH: of mi.Color3f)."""
         columns = self.columns(name)
         activate = {"sigmoid": sigmoid, "exp": _exp}.get(attribute(name).activation)
         columns = columns if activate is None else [activate(column) for column in columns]
@@ -209,10 +185,7 @@ class Surfels:
         return kind(*(_exp(column) for column in columns)) if self.count else dr.zeros(kind, 0)
 
     def opacity(self) -> Float:
-        """Opacities in [0, 1]; if `screened`, 0 with gradient 0 where the surfel is not `usable`.
-
-        Schedules the evaluation of `usable` then.
-        """
+        """Opacities in [0, 1]; if `screened`, 0 with gradient 0 where the surfel is not `usable`."""
         opacity = sigmoid(self.columns("opacity")[0])
         if not self.screened or self.count == 0:
             return opacity
@@ -221,16 +194,12 @@ class Surfels:
         return dr.select(usable, opacity, 0)
 
     def frame(self) -> tuple[Vector3f, Vector3f, Vector3f]:
-        """World tangents and normal (t_u, t_v, n), the columns of the rotation matrix.
-
-        n is not yet turned towards a camera.
-        """
+        """World tangents and normal (t_u, t_v, n), the columns of the rotation matrix."""
         if self.count == 0:
             return dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0), dr.zeros(mi.Vector3f, 0)
         x, y, z, w = self.rotation()
 
-        # Squares of all four on the diagonal, no 1: rounding of |q| then changes lengths, by 1e-7, and no
-        # direction, on which the far end of a needle depends.
+        # Squares of all four on the diagonal, no 1: rounding of |q| then changes no direction.
         def entry(a: Float, b: Float, c: Float, d: Float) -> Float:
             return dr.fma(a, b, c * d)
 
@@ -247,7 +216,6 @@ class Surfels:
         return Surfels(raw, self.screened)
 
     def detach(self) -> Surfels:
-        """The same values, detached from the AD graph."""
         return Surfels({name: dr.detach(tensor) for name, tensor in self.raw.items()}, self.screened)
 
     def never_empty(self) -> Surfels:

@@ -34,8 +34,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
+from mi_refgs.io.progress import with_bar
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
-from mi_refgs.progress import with_bar
 from mi_refgs.synthesis.ground_truth import surface_mesh
 from mi_refgs.synthesis.options import DatasetOptions, LightFile
 from mi_refgs.synthesis.pathtrace import (

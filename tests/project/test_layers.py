@@ -11,7 +11,7 @@ from graphlib import TopologicalSorter
 from tests.helpers import ROOT
 
 FLOORS: list[set[str]] = [
-    {"constants", "errors", "llvm", "progress", "types"},
+    {"constants", "errors", "llvm", "types"},
     {"registry"},
     {"kernels"},
     {"io"},

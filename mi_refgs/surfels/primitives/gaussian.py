@@ -51,10 +51,7 @@ class GaussianSample(FootprintSample):
 
 
 def _as_surfel(columns: list[Float]) -> list[Float]:
-    """Rows of a surfel without perspective: c = 0, so w = 1 and u, v are linear in δ.
-
-    Its low-pass never decides: λ makes ρ at most |δ|²/λ, below that of the surfel's filter.
-    """
+    """Rows of a surfel without perspective: c = 0; λ keeps ρ below that of the surfel's low-pass."""
     a_x, a_y, b, *others = columns
     none = dr.zeros(mi.Float, dr.width(b))
     return [a_x, a_y, none, b, none, none, *others]
@@ -70,10 +67,7 @@ class Gaussian(Oriented):
     first_order = True
 
     def project(self, surfels: Surfels, camera: Camera) -> Footprints:
-        """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
-
-        Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite.
-        """
+        """Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite."""
         ahead, z, nearness, slope = projected(surfels, camera)
         axes = [camera.rotate_to_camera(t) for t in surfels.frame()]
         s, opacity = surfels.scale(), surfels.opacity()
@@ -105,7 +99,6 @@ class Gaussian(Oriented):
             return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> GaussianSample:
-        """Evaluate ρ as the sum of two squares; culling has put the centre beyond the near plane."""
         delta = mi.Vector2f(pixel.x - row[4], pixel.y - row[5])
         u, v = dot2(row[0], row[1], delta), row[2] * delta.y
         gaussian = dr.exp(-0.5 * dr.fma(u, u, v * v))
@@ -115,7 +108,6 @@ class Gaussian(Oriented):
         return GaussianSample(alpha, row[3], alpha >= ALPHA_MIN, gaussian, clamped, delta, u, v)
 
     def adjoint(self) -> GaussianAdjoint:
-        """See `Primitive.adjoint`."""
         return GaussianAdjoint()
 
     def evaluate_forward(
@@ -157,10 +149,7 @@ class Gaussian(Oriented):
 
 
 def _near_image(slope: Vector2f, camera: Camera) -> Vector2f:
-    """Slopes clamped to GAUSSIAN_SLOPE_MARGIN around the image, without gradient beyond.
-
-    A crop window has the borders of its film, or Gaussians would change with the window.
-    """
+    """Slopes clamped to GAUSSIAN_SLOPE_MARGIN around the film, without gradient beyond."""
     limited = []
     width, height = camera.film or (camera.width, camera.height)
     margins = (-GAUSSIAN_SLOPE_MARGIN, 1 + GAUSSIAN_SLOPE_MARGIN)
@@ -179,7 +168,6 @@ class GaussianAdjoint:
         self.depth, self.opacity = mi.Float(0), mi.Float(0)
 
     def add(self, sample: GaussianSample, δalpha: Float, δz: Float) -> None:
-        """See `Adjoint.add`."""
         delta = sample.delta
         δalpha = dr.select(sample.clamped, 0, δalpha)
         self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
@@ -190,6 +178,5 @@ class GaussianAdjoint:
         self.v = [self.v[0] + δv, dr.fma(δv, delta.y, self.v[1])]
 
     def columns(self, row: list[Float]) -> list[Float]:
-        """Adjoint of the seven columns."""
         (u, *δa), (v, δb) = self.u, self.v
         return [*δa, δb, self.depth, -u * row[0], -dr.fma(u, row[1], v * row[2]), self.opacity]

@@ -39,17 +39,15 @@ class Footprints:
     def followed_by(self, other: Footprints) -> Footprints:
         """These footprints, then others, under AD; raises InputError as `evaluating_both` does."""
         primitive = evaluating_both(self.primitive, other.primitive)
-        columns = joined(self.as_rows_of(primitive), other.as_rows_of(primitive))
+        rows = []
+        for part in (self, other):
+            same = part.primitive is primitive
+            rows.append(part.columns if same else part.primitive.rows_as[primitive.name](part.columns))
         (left, top), (right, bottom) = (
             tuple(dr.concat([a, b]) for a, b in zip(mine, theirs, strict=True))
             for mine, theirs in ((self.first, other.first), (self.last, other.last))
         )
-        return Footprints(columns, (left, top), (right, bottom), primitive)
-
-    def as_rows_of(self, primitive: Primitive) -> list[Float]:
-        """The columns, as another primitive evaluates them."""
-        own = self.primitive
-        return self.columns if primitive is own else own.rows_as[primitive.name](self.columns)
+        return Footprints(joined(*rows), (left, top), (right, bottom), primitive)
 
 
 @dataclass(frozen=True)
@@ -72,11 +70,7 @@ class Adjoint(Protocol):
 
 
 class Primitive(ABC):
-    """A primitive to splat. A row has its columns of one footprint, then features.
-
-    The argument `surfels` is a `surfels.table.Surfels`, `camera` a `splat.camera.Camera`, and `raw` maps
-    attributes to NumPy arrays (N, D) of raw values.
-    """
+    """A primitive to splat. A row has its columns of one footprint, then features."""
 
     name: str  # in method files
     widths: Mapping[str, int]  # attributes that it requires, and their columns; with position and opacity
@@ -90,10 +84,7 @@ class Primitive(ABC):
 
     @abstractmethod
     def project(self, surfels: Surfels, camera: Camera) -> Footprints:
-        """Footprints of all surfels in a camera.
-
-        The rectangles have no derivative. Culled surfels cover no pixel and get zero gradient.
-        """
+        """Footprints of all surfels; rectangles have no derivative, culled surfels cover no pixel."""
 
     @abstractmethod
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> FootprintSample:
@@ -125,18 +116,14 @@ class Primitive(ABC):
 
     @abstractmethod
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
-        """Raw attributes beside position and opacity, one primitive per point.
+        """Raw attributes beside position and opacity, for points whose neighbours are `spacing` (N,) away.
 
-        spacing: (N,) distance of neighbours. rotation: (N, 4) unit quaternion (x, y, z, w) whose third axis
-        is the surface normal.
+        rotation: (N, 4) unit quaternion (x, y, z, w) whose third axis is the surface normal.
         """
 
     @abstractmethod
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Orthonormal world axes (N, A, 3) of its Gaussian, and standard deviations (N, A) along them.
-
-        Densification splits a primitive along the longest of them.
-        """
+        """Orthonormal world axes (N, A, 3) of its Gaussian, and standard deviations (N, A) along them."""
 
     def like(self, axes: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
         """What `start` returns, for the `extent` of another primitive, A = 2 or 3: as large, round."""
@@ -149,10 +136,7 @@ class Primitive(ABC):
             raw[name][rows] += np.float32(np.log(factor))
 
     def shrink(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, factor: float) -> None:
-        """Multiply the standard deviation along one axis (n,) of each of n primitives by a factor, in place.
-
-        A primitive with one size for all axes shrinks along all of them.
-        """
+        """Multiply the standard deviation along an axis (n,) per primitive by a factor, in place."""
         for name in self.sizes:
             along = np.minimum(axis, raw[name].shape[1] - 1)
             raw[name][rows] += np.log(factor) * (np.arange(raw[name].shape[1]) == along[:, None])
@@ -182,10 +166,8 @@ def _check(primitive: Primitive) -> None:
     for other in PRIMITIVES.values():
         others = {*other.widths.items()}
         if mine <= others or others <= mine:
-            raise InputError(
-                f"primitive '{primitive.name}': '{other.name}' has its attributes",
-                remedy="give it an attribute, or a number of columns, of its own",
-            )
+            what = f"primitive '{primitive.name}': '{other.name}' has its attributes"
+            raise InputError(what, remedy="give it an attribute, or a number of columns, of its own")
 
 
 PRIMITIVES: Registry[Primitive] = Registry("primitive", _check)
@@ -208,21 +190,14 @@ def nearest_primitive(raw: Mapping[str, Any]) -> tuple[Primitive, list[str]]:
 
 
 def primitive_of(raw: Mapping[str, Any]) -> Primitive:
-    """The primitive whose attributes are among raw ones (N, D).
-
-    Raises InputError that names what the nearest primitive lacks.
-    """
+    """The primitive whose attributes are among raw ones (N, D); raises InputError that names missing ones."""
     nearest, missing = nearest_primitive(raw)
     if not missing:
         return nearest
     name = missing[0]
     if name in raw:
-        raise InputError(
-            f"{raw[name].shape[1]} columns, a {nearest.name} has {nearest.widths[name]}",
-            "surfels",
-            name,
-            "fix the array's shape",
-        )
+        found = f"{raw[name].shape[1]} columns, a {nearest.name} has {nearest.widths[name]}"
+        raise InputError(found, "surfels", name, "fix the array's shape")
     raise InputError("the attribute is missing", "surfels", name, f"add it, every {nearest.name} needs it")
 
 
@@ -231,22 +206,16 @@ def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
     for one, other in ((first, second), (second, first)):
         if one is other or one.name in other.rows_as:
             return one
-    raise InputError(
-        f"'{second.name}' is not splatted together with '{first.name}'",
-        "surroundings",
-        "scale",
-        "give both the same primitive, or surfel and gaussian (surroundings.primitive of a method)",
-    )
+    what = f"'{second.name}' is not splatted together with '{first.name}'"
+    remedy = "give both the same primitive, or surfel and gaussian (surroundings.primitive of a method)"
+    raise InputError(what, "surroundings", "scale", remedy)
 
 
 # ---------------- what all primitives share ----------------
 
 
 def projected(surfels: Surfels, camera: Camera) -> tuple[Bool, Float, Float, Vector2f]:
-    """Which centres lie beyond the near plane, their depth z, 1 / z, and (x, y) / z in the camera's frame.
-
-    Depths of the others are 1: a masked Inf would still poison the adjoint.
-    """
+    """Whether centres lie beyond the near plane, their depth z (else 1), 1 / z, and (x, y) / z."""
     p = camera.to_camera(surfels.position())
     ahead = dr.detach((p.z > camera.near) & (p.z > 0))
     z = dr.select(ahead, p.z, 1)
@@ -269,8 +238,7 @@ def rectangle(
 ) -> tuple[tuple[Int32, Int32], tuple[Int32, Int32]]:
     """First and last pixel column and row of centre + `low` to centre + `high`, pixels.
 
-    The last is below the first where nothing is covered or `visible` is false. `camera` is a
-    `splat.camera.Camera`.
+    The last is below the first where nothing is covered or `visible` is false.
     """
     first, last = [], []
     for axis, size in enumerate((camera.width, camera.height)):
@@ -293,14 +261,13 @@ def rotation_axes(rotation: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(axis, axis=1) for axis in (first, second, third)], axis=1)
 
 
-THICKNESS = 0.1
-"""Third standard deviation of a flat primitive as a Gaussian, over the smaller of its two."""
+THICKNESS = 0.1  # third standard deviation of a flat primitive as a Gaussian, over the smaller of its two
 
 
 def sorted_frame(axes: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions (N, 4) of axes in the order of their deviations, longest first, and all three (N, 3).
+    """Quaternions (N, 4) of axes (N, A, 3), A = 2 or 3, by their deviations, longest first; all three (N, 3).
 
-    axes: (N, A, 3), A = 2 or 3, as `Primitive.extent` returns them; the third of two is THICKNESS long.
+    The third of two is THICKNESS long.
     """
     order = np.argsort(-deviations, axis=1, kind="stable")
     axes = np.take_along_axis(axes, order[:, :, None], axis=1)

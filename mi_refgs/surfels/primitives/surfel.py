@@ -70,11 +70,7 @@ class Surfel(Oriented):
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
 
     def project(self, surfels: Surfels, camera: Camera) -> Footprints:
-        """Rows, and rectangles that contain every pixel with α ≥ ALPHA_MIN.
-
-        Culled: centre not beyond the near plane, edge-on by EDGE_ON_COSINE, opacity below ALPHA_MIN,
-        non-finite.
-        """
+        """Culled: centre not beyond the near plane, edge-on, opacity below ALPHA_MIN, non-finite."""
         ahead, z, nearness, slope = projected(surfels, camera)
         t_u, t_v, n = (camera.rotate_to_camera(t) for t in surfels.frame())
         s, opacity = surfels.scale(), surfels.opacity()
@@ -86,7 +82,6 @@ class Surfel(Oriented):
         )
         inverse = dr.rcp(dr.select(visible, qn, 1))
         s = dr.clip(dr.select(visible, s * nearness, 1), 1 / SIZE_RANGE, SIZE_RANGE)
-
         focal = mi.Vector2f(camera.fx, camera.fy)
         along_u, along_v = (
             mi.Vector2f(*(dr.fma(-slope[i], t.z, t[i]) for i in range(2))) for t in (t_u, t_v)
@@ -98,14 +93,12 @@ class Surfel(Oriented):
         columns += [inverse * n.x / focal.x, inverse * n.y / focal.y]
         columns += [z, centre.x, centre.y, opacity]
         columns = [dr.select(visible, column, 0) for column in columns]
-
         with dr.suspend_grad():
             deviations = along_u * s.x * focal, along_v * s.y * focal
             low, high = _extent(t_u.z * s.x, t_v.z * s.y, *deviations, opacity)
             return Footprints(columns, *rectangle(centre, low, high, visible, camera), self)
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> SurfelSample:
-        """Intersect the ray through each pixel with the surfel's plane; formulas: the module's docstring."""
         delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
         w = dr.fma(row[4], delta.x, dr.fma(row[5], delta.y, 1))
         in_front = w > 0
@@ -125,13 +118,11 @@ class Surfel(Oriented):
         return SurfelSample(alpha, z, valid, ratio, gaussian, clamped, low_pass, delta, u, v)
 
     def adjoint(self) -> FootprintAdjoint:
-        """See `Primitive.adjoint`."""
         return FootprintAdjoint()
 
     def evaluate_forward(
         self, row: list[Float], sample: SurfelSample, drow: list[Float]
     ) -> tuple[Float, Float]:
-        """Apply the chain rule, column by column."""
         plane = ~sample.low_pass
         delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
         ddelta = mi.Vector2f(-drow[7], -drow[8])
@@ -148,14 +139,12 @@ class Surfel(Oriented):
         return dr.select(sample.clamped, 0, dalpha), dz
 
     def normal(self, surfels: Surfels) -> Vector3f:
-        """The third axis."""
         return surfels.frame()[2]
 
     def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
-        """With r as in `_extent`, u² + v² ≤ r² is q ≤ 0 for q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)².
+        """Whether u² + v² ≤ r², q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)² ≤ 0, at the rectangle's least q.
 
-        The least q of a rectangle lies at the minimum of q itself or on an edge that faces it, where q is a
-        parabola. [cf. Speedy-Splat, Hanson et al. 2025, §4: tiles by the exact ellipse]
+        It lies at the minimum of q or on an edge that faces it. [cf. Speedy-Splat, Hanson et al. 2025, §4]
         """
         a_x, a_y, b_x, b_y, c_x, c_y, _, x, y, opacity = row[: self.columns]
         r2 = cutoff_radius_squared(opacity) * 1.0005 + 1e-4  # rounding of q
@@ -188,10 +177,8 @@ class Surfel(Oriented):
     def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
         """Depth of the surfel's plane there, up to SORT_REACH standard deviations from its centre.
 
-        Beyond (in the affine approximation) the plane says nothing about the surfel. Where neighbours on a
-        curved surface tilt away from each other, the visible one is the nearest; sorted by their centres,
-        those on the camera's side would always come first, and the image would depend on the view as no
-        surface does. [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
+        Sorted by centres, those on the camera's side of a curved surface would always come first.
+        [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
         """
         a_x, a_y, b_x, b_y, c_x, c_y, z, x, y = row[:9]
         delta = mi.Vector2f(pixel.x - x, pixel.y - y)
@@ -201,10 +188,7 @@ class Surfel(Oriented):
 
 
 class FootprintAdjoint:
-    """Adjoint of `Surfel.evaluate`: sums over pixels of the adjoints of a·δ, b·δ, c·δ, times 1, δ.x and δ.y.
-
-    The row, which the pixels of a footprint have in common, is applied once at the end.
-    """
+    """Adjoint of `Surfel.evaluate`: sums over pixels of adjoints of a·δ, b·δ, c·δ, times 1, δ.x and δ.y."""
 
     def __init__(self) -> None:
         self.a, self.b, self.c = ([mi.Float(0)] * 3 for _ in range(3))
@@ -212,7 +196,6 @@ class FootprintAdjoint:
         self.screen = [mi.Float(0)] * 2
 
     def add(self, sample: SurfelSample, δalpha: Float, δz: Float) -> None:
-        """See `Adjoint.add`."""
         plane = ~sample.low_pass
         delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
         # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
@@ -232,7 +215,6 @@ class FootprintAdjoint:
         self.c = _moments(self.c, dr.select(plane, δw, 0), delta)
 
     def columns(self, row: list[Float]) -> list[Float]:
-        """Adjoint of the ten geometry columns."""
         a, b, c = self.a, self.b, self.c
         # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ
         δcentre = [
@@ -251,10 +233,10 @@ def _extent(
 ) -> tuple[Vector2f, Vector2f]:
     """Rectangle around the centre, in pixels, that contains every pixel with α ≥ ALPHA_MIN.
 
-    The contour u² + v² = r², r² = 2 ln(o/α_min), projects to a conic; its bounds per axis follow from the
-    tangent lines of the dual conic [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A
-    contour that reaches behind the camera has no bounds: such a surfel is listed everywhere. The arguments
-    are of one standard deviation along t_u and t_v: depth in depths of the centre, and offset in pixels.
+    The contour u² + v² = r² projects to a conic; its bounds follow from the tangent lines of the dual conic
+    [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A contour that reaches behind the
+    camera has none. Arguments: of one standard deviation along t_u and t_v, depth in depths of the centre,
+    and offset in pixels.
     """
     r2 = cutoff_radius_squared(opacity)
     denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - 1
