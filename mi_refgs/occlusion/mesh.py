@@ -115,8 +115,7 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 def read_mesh(path: Path | str) -> Mesh:
     """Read a triangle mesh (PLY, OBJ, STL or OFF), and no other file that it refers to.
 
-    The voxel size comes from the comment of `write_mesh`; for other files see FOREIGN_RESOLUTION. Raises
-    InputError if the file is missing or contains no mesh.
+    The voxel size is in the comment of `write_mesh`, else see FOREIGN_RESOLUTION. Raises InputError.
     """
     path = Path(path)
     if not is_file(path):
@@ -150,19 +149,16 @@ def read_mesh(path: Path | str) -> Mesh:
 def _voxel(header: Header) -> float | None:
     """The voxel size in a comment, None without one; raises ValueError unless it is positive."""
     noted = [words[1:2] for words in map(str.split, header.comments) if words[:1] == [VOXEL_COMMENT]]
+    voxel = float(noted[0][0]) if noted and noted[0] else 0.0
     if not noted:
         return None
-    voxel = float(noted[0][0]) if noted[0] else 0.0
     if not 0 < voxel < np.inf:
         raise ValueError("a voxel without size")
     return voxel
 
 
 def _load(path: Path, kind: str, data: bytes) -> Any:
-    """The trimesh of a file's bytes, with its indices checked.
-
-    From memory, trimesh resolves no other names: textures, materials, archives.
-    """
+    """The trimesh of a file's bytes, with indices checked; it resolves no other names from memory."""
     options: Any = {"skip_materials": True} if kind in ("ply", "obj") else {}
     mesh: Any = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, **options)
     faces = np.asarray(mesh.faces)

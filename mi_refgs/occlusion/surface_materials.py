@@ -1,7 +1,6 @@
 """Materials on the extracted mesh, taken from the surfels around each vertex, under AD.
 
-Each vertex's neighbours, their weights and the vertex normal are computed once per mesh, in NumPy; the
-materials are gathered for every render, so that the surfels' own parameters receive the gradient.
+Neighbours, weights and normals of vertices are computed once per mesh, materials are gathered per render.
 """
 
 from __future__ import annotations
@@ -22,13 +21,10 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Array, Bool, Color3f, Float, Point2f, UInt32, Vector3f
 
 NEIGHBOURS = 4  # surfels per vertex: those that overlap at a point of a fitted surface with visible weight
-
-WEIGHT_FLOOR = 1e-6
-"""Sum of weights below which no surfel reaches a vertex, which then takes the nearest one only."""
-
+WEIGHT_FLOOR = 1e-6  # sum of weights below which a vertex takes the nearest surfel only
 NORMAL_AGREEMENT = 0.5
-"""Cosine between the neighbours' mean normal and the mesh's from which the former, which a fit has smoothed,
-is used: at a rim the neighbours belong to another face."""
+"""Cosine between the neighbours' mean normal and the mesh's from which the neighbours' is used, which the fit
+has smoothed: at a rim they belong to another face."""
 
 GROUP = 4  # columns that one access reads
 
@@ -56,17 +52,14 @@ class VertexSurfels:
     def of(mesh: Mesh, surfels: Surfels) -> VertexSurfels:
         """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
 
-        The footprint is the surfel's own Gaussian, wider by a voxel along its normal. Detached. Raises
-        InputError if there are no surfels.
+        Footprints are wider by a voxel along the normal. Detached. Raises InputError without surfels.
         """
         if not surfels.count:
             raise InputError("there are none to take materials from", "occluder", "surfels")
         usable, surfels = np.flatnonzero(surfels.usable().numpy()), surfels.detach().cleaned()
         if not len(usable):
-            raise InputError(
-                "none has finite values", "occluder", "surfels", "correct them, or trace nothing"
-            )
-
+            remedy = "correct them, or trace nothing"
+            raise InputError("none has finite values", "occluder", "surfels", remedy)
         # Ellipsoids of the surfels: axes and standard deviations, along the normal at least a voxel.
         position, opacity = surfels.position().numpy().T, surfels.opacity().numpy()
         axes, spread = surfels.primitive.extent(surfels.to_numpy())
@@ -107,15 +100,11 @@ class VertexSurfels:
         )
 
     def values(self, surfels: Surfels, names: Sequence[str]) -> dict[str, list[Float]]:
-        """The present values of attributes of the surfels at the vertices, by name: columns (V,), under AD.
-
-        Raises InputError for another number of surfels than `of` has seen, and for an absent attribute.
-        """
+        """Present values at the vertices, by attribute: columns (V,), under AD; raises InputError."""
         for name in names:
             if not surfels.has(name):
-                raise InputError(
-                    "surfels have no such attribute", "occluder", name, "add it, or trace nothing"
-                )
+                remedy = "add it, or trace nothing"
+                raise InputError("surfels have no such attribute", "occluder", name, remedy)
         if surfels.count != self.count:
             numbers = f"there are {surfels.count}, but the mesh was given {self.count}"
             raise InputError(numbers, "occluder", "surfels", "call Occluder.set_materials after each change")
@@ -146,18 +135,14 @@ class Surface:
     rows: Float  # by vertices: columns of the attributes, normal, zeros up to a multiple of GROUP
     widths: dict[str, int]  # columns of each attribute
 
-    @property
-    def groups(self) -> int:
-        """Groups of a vertex."""
-        return -(-(sum(self.widths.values()) + 3) // GROUP)
-
     def at(self, triangle: UInt32, barycentric: Point2f, active: Bool) -> SurfaceSample:
         """Attributes at barycentric coordinates of the second and third corner."""
-        mixed = [mi.Vector4f(0) for _ in range(self.groups)]
+        groups = -(-(sum(self.widths.values()) + 3) // GROUP)  # of a vertex
+        mixed = [mi.Vector4f(0) for _ in range(groups)]
         closest, largest = mi.UInt32(0), mi.Float(-1)
         for vertex, share in _corners(self.vertex_surfels.faces, triangle, barycentric, active):
-            for i in range(self.groups):
-                mixed[i] += share * dr.gather(mi.Vector4f, self.rows, self.groups * vertex + i, active)
+            for i in range(groups):
+                mixed[i] += share * dr.gather(mi.Vector4f, self.rows, groups * vertex + i, active)
             closest = dr.select(share > largest, vertex, closest)
             largest = dr.maximum(share, largest)
         surfel = dr.gather(mi.UInt32, self.vertex_surfels.surfel[0], closest, active)
@@ -189,7 +174,6 @@ class VertexColours:
         return colour
 
     def numpy(self) -> np.ndarray:
-        """The colours (V, 3)."""
         return np.array(self.rows).reshape(-1, 3)
 
 
@@ -203,7 +187,7 @@ def _corners(
 
 
 def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Outward unit normals (V, 3): the weighted normals (V, K, 3) of the surfels where the mesh's agree."""
+    """Outward unit normals (V, 3): weighted ones (V, K, 3) of the surfels where the mesh's agree."""
     # In voxels: trimesh takes triangles of less than 1e-14 square units for points.
     scaled = (mesh.vertices - mesh.vertices[0]) / mesh.voxel
     own = np.asarray(trimesh.Trimesh(scaled, mesh.faces, process=False).vertex_normals)

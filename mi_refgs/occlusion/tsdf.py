@@ -10,9 +10,8 @@ in no view's image                       +1: nothing is known to be there
 =======================================  ===================================================================
 
 Contracted space is the ball of radius 2 that a region's contraction maps all of space to; grid, truncation
-and distances are in that space. The distance between a voxel and a surface along the view's ray is theirs in
-contracted space times the cosine between ray and viewing axis: (depth - z) / radius inside the region, as
-without contraction.
+and distances are in that space. A distance along the view's ray is that in contracted space times the cosine
+between ray and viewing axis: (depth - z) / radius inside the region, as without contraction.
 """
 
 from __future__ import annotations
@@ -33,29 +32,18 @@ from mi_refgs.types import Bool, Float, Int32, Point3f, TensorXf, UInt32, Vector
 ALPHA_SOLID = 0.5
 """Opacity from which a pixel has a surface: half coverage, where a box filter has its silhouette."""
 
-TRUNCATION_VOXELS = 5.0
-"""Truncation of the signed distance, in voxels. [Ref-Gaussian's released extraction; 2DGS, §6]"""
+TRUNCATION_VOXELS = 5.0  # of the signed distance. [Ref-Gaussian's released extraction; 2DGS, §6]
 
 UNSEEN_VOTE = 0.1
-"""A voxel is inside while it has at most this many sightings per view with a surface before it, so that
-pixels which leak through thin places drill no tunnels; 9 % of the views keep a cavity open."""
+"""A voxel is inside while it has at most this many sightings per view with a surface before it: pixels that
+leak through thin places drill no tunnels; 9 % of the views keep a cavity open."""
 
 RESOLUTION_MAX = 1023  # most voxels along one axis: three coordinates share one 32-bit word
-
-BOX_QUANTILE = 0.02
-"""Fraction of the points per side and axis that may be floaters when the fusion box is computed."""
-
-BOX_REACH = 0.25
-"""The box may grow beyond those quantiles by this part of their distance: thin ends have few points."""
-
-BOX_FLOOR = 1e-6
-"""Least margin, as part of the points' distance from the origin: some units in the last place of float32."""
-
-BOX_MARGIN = 0.05
-"""Free space around the points, as part of the longest side: room for the truncation from 128 voxels up."""
-
-END_VOXELS = 2.0
-"""Contracted voxels from the border of contracted space, where the world is infinite, to the last values."""
+BOX_QUANTILE = 0.02  # fraction of the points per side and axis that may be floaters
+BOX_REACH = 0.25  # part of the quantiles' distance by which the box may grow beyond them: thin ends
+BOX_FLOOR = 1e-6  # least margin, as part of the points' distance from the origin: float32
+BOX_MARGIN = 0.05  # free space around the points, as part of the longest side: room for the truncation
+END_VOXELS = 2.0  # contracted voxels from the border of contracted space to the last values
 
 
 @dataclass(frozen=True)
@@ -74,9 +62,9 @@ class TSDF:
 
 
 def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Box (lo, hi) with a margin around (N, 3) world points, without a few per cent of floaters.
+    """Box (lo, hi) with a margin around (N, 3) world points, without NaN and a few per cent of floaters.
 
-    Points that are not finite are ignored. Raises InputError if none is left.
+    Raises InputError if none is left.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -105,17 +93,16 @@ def fuse(
     surface: Bylow et al. 2013]
 
     `resolution`: voxels along the longest side. Depths (expected camera z, scene units; not premultiplied)
-    and alphas are `mi.Float` or `mi.TensorXf` in raster order, read once: with generators only one view is in
-    memory. Depth where alpha < ALPHA_SOLID is ignored; with `carve`, such pixels are free space. With a
-    `region`, `bounds` are in its contracted space, and `resolution` voxels are as long as the region is wide.
-    Detached. Raises InputError for an empty box or a resolution that does not fit.
+    and alphas are `mi.Float` or `mi.TensorXf` in raster order, read once. Pixels with alpha < ALPHA_SOLID
+    have no depth; with `carve`, they are free space. With a `region`, `bounds` are in its contracted space,
+    and `resolution` voxels are as long as the region is wide. Detached. Raises InputError for an empty box or
+    a resolution that does not fit.
     """
     lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
     extent = hi - lo
     if not (np.all(np.isfinite(extent)) and np.all(extent > 0)):
-        raise InputError(
-            f"box from {lo} to {hi} has no volume", "tsdf", "bounds", "give lo < hi on every axis"
-        )
+        what = f"box from {lo} to {hi} has no volume"
+        raise InputError(what, "tsdf", "bounds", "give lo < hi on every axis")
     most = RESOLUTION_MAX if region is None else RESOLUTION_MAX // 2  # all of space is twice as wide
     if not 2 <= resolution <= most:
         raise InputError(f"{resolution} is outside 2..{most}", "tsdf", "resolution", "choose 64 to 256")
@@ -164,7 +151,6 @@ class _Grid:
         # Surface depth, or 0 for background; NaN and infinite depths are background too.
         surface = dr.select((alpha >= ALPHA_SOLID) & (depth > camera.near) & dr.isfinite(depth), depth, 0)
         dr.eval(surface)
-
         place = self._place()
         world = place if self.space is None else self.space.expand(place)
         point = camera.to_camera(world)
@@ -179,7 +165,6 @@ class _Grid:
         ray = (world - camera.origin) * inv_z
         apart = trunc if self.space is None else trunc * self.space.stretch(place, ray)
         near, same_surface, background = _sample(surface, px, py, width, height, apart, in_image)
-
         distance = near - point.z
         if self.space is not None:
             met = self.space.contract(camera.origin + near * ray)
@@ -200,7 +185,6 @@ class _Grid:
         dr.eval(self.total, self.weight, self.seen, self.behind)
 
     def volume(self) -> np.ndarray:
-        """Signed distance of every voxel, flat float32."""
         inside = (self.behind > 0) & (self.seen <= UNSEEN_VOTE * self.behind)
         observed = self.weight > 0
         mean = self.total / dr.select(observed, self.weight, 1)
@@ -212,7 +196,6 @@ class _Grid:
         return everywhere
 
     def _place(self) -> Any:
-        """Positions of the voxels (mi.Point3f): world, or contracted."""
         corner = mi.Point3f(self.corner & 1023, (self.corner >> 10) & 1023, self.corner >> 20)
         return corner * self.voxel + self.lo
 
@@ -239,7 +222,7 @@ class _Contracted:
         return self.centre + self.radius * mi.Vector3f(place) * dr.rcp(length * (2 - length))
 
     def stretch(self, place: Point3f, ray: Vector3f) -> Float:
-        """Depth per unit of contracted distance (see above) at contracted positions, along `ray` per depth.
+        """Depth per unit of contracted distance at contracted positions, along `ray` per depth.
 
         The contraction shrinks by 1/r² along the offset of length r, and by (2 - 1/r)/r across it.
         """
@@ -258,7 +241,7 @@ def _sample(
     """Depth at a pixel position, whether it is a surface, and whether it is certainly background.
 
     Bilinear where the four texels differ by less than `apart`, the truncation; else the nearest texel: a mean
-    across a depth edge lies on no surface. A silhouette is no background, or carving would eat the rim."""
+    across a depth edge lies on no surface. A silhouette is no background: carving would eat the rim."""
     fx, fy = dr.floor(px), dr.floor(py)
     wx, wy = px - fx, py - fy
     x0, y0 = mi.Int32(fx), mi.Int32(fy)

@@ -18,8 +18,7 @@ from mi_refgs.types import Array, Bool, Float, Point2f, Point3f, Scene, UInt32, 
 
 OFFSET_VOXELS = 2.0
 """Voxels by which a ray's origin leaves the surface along the normal: more than the errors of the mesh (0.4
-voxel on smooth shapes) and of the expected depth. With points 1 voxel too deep, a quarter of the rays is
-falsely occluded at 1 voxel, 0.1 % at 2; offsets along the ray leave grazing rays occluded."""
+voxel) and of the depth. At 1 voxel, a quarter of the rays of points 1 voxel too deep is falsely occluded."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,7 @@ class Hit:
 class Occluder:
     """The extracted mesh in a private scene of its own, updated in place.
 
-    The user's scene must neither be hit here nor be hidden by this mesh. Evaluate results of `visible` before
-    the next `update`: Dr.Jit traces rays when their result is needed.
+    Evaluate results of `visible` before the next `update`: Dr.Jit traces rays when they are needed.
     """
 
     NAME = "occluder"
@@ -75,8 +73,7 @@ class Occluder:
     def set_materials(self, surfels: Surfels) -> None:
         """Find the surfels around every vertex, whose attributes `surface` then reads, under AD.
 
-        Call it again after `update`, and whenever surfels move or their number changes; new values of their
-        materials need no call. Raises InputError without surfels.
+        Required after `update`, and when surfels move or their number changes. Raises InputError without any.
         """
         self.vertex_surfels = None
         if self._mesh is not None and not self.empty:
@@ -85,13 +82,11 @@ class Occluder:
     def surface(self, surfels: Surfels, names: Sequence[str] = ()) -> Surface:
         """The mesh with the present values of attributes of `surfels`, to look up where `closest` hits it.
 
-        Raises InputError without a `set_materials` for this mesh and this number of surfels, and for an
-        attribute that is absent.
+        Raises InputError without `set_materials` for this mesh and number of surfels, or an attribute.
         """
         if self.vertex_surfels is None:
-            raise InputError(
-                "none are set", "occluder", "materials", "call Occluder.set_materials after update"
-            )
+            remedy = "call Occluder.set_materials after update"
+            raise InputError("none are set", "occluder", "materials", remedy)
         return self.vertex_surfels.surface(surfels, names)
 
     def visible(
@@ -100,8 +95,7 @@ class Occluder:
         """1 where the ray leaves the scene freely, 0 where the mesh blocks it.
 
         `direction` and `normal` need not be unit. The origin (world) first moves OFFSET_VOXELS along the
-        normal, or along the ray where there is none, which suits steep rays only. Rays without a finite
-        direction or not `active`, and all rays without a mesh, are visible. Detached."""
+        normal, or along the ray without one. Rays without a finite direction or not `active` are visible."""
         if self.empty:
             return dr.full(mi.Float, 1, max(dr.width(origin), dr.width(direction)))
         with dr.suspend_grad():
@@ -147,31 +141,23 @@ class Occluder:
         return mi.Ray3f(mi.Point3f(dr.select(active, o, 0)), d), active
 
 
-def _unit(v: Vector3f) -> tuple[Vector3f, Bool]:
-    """Unit vector and whether there is one; (0, 0, 0) where there is none."""
+def _unit(v: Vector3f) -> tuple[Vector3f, Bool]:  # and whether there is one, else (0, 0, 0)
     squared = dr.squared_norm(v)
     valid = dr.isfinite(squared) & (squared > 0)
     scale = dr.select(valid, dr.rsqrt(dr.select(valid, squared, 1)), 0)
     return dr.select(valid, v * scale, 0), valid
 
 
-# ---------------- `mi.Mesh`, whose data Mitsuba 3.10 renamed and reshaped ----------------
-
-
-def _is_3_9() -> bool:
-    return hasattr(mi.Mesh, "vertex_positions_buffer")
-
-
 def _values(mesh: Mesh) -> dict[str, Array]:
-    """Parameters of a `mi.Mesh`, by their name in `mi.traverse`."""
-    if _is_3_9():
+    """Parameters of a `mi.Mesh` by their name in `mi.traverse`: Mitsuba 3.10 renamed and reshaped them."""
+    if hasattr(mi.Mesh, "vertex_positions_buffer"):
         return {"vertex_positions": upload(mesh.vertices), "faces": upload(mesh.faces, mi.UInt32)}
     return {"positions": upload_tensor(mesh.vertices), "faces": upload_tensor(mesh.faces, mi.TensorXu)}
 
 
 def _mitsuba_mesh(name: str, mesh: Mesh) -> Any:
     """A `mi.Mesh` with flat shading normals and the winding as orientation; at least one face."""
-    if not _is_3_9():
+    if not hasattr(mi.Mesh, "vertex_positions_buffer"):
         return mi.Mesh(name, **_values(mesh))
     made = mi.Mesh(name, len(mesh.vertices), len(mesh.faces))
     _set_mesh(mi.traverse(made), "", mesh)

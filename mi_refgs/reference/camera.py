@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 Array = np.ndarray
-QUATERNION_FLOOR = 1e-12
-"""Largest |component| below which a quaternion is the identity, with gradient 0: a rule of the table."""
+QUATERNION_FLOOR = 1e-12  # largest |component| of a quaternion that is the identity, with gradient 0
 
 
 @dataclass(frozen=True)
@@ -23,12 +22,11 @@ class PinholeCamera:
     cy: float
     to_world: np.ndarray  # (4, 4)
     near: float = 0.01
-    film: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """First and last pixel border of the film along x and y, of a crop window; None: those of the image."""
+    film: tuple[tuple[float, float], tuple[float, float]] | None = None  # borders along x and y; None: all
 
     @property
     def borders(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """`film`, or the borders of the image."""
+        """First and last pixel border of the film along x and y."""
         return self.film or ((0, self.width), (0, self.height))
 
 
@@ -63,12 +61,10 @@ def ray_slopes(camera: PinholeCamera, x: Array, y: Array) -> Array:
 
 
 def sigmoid(x: Array) -> Array:
-    """Logistic sigmoid."""
     return 1 / (1 + np.exp(-x))
 
 
-PARALLEL = 0.95
-"""|cos| between the view and `up` above which another direction is taken for up."""
+PARALLEL = 0.95  # |cos| between the view and `up` above which world y is taken for up
 
 
 def look_at(origin: np.ndarray, target: np.ndarray, up: tuple[float, ...] = (0.0, 0.0, 1.0)) -> np.ndarray:

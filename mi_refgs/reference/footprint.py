@@ -1,14 +1,12 @@
 """Footprints of surfels and of 3D Gaussians in float64: each primitive is a class of four functions.
 
-    culled(raw, camera, rules)           which rows (N,) cover no pixel
-    footprint(raw, camera, rules, x, y)  Sample (N, P) at pixel centres x, y (P,)
-    sort_key(raw, camera, pixels, corner)
-                                         depth (N, P) by which rows are ordered in the tiles of pixels (raster
-                                         indices); `corner` is the first pixel's place in its tile
-    normal(raw)                          which of the three axes (N,) is the normal
+    culled(raw, camera, rules)             which rows (N,) cover no pixel
+    footprint(raw, camera, rules, x, y)    Sample (N, P) at pixel centres x, y (P,)
+    sort_key(raw, camera, pixels, corner)  depth (N, P) that orders rows in the tiles of pixels (raster);
+                                           `corner`: the first pixel's place in its tile
+    normal(raw)                            which of the three axes (N,) is the normal
 
-Letters: N primitives, P pixels. Raw channels are real or, for derivatives by a complex step, complex. The
-columns of its `scale` say which primitive a table is of.
+Letters: N primitives, P pixels. Raw channels are real or, for derivatives by a complex step, complex.
 """
 
 from __future__ import annotations
@@ -107,10 +105,9 @@ class Surfel:
 
 
 class Gaussian:
-    """3D Gaussians by EWA. [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]
+    """3D Gaussians by EWA, Σ' = J W Σ Wᵀ Jᵀ + λ I. [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]
 
-    Σ' = J W Σ Wᵀ Jᵀ + λ I, with J the derivative of the projection at the centre, whose slope is clamped to
-    the neighbourhood of the image.
+    J is the derivative of the projection at the centre, whose slope is clamped to around the image.
     """
 
     @staticmethod
@@ -154,10 +151,9 @@ class Gaussian:
 
 
 def _from_centre(p: Array, axes: Array, ray: Array) -> tuple[Array, list[Array]]:
-    """Where rays (3, P) meet the planes, relative to their centres p, over the depth there.
+    """Difference (N, P) of 1 / depth to the centres', and offsets along t_u, t_v over depth, of rays (3, P).
 
-    Returns the difference (N, P) of 1 / depth to the centre's, and the offsets (N, P) along t_u and t_v. Only
-    the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
+    Only the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
     """
     beside = ray[None] - (p / p[:, 2:])[:, :, None]
     lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]

@@ -1,8 +1,7 @@
 """Render an image and its gradients in float64: footprints, compositing, shading, for any pixels of a view.
 
-Every stage treats its items (surfels, surfel-pixel pairs, pixels) one by one, so its derivative is one
-complex step per column, exact to the last digit: the imaginary part of f(x + ih) is h f'(x). The order of
-surfels is an input: the sort has no derivative.
+Every stage treats its items one by one, so its derivative is one complex step per column, exact to the last
+digit: the imaginary part of f(x + ih) is h f'(x). The order of surfels is an input.
 
 Letters: N surfels, P pixels, K features, D raw columns. Maps are (P, …).
 """
@@ -42,9 +41,7 @@ class Scene:
     options: Options = field(default_factory=Options)  # but its `diffuse`, which is the one above
     antialias: bool = False  # the mean over each pixel; of all pixels of the camera, and without gradients
     terms: bool = False  # also the terms of the radiance, premultiplied; these give the light no gradient
-    around: dict[str, Array] | None = (
-        None  # M rows of the surroundings, last in `order` (N + M, P); no gradients
-    )
+    around: dict[str, Array] | None = None  # M rows, last in `order` (N + M, P); no gradients
     background: Array | None = None  # (h, 2h, 3) raw, seen behind both; radiance is log(1 + exp raw)
 
 
@@ -64,13 +61,12 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
 
     `band` is the relative width of the declared discontinuities.
     """
-    tables = [
+    raw, around = (
         {n: np.asarray(x, np.float64) for n, x in table.items()} for table in (scene.raw, scene.around or {})
-    ]
-    raw, around = tables
+    )
     camera, count = scene.camera, len(raw["position"])
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    blend = Blend.of([table for table in tables if table], camera, scene.order, x, y, scene.rules)
+    blend = Blend.of([raw, around] if around else [raw], camera, scene.order, x, y, scene.rules)
     features_of = Features(scene, raw)
     taps: list[tuple[Array, Array, Array]] = []
     features = features_of(features_of.columns, taps).real
@@ -159,12 +155,7 @@ class Features:
 
     def split(self, columns: Array) -> dict[str, Array]:
         """Columns by channel."""
-        return dict(zip(self.names, np.split(columns, np.cumsum(self.widths)[:-1], axis=1), strict=True))
-
-    def blended(self, sums: Array) -> dict[str, Array]:
-        """Columns of blended features by name."""
-        ends = np.cumsum([*self.layout.values()])[:-1]
-        return dict(zip(self.layout, np.split(sums, ends, axis=1), strict=True))
+        return split(columns, dict(zip(self.names, self.widths, strict=True)))
 
     def __call__(self, columns: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
         raw, scene = self.split(columns), self.scene
@@ -205,7 +196,7 @@ class Resolve:
     def __call__(self, sums: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
         scene, alpha = self.scene, sums[:, -1:]
         inverse = inverse_alpha(alpha)
-        blended = self.features.blended(sums[:, :-2])
+        blended = split(sums[:, :-2], self.features.layout)
         values = {name: x * inverse for name, x in blended.items() if name != "normal"}
         depth = sums[:, -2:-1] * inverse
         maps = {"alpha": alpha, "depth": depth, "normal": blended["normal"], **values}
@@ -253,8 +244,12 @@ class Resolve:
 
     def named(self, values: Array) -> dict[str, Array]:
         """Columns by map."""
-        widths = self.maps()
-        return dict(zip(widths, np.split(values, np.cumsum([*widths.values()])[:-1], axis=1), strict=True))
+        return split(values, self.maps())
+
+
+def split(columns: Array, widths: dict[str, int]) -> dict[str, Array]:
+    """Columns (n, D) by name, for their widths."""
+    return dict(zip(widths, np.split(columns, np.cumsum([*widths.values()])[:-1], axis=1), strict=True))
 
 
 def inverse_alpha(alpha: Array) -> Array:
@@ -270,10 +265,7 @@ def rays(camera: PinholeCamera, x: Array, y: Array) -> Array:
 
 
 def bilinear_map(values: Array, x: Array, y: Array) -> Array:
-    """Values (P, C) at points of the image (P,), in pixels, of a map (H, W, C) given at pixel centres.
-
-    The border repeats.
-    """
+    """Values (P, C) at points of the image (P,), in pixels, of a map (H, W, C); the border repeats."""
     column, row = np.floor(x - 0.5).astype(int), np.floor(y - 0.5).astype(int)
     u, v = (x - 0.5 - column)[:, None], (y - 0.5 - row)[:, None]
 

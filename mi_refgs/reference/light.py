@@ -1,6 +1,6 @@
 """Environment maps in float64: prefiltered levels, lookups, and the lobe average that a level approximates.
 
-A lookup is a pair of arrays, texels (n, k) of the flat levels and their weights; the weights may be complex.
+A lookup is texels (n, k) of the flat levels and their weights, which may be complex.
 """
 
 from __future__ import annotations
@@ -66,10 +66,8 @@ def dense_filter(weights: Array) -> Array:
 
 
 def bilinear(light: Light, direction: Array, level: Array) -> tuple[Array, Array]:
-    """Lookup (n, 4) of `level` (n,) in unit directions (n, 3), as Mitsuba's `envmap` does.
-
-    Column centres are at half-integers, the first and last rows on the poles.
-    """
+    """Lookup (n, 4) of `level` (n,) in unit directions (n, 3), as Mitsuba's `envmap`: column centres are at
+    half-integers, the first and last rows on the poles."""
     heights = np.array([len(x) for x in light.levels])
     firsts = np.concatenate([[0], np.cumsum(2 * heights**2)[:-1]])
     h = heights[level]
@@ -127,8 +125,7 @@ def table_lookup(table: Array, n_dot_v: Array | float, roughness: Array | float)
 def lobe_average(
     map_: Array, direction: Array, roughness: float, *, rings: int = 400, spokes: int = 400
 ) -> Array:
-    """∫ L W / ∫ W with W = max(L·R, 0) D(R·H), in polar coordinates around R: even rings in the core, wider
-    in the tail."""
+    """∫ L W / ∫ W with W = max(L·R, 0) D(R·H), in polar coordinates around R: rings wider in the tail."""
     α = roughness**2
     pole = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     side, up, _ = frame(pole)
@@ -147,9 +144,6 @@ def lobe_average(
         total += weight * radiance_of(map_, ring).mean(0)
         weights += weight
     return total / weights
-
-
-# ---------------- functions of complex steps ----------------
 
 
 def clip(x: Array | float, low: float, high: float) -> Array:

@@ -12,17 +12,13 @@ from typing import Any
 
 import numpy as np
 
-Incoming = Callable[[np.ndarray], np.ndarray]
-"""Radiance (n, 3), or any other quantity (n, c), that arrives from unit directions (n, 3)."""
-
+Incoming = Callable[[np.ndarray], np.ndarray]  # radiance (n, 3), or any (n, c), from unit directions (n, 3)
 Hit = Callable[[np.ndarray, np.ndarray], "tuple[np.ndarray, np.ndarray, Any] | None"]
 """Where a ray (origin, direction) first ends: place, unit normal against the ray, and any other thing."""
 
-Outgoing = Callable[[Any, np.ndarray, np.ndarray, float, np.ndarray], np.ndarray]
-"""Radiance (3,) that leaves: see `chain`."""
-
-HORIZON = 1e-4
-"""|cosine| below which a walk inside the microsurface counts as horizontal, and keeps its height."""
+Outgoing = Callable[
+    [Any, np.ndarray, np.ndarray, float, np.ndarray], np.ndarray
+]  # radiance (3,): see `chain`
 
 
 def smith_lambda(cosine: float | np.ndarray, α: float) -> np.ndarray:
@@ -42,7 +38,7 @@ def frame(normal: np.ndarray) -> np.ndarray:
 def lobe_nodes(
     normal: np.ndarray, view: np.ndarray, roughness: float, rings: int = 200, spokes: int = 200
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions (n, 3), cosines between view and half vector (n,), and weights (n,) of a quadrature:
+    """Directions (n, 3), cosines of view and half vector (n,), and weights (n,) of a quadrature:
 
     Σ weight F(cosine) L(direction) = ∫ f L cosθ dω. Midpoints over the half vectors, drawn from D cosθ.
     """
@@ -98,8 +94,7 @@ def normal_reflectance(albedo: np.ndarray, metallic: float | np.ndarray) -> np.n
 def diffuse_reflectance(
     albedo: np.ndarray, metallic: float, roughness: float, n_dot_v: float, nodes: int = 400
 ) -> np.ndarray:
-    """(1 - F0 A - B) (1 - metallic) albedo, (3,): what the base reflects of what the specular layer leaves;
-    0 from behind."""
+    """(1 - F0 A - B) (1 - metallic) albedo, (3,): what the base reflects of the rest; 0 from behind."""
     if n_dot_v <= 0:
         return np.zeros(3)
     a, b = split_sum_entry(n_dot_v, roughness, nodes)
@@ -114,8 +109,7 @@ def brdf_cosine(
     view: np.ndarray,
     lights: np.ndarray,
 ) -> np.ndarray:
-    """BRDF times n·l, (n, 3), for unit directions `lights` (n, 3): GGX α = roughness², correlated Smith,
-    Schlick, and `diffuse_reflectance` / π; zero below the horizon."""
+    """BRDF times n·l, (n, 3), for unit directions `lights` (n, 3); zero below the horizon."""
     α2 = roughness**4
     n_l, n_v = lights @ normal, float(normal @ view)
     lit = (n_l > 0) & (n_v > 0)
@@ -164,9 +158,8 @@ def chain(
     """Radiance (3,) that arrives against a ray from what it meets; None if it meets nothing.
 
     That is shaded with what its own mirror ray meets, and so on, `bounces` surfaces in all; what stops the
-    mirror ray of the last is black. `hit` says where a ray ends and what surface is there, `outgoing` what
-    leaves it: from a surface, its unit normal on the ray's side, the view, the visibility of the light along
-    the mirror direction (0 or 1), and the radiance that arrives there instead.
+    mirror ray of the last is black. `outgoing` is what leaves a surface with its unit normal, the view, the
+    visibility of the light along the mirror direction (0 or 1), and the radiance that arrives there instead.
     """
     found = hit(origin, direction)
     if found is None:
@@ -186,9 +179,8 @@ def blocked_mean(
 ) -> np.ndarray:
     """Mean (3,) of the radiance (k, 3) of those of k ≥ 2 rays that are `blocked` (k,), weighted.
 
-    In each colour, where the largest product of weight and radiance exceeds k times the mean of the other
-    rays' products, it loses the share `fading` of the excess; rays that are not blocked have the radiance
-    `free` (3,).
+    Per colour, where the largest product of weight and radiance exceeds k times the mean of the others, it
+    loses the share `fading` of the excess; rays that are not blocked have the radiance `free` (3,).
     """
     count, products = len(weight), weight[:, None] * np.where(blocked[:, None], radiance, free)
     for channel in range(3):

@@ -1,7 +1,4 @@
-"""Losses, depth normals and Adam in float64.
-
-Images are (H, W, 3), planes (H, W); row first. No helper is shared with the fast path.
-"""
+"""Losses, depth normals and Adam in float64; images are (H, W, 3), planes (H, W)."""
 
 from __future__ import annotations
 
@@ -17,9 +14,8 @@ Array = np.ndarray
 
 def srgb(linear: Array) -> Array:
     """sRGB encoding (IEC 61966-2-1), unbounded above."""
-    return np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    )
+    curve = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, curve)
 
 
 def display_image(radiance: Array, alpha: Array, background: tuple[float, float, float]) -> Array:
@@ -49,17 +45,11 @@ def ssim(image: Array, target: Array) -> float:
 
 
 def normals_from_depth(
-    depth: Array,
-    alpha: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    world_from_camera: Array,
+    depth: Array, alpha: Array, fx: float, fy: float, cx: float, cy: float, world_from_camera: Array
 ) -> tuple[Array, Array]:
     """World normals (H, W, 3) of a camera-depth map and their validity (H, W), by central differences.
 
-    Steps between two surfaces, which the viewing ray meets at a cosine of at most 0.2, are not valid.
+    Invalid: steps between surfaces, which the viewing ray meets at a cosine of at most 0.2.
     """
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -132,10 +122,7 @@ def light_difference(
 
 
 def adam(
-    parameter: Array,
-    gradients: list[Array],
-    rates: list[Array | float],
-    epsilon: float = 1e-15,
+    parameter: Array, gradients: list[Array], rates: list[Array | float], epsilon: float = 1e-15
 ) -> Array:
     """Adam in the form of its Algorithm 1 (bias-corrected moments); ε as in the efficient order."""
     θ, m, v = parameter.astype(np.float64), np.zeros(parameter.shape), np.zeros(parameter.shape)

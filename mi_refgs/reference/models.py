@@ -1,7 +1,6 @@
-"""Reflectance models in float64, many points at once; derivatives by complex steps.
+"""Reflectance models in float64: functions of points and a light to three terms of radiance.
 
-A model is a function of points and a light to its three terms of radiance. `taps` collects its lookups in the
-light: texels, weights, and the factor that their sum is multiplied by.
+`taps` collects lookups in the light: texels, weights, and the factor of their sum.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from mi_refgs.reference.lobe import normal_reflectance
 
 Array = np.ndarray
 Taps = list[tuple[Array, Array, Array]]
-
 
 MATERIALS = ("albedo", "metallic", "roughness", "tint")
 
@@ -47,8 +45,7 @@ class Points:
     @staticmethod
     def of(values: dict[str, Any]) -> Points:
         """Points from arrays (n, …) by name, normal and view among them; what is None is left out."""
-        found = {n: np.asarray(x, np.float64) for n, x in values.items() if x is not None}
-        found = {n: x.reshape(len(x), -1) for n, x in found.items()}
+        found = {n: np.asarray(x, np.float64).reshape(len(x), -1) for n, x in values.items() if x is not None}
         return Points(found.pop("normal"), found.pop("view"), found)
 
 
@@ -120,10 +117,7 @@ def gaussian_shader(points: Points, light: Light | None, options: Options, taps:
 
 
 def monte_carlo(points: Points, light: Light | None, options: Options, taps: Taps) -> list[Array]:
-    """Model of R3DG: diffuse and specular light of the environment, and all light of surfaces nearby.
-
-    The normal has no derivative.
-    """
+    """Model of R3DG: light of the environment and of surfaces nearby; the normal has no derivative."""
     assert light is not None
     values, v = points.values, unit(points.view)
     normal = unit(points.normal).real if options.detached_normal is None else options.detached_normal
@@ -155,7 +149,7 @@ def monte_carlo(points: Points, light: Light | None, options: Options, taps: Tap
 def hemisphere(count: int, normal: Array) -> Array:
     """Directions (count, 3) of a Fibonacci hemisphere about a unit normal (3,), at least 10° high.
 
-    The frame is that of Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
+    Frame: Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
     """
     x, y, z = normal
     sign = math.copysign(1.0, z)
@@ -172,12 +166,7 @@ def hemisphere(count: int, normal: Array) -> Array:
 
 
 MODELS: dict[str, Model] = {
-    "split_sum": split_sum,
-    "radiance": radiance,
-    "mirror": mirror,
-    "gaussian_shader": gaussian_shader,
-    "monte_carlo": monte_carlo,
-    "displayed": displayed,
+    model.__name__: model for model in (split_sum, radiance, mirror, gaussian_shader, monte_carlo, displayed)
 }
 
 
@@ -201,10 +190,7 @@ def harmonics(coefficients: Array, direction: Array) -> Array:
 
 
 def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
-    """Real spherical harmonics (…, (degree + 1)²) of unit directions (…, 3), with the Condon-Shortley phase.
-
-    Legendre functions over sin^m θ by recursion; complex steps give derivatives.
-    """
+    """Real spherical harmonics (…, (degree + 1)²) of unit directions (…, 3), with Condon-Shortley phase."""
     x, y, z = np.moveaxis(direction, -1, 0)
     cos, sin = [np.ones_like(x)], [np.zeros_like(x)]  # sin^m θ cos mφ, sin^m θ sin mφ
     for _ in range(degree):

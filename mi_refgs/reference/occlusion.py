@@ -13,26 +13,19 @@ import numpy as np
 
 Shape = Callable[[np.ndarray], np.ndarray]
 
-HIT_DISTANCE = 1e-5
-"""A ray this close to a shape of unit size has hit it."""
-
-TRACE_STEPS = 200
-TRACE_FAR = 20.0
+HIT_DISTANCE = 1e-5  # a ray this close to a shape of unit size has hit it
+TRACE_STEPS, TRACE_FAR = 200, 20.0
 
 
 def sphere(centre: tuple[float, float, float], radius: float) -> Shape:
-    """Ball."""
     return lambda p: np.linalg.norm(p - np.array(centre), axis=-1) - radius
 
 
 def torus(major: float, minor: float) -> Shape:
-    """Ring around the z axis."""
     return lambda p: np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) - minor
 
 
 def box(centre: tuple[float, float, float], half: tuple[float, float, float]) -> Shape:
-    """Axis-aligned box."""
-
     def distance(p: np.ndarray) -> np.ndarray:
         q = np.abs(p - np.array(centre)) - np.array(half)
         return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
@@ -41,7 +34,6 @@ def box(centre: tuple[float, float, float], half: tuple[float, float, float]) ->
 
 
 def union(*shapes: Shape) -> Shape:
-    """All of the shapes."""
     return lambda p: np.min([shape(p) for shape in shapes], axis=0)
 
 
@@ -67,9 +59,7 @@ def trace(shape: Shape, origin: np.ndarray, direction: np.ndarray) -> np.ndarray
 def depth_map(shape: Shape, to_world: np.ndarray, focal: float, size: int) -> np.ndarray:
     """(size, size) camera z of the shape through the pixel centres, 0 for background."""
     j, i = np.mgrid[:size, :size] + 0.5
-    local = np.stack([(size / 2 - i) / focal, (size / 2 - j) / focal, np.ones_like(i)], axis=-1).reshape(
-        -1, 3
-    )
+    local = np.stack([(size / 2 - i) / focal, (size / 2 - j) / focal, np.ones_like(i)], -1).reshape(-1, 3)
     length = np.linalg.norm(local, axis=1)
     direction = (local / length[:, None]) @ to_world[:3, :3].T
     t = trace(shape, np.broadcast_to(to_world[:3, 3], direction.shape), direction)
@@ -77,8 +67,7 @@ def depth_map(shape: Shape, to_world: np.ndarray, focal: float, size: int) -> np
 
 
 def visible(shape: Shape, points: np.ndarray, direction: np.ndarray, clearance: float) -> np.ndarray:
-    """Whether rays from `points` on the shape leave it, starting `clearance` off the surface along its
-    normal."""
+    """Whether rays from `points` leave the shape, starting `clearance` off it along its normal."""
     return ~np.isfinite(trace(shape, points + clearance * normal(shape, points), direction))
 
 
@@ -113,11 +102,8 @@ def fuse_point(
             continue
         u0, v0 = int(np.floor(u)), int(np.floor(v))
         du, dv = u - u0, v - v0
-        texels = [
-            [depth[min(max(r, 0), size - 1), min(max(c, 0), size - 1)] for c in (u0, u0 + 1)]
-            for r in (v0, v0 + 1)
-        ]
-        tap = np.array(texels)
+        rows, columns = (np.clip((k, k + 1), 0, size - 1) for k in (v0, u0))
+        tap = depth[np.ix_(rows, columns)]
         if (tap == 0).all():  # background for certain
             sightings += 1
             if carve:
@@ -155,8 +141,10 @@ def fuse_point(
 def mesh_hit(
     vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray
 ) -> tuple[float, int, np.ndarray]:
-    """Distance along one ray to the nearest of all triangles, either side, infinite for a miss; the triangle;
-    and the shares (3,) of its corners. [Möller and Trumbore 1997]"""
+    """Distance along a ray to the nearest triangle, infinite for a miss; its index; shares (3,) of corners.
+
+    Either side counts. [Möller and Trumbore 1997]
+    """
     a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces, int)[:, k]] for k in range(3))
     across = np.cross(direction, c - a)
     determinant = np.sum((b - a) * across, axis=1)
@@ -168,11 +156,8 @@ def mesh_hit(
         t = np.sum((c - a) * beside, axis=1) * inverse
     hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & np.isfinite(t)
     first = int(np.argmin(np.where(hit, t, np.inf)))
-    return (
-        float(t[first]) if hit[first] else np.inf,
-        first,
-        np.array([1 - u[first] - v[first], u[first], v[first]]),
-    )
+    shares = np.array([1 - u[first] - v[first], u[first], v[first]])
+    return (float(t[first]) if hit[first] else np.inf), first, shares
 
 
 def mesh_distance(
@@ -190,9 +175,9 @@ def mirror_visibility(
     ray: np.ndarray,
     offset: float,
 ) -> np.ndarray:
-    """1 (P,), or 0 where the mirror rays of unit rays (P, 3) from the eye are blocked.
+    """1 (P,), or 0 where the mirror rays of unit rays (P, 3) from the eye to the mesh are blocked.
 
-    They start where those meet the mesh, `offset` along the unit normals (P, 3).
+    They start `offset` off the mesh along the unit normals (P, 3).
     """
     if not len(faces):
         return np.ones(len(normal))
@@ -221,10 +206,9 @@ def ambient(
 ) -> np.ndarray:
     """Ratios (V, 3) by the formula at the head of `shade.ambient`.
 
-    normals (V, 3), unit; directions (V, K, 3), unit, with density cosine / π; light(ω) is the light's
-    radiance (3,), blurred as for one ray. outgoing(normal, view, free, ratio) is the radiance (3,) that
-    leaves a hit, `free` telling if light arrives along its mirror direction. Rays start `offset` off the
-    surface.
+    normals (V, 3), directions (V, K, 3), unit, with density cosine / π; light(ω) is radiance (3,), blurred.
+    outgoing(normal, view, free, ratio) is the radiance (3,) that leaves a hit, `free` if light arrives along
+    its mirror direction. Rays start `offset` off the surface.
     """
     ratio = np.ones((len(vertices), 3))
     for _ in range(bounces):

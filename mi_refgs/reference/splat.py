@@ -22,7 +22,6 @@ STEP = 1e-40
 
 
 def primitive_of(raw: dict[str, np.ndarray]) -> Any:
-    """3D Gaussians have a third standard deviation."""
     return Gaussian if raw["scale"].shape[1] == 3 else Surfel
 
 
@@ -111,17 +110,15 @@ class Blend:
         behind = _unsort(np.cumsum(part[::-1], axis=0)[::-1] - part, self.order)
         δalpha = np.where(self.shown, self.before * value - behind / (1 - self.alpha), 0)
         δz = np.where(self.shown, self.weight * δsums[:, -2], 0)
-        primitive, gradients = primitive_of(raw), {}
+        primitive, gradients = primitive_of(raw), {name: np.zeros_like(raw[name]) for name in GEOMETRY}
         for name in GEOMETRY:
-            gradients[name] = np.zeros_like(raw[name])
             for d in range(raw[name].shape[1]):
                 moved = raw | {name: raw[name].astype(complex)}
                 moved[name][:, d] += 1j * STEP
                 there = primitive.footprint(moved, self.camera, self.rules, self.x, self.y)
                 slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
-                gradients[name][:, d] = np.sum(
-                    np.where(self.shown, δalpha * slope_alpha + δz * slope_z, 0), 1
-                )
+                slope = np.where(self.shown, δalpha * slope_alpha + δz * slope_z, 0)
+                gradients[name][:, d] = np.sum(slope, 1)
         return gradients, self.weight @ δsums[:, :-2]
 
 

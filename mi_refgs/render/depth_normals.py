@@ -1,7 +1,6 @@
 """Normals of the surface that a depth map describes.
 
-Letters: D = Σ w z the blended depth, A the accumulated alpha, z = D / A the expected camera depth, X(i, j)
-the point that pixel (i, j) sees at depth z.
+Letters: z expected camera depth, A accumulated alpha, X(i, j) the point that pixel (i, j) sees at depth z.
 """
 
 from __future__ import annotations
@@ -15,30 +14,25 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Bool, Float, Vector3f
 
 DEPTH_EDGE_COSINE = 0.2
-"""Cosine to the viewing ray below which a depth difference is a step between two surfaces, not a slope: its
-normal would bend the rims of both. At 160² and 40° it is a step of 1/20 of the depth."""
+"""Cosine to the viewing ray below which a depth difference is a step between two surfaces, not a slope."""
 
 
 def normals_from_depth(depth: Float, alpha: Float, camera: Camera) -> tuple[Vector3f, Bool]:
     """World normals of a depth map by central differences, facing the camera, and where they are valid.
 
-    depth: (H·W) camera depth z, raster order, scene units; alpha: (H·W), read for validity only, no
-    derivative. Returns (normal: mi.Vector3f unit, or zero where invalid; valid: mi.Bool). Invalid: the
-    one-pixel image border, pixels that or whose four neighbours have A < 1/255, and points in one line.
-    Gradients flow to depth. Source: 2DGS, Huang et al. 2024, eq. 15, with X unprojected through the pixel
-    centres (i + ½, j + ½).
+    depth: (H·W) camera depth z, raster order, scene units; alpha: (H·W), for validity only. Unit normals, or
+    zero where invalid: at the image border, where a pixel or a neighbour has A < 1/255, and points in a line.
+    Gradients flow to depth. Source: 2DGS, Huang et al. 2024, eq. 15.
     """
     width, height = camera.width, camera.height
     steps = ((-1, 0), (1, 0), (0, -1), (0, 1))
     pixel = camera.pixel_centres()
     ray = mi.Vector3f((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy, 1)
-    # In units of the pixel's own depth, and of its width there: normals have no unit, so that it needs no
-    # derivative, and what is compared with a floor below is near 1 in scenes of any size.
+    # In units of the pixel's own depth: what is compared with a floor below is near 1 in scenes of any size.
     unit = dr.detach(dr.select(depth > 0, dr.rcp(dr.select(depth > 0, depth, 1)), 0))
     left, right, up, down = neighbours(depth, width, height, steps)
 
-    # X(right) - X(left) = ray (z₁ - z₀) + (z₁ + z₀) x / f: written out, no large terms cancel. Camera-frame
-    # axes have signed focal lengths, so the orientation is settled by the view direction below.
+    # X(right) - X(left) = ray (z₁ - z₀) + (z₁ + z₀) x / f: no large terms cancel.
     along_x = unit * (right - left) * camera.fx * ray + mi.Vector3f(unit * (right + left), 0, 0)
     along_y = unit * (down - up) * camera.fy * ray + mi.Vector3f(0, unit * (down + up), 0)
     normal = dr.cross(along_x, along_y)

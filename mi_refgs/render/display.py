@@ -1,6 +1,6 @@
 """Display of linear radiance: the one place where the sRGB curve and the background are applied.
 
-Images are planes: lists of mi.Float of width H·W in raster order (or a mi.Color3f).
+Images are lists of planes: mi.Float of width H·W in raster order.
 """
 
 from __future__ import annotations
@@ -16,15 +16,11 @@ from mi_refgs.io.images import SRGB_LINEAR_LIMIT
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.types import Color3f, Float
 
-ALPHA_EMPTY = 1e-6
-"""Alpha below which a pixel is empty: radiance / A has no meaning, and only the background is seen."""
+ALPHA_EMPTY = 1e-6  # alpha below which a pixel is empty: only the background is seen
 
 
 def srgb_from_linear(linear: Float) -> Float:
-    """sRGB encoding (IEC 61966-2-1) of a linear plane: straight below 0.0031308, else the curve.
-
-    Unbounded above 1. The slope is finite everywhere (12.92 at 0).
-    """
+    """sRGB encoding (IEC 61966-2-1) of a linear plane, unbounded above 1; finite slope (12.92 at 0)."""
     straight = linear <= SRGB_LINEAR_LIMIT
     curve = 1.055 * dr.power(dr.select(straight, 1.0, linear), 1 / 2.4) - 0.055
     return dr.select(straight, 12.92 * linear, curve)
@@ -35,8 +31,7 @@ def display_image(
 ) -> list[Float]:
     """Composite as 8-bit RGBA images do: A srgb(L / A) + (1 - A) background, per plane.
 
-    radiance: linear, premultiplied (L); background: display-encoded floats or planes. Pixels with A < 1e-6
-    show the background, and their radiance has no gradient.
+    radiance: linear, premultiplied (L); background: display-encoded. Pixels with A < 1e-6 show it alone.
     """
     seen = alpha >= ALPHA_EMPTY
     inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1.0)), 0.0)
@@ -58,9 +53,8 @@ def displayed(
 ) -> list[Any]:
     """Display-encoded planes of a frame.
 
-    Images with alpha were composited after encoding, A srgb(L) + (1 - A) background; linear data before it.
-    The frame's own background replaces `background`, linear. `gain` is a factor per channel of radiance
-    and of the frame's own background, applied first.
+    Images with alpha were composited after encoding, linear data before it. The frame's own background
+    replaces `background`, linear. `gain`: factor per channel of radiance and of the frame's background.
     """
     radiance = list(frame.radiance)
     behind = [float(x) for x in background] if frame.background is None else list(frame.background)

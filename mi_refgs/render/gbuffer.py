@@ -16,15 +16,10 @@ from mi_refgs.splat import Composited
 from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.types import Array, Float
 
-OBJECT = "object"
-"""Slot of the object's opacity; where it is blended, slots are divided by it."""
-
-AROUND = "surroundings"
-"""Slot of the radiance of the surroundings."""
-
+OBJECT = "object"  # slot of the object's opacity; where it is blended, slots are divided by it
+AROUND = "surroundings"  # slot of the radiance of the surroundings
 Slots = Mapping[str, Any]
-"""Values by name: mi.Float, or an array of several such as mi.Color3f. Every component is a feature, which
-costs time in every surfel-tile pair."""
+"""Values by name: mi.Float, or several such as mi.Color3f; each costs time in every surfel-tile pair."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,6 @@ class GBuffer:
 
 
 def features(slots: Slots) -> list[Float]:
-    """The components of all slots."""
     return [part for value in slots.values() for part in _parts(value)]
 
 
@@ -76,11 +70,9 @@ def inverse_alpha(alpha: Float) -> Float:
 
 
 def _parts(value: Array) -> list[Float]:
-    """The components of a value."""
     return [*value] if dr.depth_v(value) > 1 else [value]
 
 
 def _grouped(kinds: Slots, parts: Sequence[Float]) -> dict[str, Any]:
-    """Values of the types of slots from all their components."""
     rest = iter(parts)
     return {name: type(kind)(*islice(rest, len(_parts(kind)))) for name, kind in kinds.items()}

@@ -19,10 +19,8 @@ from mi_refgs.surfels.table import Surfels
 MARGIN = 2  # pixels of a cube face beyond its edges, so that interpolation never leaves an image
 SURFACE = 0.5  # opacity from which a pixel shows a surface
 LARGEST = 0.2
-"""Standard deviation over distance from the centre. A Gaussian is splatted by the derivative of the
-projection at its own centre: a larger one covers whole faces of the cube with its colour. Fits to rooms have
-few, 0.1 % of all.
-"""
+"""Standard deviation over distance from the centre above which a Gaussian is left out: its projection would
+cover whole faces of the cube. Fits to rooms have few, 0.1 % of all."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +38,7 @@ class Panorama:
 
 
 def panorama(surroundings: Surroundings, centre: np.ndarray, height: int, near: float) -> Panorama:
-    """Render surroundings from a `centre` (3,), without what is nearer than `near`, by six cameras.
-
-    `height`: rows h of the maps. Gaussians that are too large for their distance (LARGEST) are left out.
-    """
+    """Render surroundings beyond `near` from a `centre` (3,), by six cameras, to maps of `height` rows."""
     shading, nothing = Shading(reflectance="radiance", at="surfel"), nothing_around(surroundings.surfels)
     around = replace(surroundings, surfels=_small_from(centre, surroundings.surfels))
     scene = SurfelScene(nothing, shading, surroundings=around)

@@ -1,7 +1,6 @@
-"""Rendering in passes, band of rows by band of rows, so that memory does not grow with the sample count.
+"""Rendering band of rows by band of rows, so that memory does not grow with the sample count.
 
-The tiles of a band are tiles of the whole image, with the same lists: its pixels have the same values.
-Bands are equally high and their offsets opaque, so that all of them use one set of kernels.
+Bands have the tiles of the whole image, are equally high, and share one set of kernels.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
     """Divide an image into bands of at most `most` samples (default: PASS_SAMPLES), factor² per pixel.
 
     `margin`: pixels of neighbours on which a pixel depends. Without one, the last band may reach below the
-    image, as high as the others. A band has PATCH_EDGE rows of samples at least.
+    image. A band has PATCH_EDGE rows of samples at least.
     """
     most = PASS_SAMPLES if most is None else most
     width, height = camera.width, camera.height
@@ -72,8 +71,8 @@ def in_passes(
 ) -> Result:
     """Call `draw` for each band of a camera's image and join the results; without derivatives.
 
-    `draw` renders factor² samples per pixel and returns lists, dictionaries and dataclasses of arrays of one
-    value per pixel or one in all. Raises InputError if an image of so many surfels does not fit into memory.
+    `draw` renders factor² samples per pixel and returns arrays of one value per pixel, or one in all, in
+    lists, dictionaries and dataclasses. Raises InputError if the image does not fit into memory.
     """
     require_image((camera.width, camera.height), factor**2, surfels, channels=24)  # with all maps, about
     found = bands(camera, factor, margin)

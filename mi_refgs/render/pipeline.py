@@ -3,9 +3,8 @@
     forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.shaded_at` is "surfel")
     deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.shaded_at` is "pixel")
 
-Both use the same splatter and the same `shade`. Everything is traced by Dr.Jit. No derivative: visibility,
-the side to which a normal is turned, rays that are traced, and those that `mi_refgs.splat.composite` lists;
-cameras have derivatives if they have a `motion`.
+Both use the same splatter and the same `shade`. No derivative: visibility, the side to which a normal is
+turned, traced rays, and what `mi_refgs.splat.composite` lists; cameras have one if they have a `motion`.
 """
 
 from __future__ import annotations
@@ -71,8 +70,7 @@ class Request:
     attribution: Float | None = None  # (N,) zeros, which get Σ w δ for adjoints δ of the frame's
 
 
-RADIANCE = Request()
-"""Radiance and alpha, with derivatives."""
+RADIANCE = Request()  # radiance and alpha, with derivatives
 
 
 @dataclass(frozen=True)
@@ -86,8 +84,7 @@ class Frame:
         terms      object                      times object_alpha       0
         maps       object                      divided by object_alpha  0
 
-    Without derivatives, AOVs that were not requested are None or absent. With derivatives, those that the
-    radiance was computed from are there as well.
+    Without derivatives, AOVs that were not requested are None or absent.
     """
 
     alpha: Float  # accumulated opacity
@@ -113,11 +110,7 @@ class Frame:
 
 
 def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> Frame:
-    """Render a view of a scene.
-
-    With surroundings, the rows of `attribution` are those of the object, then theirs. Raises InputError as
-    `Shading.require_inputs` does.
-    """
+    """Render a view; rows of `attribution` are the object's, then the surroundings'. Raises InputError."""
     require_supported_variant("mi_refgs.render_frame")
     primitive_of(scene.surfels.raw)
     scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
@@ -184,7 +177,6 @@ class _View:
 
     @property
     def asked(self) -> frozenset[str]:
-        """Names of the requested AOVs."""
         return frozenset(self.request.aovs)
 
     def blend(self, slots: dict[str, Any], others: dict[str, Any]) -> GBuffer:
@@ -206,9 +198,8 @@ class _View:
 def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView:
     """Unit direction from the camera to each surfel, and its normal turned towards the camera.
 
-    A normal that points away by less than FACING_TOLERANCE stays: such a surfel lies just behind a
-    silhouette, and shows there through the low-pass; turned round it would oppose its neighbours and leave
-    the outline without a normal.
+    A normal that points away by less than FACING_TOLERANCE stays: the surfel lies just behind a silhouette,
+    and turned round it would oppose its neighbours.
     """
     # A surfel at the camera's own position has no direction; it is culled, so any will do.
     direction = safe_normalize(camera.towards(surfels.position()))

@@ -19,10 +19,7 @@ from mi_refgs.types import Arrays, Color3f, Float
 
 
 def samples_per_axis(samples: int) -> int:
-    """k of the k × k regular samples for a sample count: ⌈√samples⌉.
-
-    Raises InputError for less than 1.
-    """
+    """k of the k × k regular samples for a sample count: ⌈√samples⌉; raises InputError for less than 1."""
     if samples < 1:
         raise InputError(f"{samples} is out of range", "samples", remedy="give a number from 1")
     return math.ceil(math.sqrt(samples))
@@ -33,11 +30,9 @@ def supersampled(
 ) -> Frame:
     """Render a frame with k × k samples per pixel (`samples_per_axis`), box filtered; under AD.
 
-    Linear radiance, its terms, normals and alpha are premultiplied: their means are plain. Depth is weighted
-    by alpha, maps by the opacity of the object, and the background by 1 - alpha, so that compositing the mean
-    frame equals the mean of composited samples. The sRGB encoding comes after, as for a path-traced image
-    with a box filter. Without `details`, there are neither terms nor maps: each mean is a kernel of its own,
-    used or not.
+    Premultiplied values have plain means. Depth is weighted by alpha, maps by the opacity of the object, and
+    the background by 1 - alpha: compositing the mean frame equals the mean of composited samples. Without
+    `details`, there are neither terms nor maps.
     """
     factor = samples_per_axis(samples)
     fine_camera = camera.supersampled(factor)

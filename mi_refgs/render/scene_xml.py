@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,7 @@ from mi_refgs.io.files import write_bytes
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 
-# Mitsuba requires a near plane above 0 and a far plane behind it. The far plane lies beyond every scene:
-# cameras of a file have no near plane to derive it from, and other integrators show nothing behind it.
+# Mitsuba requires a near plane above 0 and a far plane behind it, here beyond every scene.
 NEAR_CLIP_MIN = 1e-12
 FAR_CLIP = RAW_LIMIT
 SQUARE = 1e-5  # relative difference of focal lengths, by rounding, up to which pixels are square
@@ -39,14 +38,9 @@ class SceneFiles:
 def write_scene_xml(path: str | Path, files: SceneFiles, shading: Shading, cameras: Sequence[Camera]) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and a sensor per camera, atomically.
 
-    The scene has a parameter `spp`, as in `mi.load_file(path, spp=4)`, 1 by default: pixel centres, as in
-    training.
-
-    Mitsuba's `perspective` sensor has square pixels. Where those of the camera are not (fx ≠ fy), the film
-    has more of them along one axis, and a comment says so: the same view, to half a pixel at that border.
-
-    Raises InputError if the camera is mirrored, if there is no mesh for the occlusion, or if the path cannot
-    be written.
+    The parameter `spp` is 1 by default: pixel centres, as in training. Mitsuba's sensors have square pixels:
+    where fx ≠ fy, the film has more of them along one axis, the same view to half a pixel at that border.
+    Raises InputError if the camera is mirrored, if occlusion has no mesh, or if the path cannot be written.
     """
     if shading.occlusion and files.mesh is None:
         raise InputError("there is none to trace", path, "mesh", "give one, or shade without occlusion")
@@ -90,23 +84,17 @@ def put(parent: ElementTree.Element, **properties: bool | float | str | Sequence
     for name, value in properties.items():
         if value is not None:
             kind = kinds.get(type(value), "rgb")
-            text = _numbers(value) if kind == "rgb" else str(value)  # type: ignore[arg-type]
-            text = text.lower() if kind == "boolean" else text
+            text = str(value).lower() if kind == "boolean" else str(value)
+            if kind == "rgb":
+                text = ", ".join(repr(float(x)) for x in value)  # type: ignore[union-attr]
             ElementTree.SubElement(parent, kind, name=name, value=text)
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return ", ".join(repr(float(x)) for x in values)
 
 
 def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     fx, fy, cx, cy, near = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy, camera.near))
     if not fx * fy > 0:
-        raise InputError(
-            f"fx, fy: {fx:g} and {fy:g} pixels mirror the image, as no Mitsuba sensor does",
-            "camera",
-            remedy="choose another view",
-        )
+        what = f"fx, fy: {fx:g} and {fy:g} pixels mirror the image, as no Mitsuba sensor does"
+        raise InputError(what, "camera", remedy="choose another view")
     to_world = camera.pose()
     if fx > 0:  # both axes point the other way: the camera is upside down
         to_world[:3, :2] *= -1
@@ -130,7 +118,7 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     put(sensor, principal_point_offset_x=0.5 - x / whole[0])
     put(sensor, principal_point_offset_y=0.5 - y / whole[1])
     transform = ElementTree.SubElement(sensor, "transform", name="to_world")
-    ElementTree.SubElement(transform, "matrix", value=_numbers(to_world.ravel()))
+    ElementTree.SubElement(transform, "matrix", value=" ".join(map(repr, to_world.ravel().tolist())))
     sampler = ElementTree.SubElement(sensor, "sampler", type="independent")
     ElementTree.SubElement(sampler, "integer", name="sample_count", value="$spp")
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")

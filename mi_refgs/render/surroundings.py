@@ -19,10 +19,7 @@ from mi_refgs.types import Color3f
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Surfels or Gaussians with geometry and radiance_sh only, and a distant background.
-
-    The background is looked up in the direction of each pixel's ray; without one it is black.
-    """
+    """Surfels or Gaussians with geometry and radiance_sh only, and a distant background, or a black one."""
 
     surfels: Surfels
     background: EnvironmentLight | None = None
