@@ -13,8 +13,7 @@ import pytest
 Dimensions = Mapping[str, Sequence[Hashable]]
 Case = dict[str, Any]
 Combination = tuple[tuple[str, Any], ...]
-CANDIDATES = 8
-"""Random cases of which the one that covers most is kept."""
+CANDIDATES = 8  # random cases of which the one that covers most is kept
 
 
 @dataclass(frozen=True)
@@ -57,15 +56,9 @@ def completed(partial: Case, dimensions: Dimensions, rules: Sequence[Rule]) -> C
 def covering_array(
     dimensions: Dimensions, rules: Sequence[Rule], strength: int = 2, seed: int = 0
 ) -> list[Case]:
-    """Cases that together have every allowed combination of `strength` values; the same for equal arguments.
-
-    Greedy: each case starts from a combination that is missing, and takes in turn the values that cover most
-    of the others.
-    """
-    rng = random.Random(seed)
-    missing = {
-        c: None for c in combinations_of(dimensions, strength) if completed(dict(c), dimensions, rules)
-    }
+    """Cases that together have every allowed combination of `strength` values, greedily."""
+    rng, every = random.Random(seed), combinations_of(dimensions, strength)
+    missing = {c: None for c in every if completed(dict(c), dimensions, rules)}
     cases: list[Case] = []
     while missing:
         first = next(iter(missing))
@@ -78,13 +71,9 @@ def covering_array(
 
 
 def _candidate(
-    first: Combination,
-    dimensions: Dimensions,
-    rules: Sequence[Rule],
-    strength: int,
-    missing: Mapping[Combination, None],
-    rng: random.Random,
-) -> tuple[Case, list[Combination]]:
+    first: Combination, dimensions: Dimensions, rules: Sequence[Rule], strength: int,
+    missing: Mapping[Combination, None], rng: random.Random,
+) -> tuple[Case, list[Combination]]:  # fmt: skip
     """A case with `first`, and the missing combinations that it covers."""
     partial, place = dict(first), {name: i for i, name in enumerate(dimensions)}
 

@@ -23,8 +23,8 @@ from tests.scenes.integrator import sky
 
 COUNT, WIDTH, HEIGHT, FOCAL = 40, 24, 16, 26.0
 LIGHT_ROWS = 16
-SHADINGS = (Shading(), Shading(at="surfel", diffuse="irradiance"))
-"""Both orders of shading, both kinds of diffuse term."""
+SHADINGS = (Shading(), Shading(at="surfel", diffuse="irradiance"))  # both orders, both diffuse terms
+
 
 Raw = dict[str, np.ndarray]
 
@@ -43,7 +43,6 @@ class View:
         return Camera.from_pose(self.width, self.height, -FOCAL, -FOCAL, *centre, self.to_world, self.near)
 
     def moved(self, matrix: np.ndarray) -> View:
-        """The view from the pose `matrix` (4, 4) takes it to."""
         return replace(self, to_world=matrix @ self.to_world)
 
 
@@ -54,26 +53,17 @@ class Scene:
     raw: Raw
     view: View
 
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """What Hypothesis prints of a failure."""
-        printer.text(f"Scene(position[0]={self.raw['position'][0]}, {self.view})")
-
     def with_rows(self, parent: np.ndarray) -> Scene:
-        """The scene of these rows of its table."""
         return replace(self, raw={name: values[parent] for name, values in self.raw.items()})
 
     def changed(self, **channels: np.ndarray) -> Scene:
-        """The scene with other values of some channels."""
         return replace(self, raw=self.raw | {k: np.asarray(v, np.float32) for k, v in channels.items()})
 
 
 def random_scene(
     seed: int, size: float = 0.25, flatness: float = 0.0, opacity: float = 0.0, axes: int = 2
 ) -> Scene:
-    """`size`: of the discs; `flatness`: log₁₀ of the ratio of their axes; `opacity`: the mean logit.
-
-    `axes`: 3 for 3D Gaussians.
-    """
+    """`size` of the discs, log₁₀ of the ratio of their axes, mean logit of opacity; 3 `axes`: Gaussians."""
     rng = np.random.default_rng(seed)
     scale = np.log(size * rng.uniform(0.3, 1.5, (COUNT, axes)))
     scale[:, 1] -= flatness * np.log(10) * rng.uniform(size=COUNT)
@@ -103,40 +93,30 @@ SCENES = st.builds(
     opacity=st.floats(-3, 5),
     axes=st.sampled_from([2, 3]),
 )
-"""Surfels, and 3D Gaussians."""
 DISCS = SCENES.filter(lambda scene: scene.raw["scale"].shape[1] == 2)
 
 
 @cache
 def light() -> Any:
-    """A prefiltered light without symmetries."""
     return EnvironmentLight.from_radiance(sky(LIGHT_ROWS)).prefilter()
 
 
 def draw(scene: Scene, shading: Shading = SHADINGS[0], by: Any = None) -> dict[str, np.ndarray]:
-    """Every map of the scene's image, (pixels, channels) each."""
     drawn = SurfelScene(Surfels.from_numpy(scene.raw), shading, by or light())
     return maps_of(render(drawn, scene.view.camera(), Request(drawn.all_aovs)))
 
 
 def maps_of(frame: Frame) -> dict[str, np.ndarray]:
     assert frame.terms is not None
-    maps = {
-        "alpha": frame.alpha,
-        "depth": frame.depth,
-        "normal": frame.normal,
-        "radiance": frame.radiance,
-        "specular": frame.terms.specular,
-        **frame.maps,
-    }
+    maps = {"alpha": frame.alpha, "depth": frame.depth, "normal": frame.normal, "radiance": frame.radiance}
+    maps |= {"specular": frame.terms.specular, **frame.maps}
     return {name: np.atleast_2d(np.array(values, np.float64)).T for name, values in maps.items()}
 
 
 def gradients(
     scene: Scene, shading: Shading, seed: int, views: tuple[View, ...] | None = None
 ) -> dict[str, np.ndarray]:
-    """Derivatives by every channel of a sum over maps and views (the scene's own by default) with random
-    weights."""
+    """Derivatives of a randomly weighted sum over maps and views (default: the scene's own) by channel."""
     weight = np.random.default_rng(seed).normal(size=(8, WIDTH * HEIGHT))
     surfels = Surfels.from_numpy(scene.raw)
     surfels.enable_grad()
@@ -150,7 +130,7 @@ def gradients(
 
 
 def differing(a: dict[str, np.ndarray], b: dict[str, np.ndarray], tolerance: float) -> float:
-    """Share of the pixels in which a map differs by more than the tolerance, of 1 or of its largest value."""
+    """Share of the pixels in which a map differs by more than the tolerance, of 1 or its largest value."""
     assert a.keys() == b.keys()
     bad = np.zeros(len(a["alpha"]), bool)
     for name, values in a.items():
@@ -160,7 +140,6 @@ def differing(a: dict[str, np.ndarray], b: dict[str, np.ndarray], tolerance: flo
 
 
 def rotated(scene: Scene, turn: Rotation) -> Scene:
-    """Surfels and camera turned about the origin together; SH coefficients stay."""
     matrix = np.eye(4)
     matrix[:3, :3] = turn.as_matrix()
     position = turn.apply(scene.raw["position"])

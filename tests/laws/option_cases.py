@@ -1,15 +1,11 @@
-"""The options of a rendered image, as data: their values, and which of these do not go together.
-
-A new reflectance model, primitive, method or option of accuracy is read from its registry. A new value of
-another option is one more entry below.
-"""
+"""The options of a rendered image: their values, and which of these do not go together."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from mi_refgs.methods.read import load, names
-from mi_refgs.shade.options import DIFFUSE, QUALITY, TRACED, ShadingOptions
+from mi_refgs.shade.options import DIFFUSE, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.surfels.primitives import PRIMITIVES
 from tests.laws.covering import Case, Rule
@@ -17,21 +13,12 @@ from tests.laws.covering import Case, Rule
 WIDTH, HEIGHT = 16, 12
 CROPS = {"none": (0, 0, WIDTH, HEIGHT), "inner": (3, 2, 8, 6), "corner": (8, 6, 8, 6)}
 """Offset and size, pixels. 2 × 2 samples of half the size share the kernels of the whole."""
-ACCURACY: dict[str, Any] = {
-    "none": None,
-    "dominant": True,
-    "antialias": True,
-    "directions": 7,
-}
-"""Options of accuracy, one at a time. Those of rays beyond the mirror ray (`TRACED`) are compared by
-`test_routes`, since the reference does not trace them."""
+ACCURACY: dict[str, Any] = {"none": None, "dominant": True, "antialias": True, "directions": 7}
+"""Options of accuracy, one at a time; those of rays beyond the mirror ray are in `test_routes`."""
 
 
 def shadings() -> list[str]:
-    """Every shading that a method of `variants/` has, and every registered model: model, order, diffuse.
-
-    Diffuse terms count as one where the model's channels do not differ.
-    """
+    """Every shading of a method of `variants/`, and every registered model: model, order, diffuse."""
     stages = [stage.shading for method in names() for stage in load(method).stage.values()]
     found = [(stage.reflectance, stage.at, stage.diffuse) for stage in stages]
     used = {reflectance for reflectance, _, _ in found}
@@ -117,15 +104,8 @@ RULES = [
 ]  # fmt: skip
 
 
-FORMATS = {"rgb": "rgba", "luminance": "luminance_alpha", "xyz": "xyza"}
-"""The pixel format with alpha of each one without."""
+FORMATS = {"rgb": "rgba", "luminance": "luminance_alpha", "xyz": "xyza"}  # with alpha, by the one without
 
 
 def spec(case: Case) -> str:
-    """A case in one line."""
     return ", ".join(f"{name}={value}" for name, value in case.items())
-
-
-def unlisted_accuracy() -> set[str]:
-    """Options of accuracy that no dimension has, and the reference could have."""
-    return {*QUALITY} - {*TRACED} - {*ACCURACY}

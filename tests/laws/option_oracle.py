@@ -56,8 +56,6 @@ def camera_of(case: Case) -> tuple[PinholeCamera, tuple[int, int], int]:
 
 
 class Oracle:
-    """Images of a case for values near the first ones; what has no derivative stays as it is for those."""
-
     def __init__(self, case: Case, first: Values) -> None:
         self.case, self.window, shown = case, (slice(None), slice(None)), case
         if case["accuracy"] == "antialias":  # normals are interpolated with pixels beside the crop window
@@ -87,7 +85,6 @@ class Oracle:
             self.band = maximum_filter(band.reshape(shape), 3).ravel()
 
     def image(self, values: Values) -> Array:
-        """(H, W, channels), as `mi.render` gives it."""
         values = {name: np.asarray(x, np.float64) for name, x in values.items()}
         return self._developed(self._maps(values)[0])[self.window]
 
@@ -104,7 +101,6 @@ class Oracle:
         return own, {n: values.get(AROUND + n, rows) for n, rows in empty.items()}
 
     def _maps(self, values: Values) -> tuple[dict[str, Array], Array]:
-        """Maps of the samples, and which of these are near a declared discontinuity."""
         chosen, (own, around) = shading(self.case), self._tables(values)
         scene = image.Scene(
             own, self.camera, self.pixels, self.order, chosen.at, chosen.reflectance, chosen.diffuse,
@@ -128,7 +124,6 @@ class Oracle:
     # ---------------- the film ----------------
 
     def _blocks(self, values: Array) -> Array:
-        """Means (H, W, n) of values (samples, n) over the pixels."""
         k = self.per_axis
         height, width = self.camera.height // k, self.camera.width // k
         return np.asarray(values).reshape(height, k, width, k, -1).mean(axis=(1, 3))
@@ -168,18 +163,13 @@ class Oracle:
         return np.where(share > c.COVERAGE_FLOOR, mean, 0)
 
     def _ray_lengths(self) -> Array:
-        """|ray| (samples, 1), of rays that are 1 along the viewing axis."""
         camera = self.camera
         x = (self.pixels % camera.width + 0.5 - camera.cx) / camera.fx
         y = (self.pixels // camera.width + 0.5 - camera.cy) / camera.fy
         return np.sqrt(1 + x**2 + y**2)[:, None]
 
 
-# ---------------- the light ----------------
-
-
 def map_of(case: Case, values: Values) -> Array:
-    """Radiance (h, 2h, 3) of the light's map, float64."""
     if "light" in values:
         own = np.logaddexp(0, values["light"])
         return own if own.ndim == 3 else np.tile(own, (8, 16, 1))
@@ -197,11 +187,7 @@ def light_of(case: Case, values: Values) -> Light:
     return Light(levels, lobe_matrices.LEVEL_ROUGHNESS, brdf.table().astype(np.float64), rotation(case).T)
 
 
-# ---------------- rays ----------------
-
-
 def _facing(raw: dict[str, Array], camera: PinholeCamera) -> Array:
-    """Normals (N, 3) of surfels towards the camera."""
     axes = np.stack(rotation_axes(raw["rotation"]))
     normal = axes[primitive_of(raw).normal(raw), np.arange(len(raw["rotation"]))]
     direction = unit(raw["position"] - camera.to_world[:3, 3])
@@ -210,7 +196,6 @@ def _facing(raw: dict[str, Array], camera: PinholeCamera) -> Array:
 
 
 def _free(position: Array, normal: Array, count: int) -> Array:
-    """Whether light arrives at surfels from their directions, (N, count)."""
     found, free = mesh(), []
     for origin, about in zip(position + OFFSET_VOXELS * found.voxel * normal, normal, strict=True):
         rays = hemisphere(count, about)

@@ -34,12 +34,9 @@ from tests.scenes.integrator import raw_channels, sky
 
 Values = dict[str, np.ndarray]
 AROUND = "surroundings_"
-OTHERS = 10
-"""Rows of the surroundings."""
+OTHERS = 10  # rows of the surroundings
 SCALE = 0.8  # of envmap emitters
-CONSTANT = (0.5, 1.0, 1.6)  # radiance of constant lights
-BACKDROP = (0.3, 0.1, 0.6)
-"""Radiance of a constant background."""
+CONSTANT, BACKDROP = (0.5, 1.0, 1.6), (0.3, 0.1, 0.6)  # radiance of constant lights, of a background
 FOV = 45.0
 NEAR = 0.01
 SOME = ("normal", "depth", "roughness")
@@ -65,7 +62,6 @@ def aov_types(case: Case) -> tuple[str, ...]:
 
 
 def rotation(case: Case) -> np.ndarray:
-    """World from light, (3, 3)."""
     return TURN.as_matrix() if case["rotated"] else np.eye(3)
 
 
@@ -90,7 +86,6 @@ def radiance(case: Case) -> np.ndarray:
 
 
 def values(case: Case, seed: int = 1) -> Values:
-    """Everything that the image depends on and that has derivatives, float32."""
     rng = np.random.default_rng(seed)
     raw = raw_channels(seed=seed)
     raw["tint"] = rng.normal(size=(len(raw["position"]), 3))
@@ -151,12 +146,10 @@ def sensor(case: Case) -> dict[str, Any]:
 
 
 def surfels_of(found: Values, prefix: str = "") -> Surfels:
-    """The table of the values whose names begin with a prefix."""
     return Surfels.from_numpy({name: found[prefix + name] for name in ATTRIBUTES if prefix + name in found})
 
 
 def build(case: Case, found: Values, folder: Path) -> Built:
-    """The scene of a case, from files in a folder where its input is such."""
     if case["input"] == "run":
         return _run(case, found, folder)
     name, at, diffuse = case["shading"].split("/")
@@ -234,7 +227,6 @@ def _emitter(case: Case, folder: Path) -> dict[str, Any]:
 
 
 def _xml(value: dict[str, Any], name: str) -> ElementTree.Element:
-    """A scene dictionary as XML."""
     kind = value["type"]
     if kind == "scene":
         element = ElementTree.Element("scene", version="3.0.0")

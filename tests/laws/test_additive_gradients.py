@@ -1,8 +1,6 @@
-"""The gradient of a sum of losses is the sum of their gradients, for every order, parameter and mode.
+"""The gradient of a sum of losses is the sum of their gradients, for every order and parameter.
 
-Each scene is a row of SCENES, each loss a row of `Losses.terms`; a new one joins by its row, and a registered
-reflectance model by itself. Losses of the parameters read them as priors do, so that their adjoints write to
-the same leaves as that of the image.
+Losses of the parameters read them as priors do: their adjoints write to the same leaves as the image's.
 """
 
 from __future__ import annotations
@@ -27,12 +25,9 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import attribute
 from tests.scenes.integrator import hollow_mesh, integrator, lit_scene, raw_channels, sensor, sky
 
-TOLERANCE = 1e-5
-"""Relative to the largest entry of the sum, for each parameter: sums by scatter come in any order."""
-COUNT = 400
-"""Surfels: enough that two threads share the work on them. What 24 lose, one thread puts right."""
-RENDERED = 100
-"""Weight of the images, whose gradients are small beside those of priors."""
+TOLERANCE = 1e-5  # relative to the largest entry of the sum, per parameter: sums by scatter are in any order
+COUNT = 400  # surfels: enough that two threads share the work on them
+RENDERED = 100  # weight of the images, whose gradients are small beside those of priors
 NEIGHBOURS = 4
 AROUND = "surroundings_"
 
@@ -41,7 +36,6 @@ AROUND = "surroundings_"
 
 
 def every_channel(model: str, diffuse: Any, gaussians: bool) -> dict[str, np.ndarray]:
-    """The geometry, and what a reflectance model needs."""
     raw, rng = raw_channels(COUNT), np.random.default_rng(5)
     if gaussians:
         raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
@@ -53,7 +47,6 @@ def every_channel(model: str, diffuse: Any, gaussians: bool) -> dict[str, np.nda
 
 
 def model_scene(model: str, diffuse: str = "sh", gaussians: bool = False, **changes: Any) -> Any:
-    """A reflectance model with its own light."""
     raw = every_channel(model, diffuse, gaussians)
     if "mesh" in changes and "traced_bounces" not in changes:
         raw["indirect_sh"] = raw_channels(COUNT)["indirect_sh"]
@@ -65,22 +58,18 @@ def model_scene(model: str, diffuse: str = "sh", gaussians: bool = False, **chan
 
 
 def open_scene(**changes: Any) -> Any:
-    """Surfels among others around them, before a map."""
     far = every_channel("radiance", "sh", False)
     far["position"] = 1.7 * far["position"]
     around = {AROUND + name: mi.TensorXf(values) for name, values in far.items()}
-    return model_scene(
-        "split_sum", background=EnvironmentLight.from_radiance(0.3 + sky(16)).raw, **around, **changes
-    )
+    background = EnvironmentLight.from_radiance(0.3 + sky(16)).raw
+    return model_scene("split_sum", background=background, **around, **changes)
 
 
 def lit(emitter: dict[str, Any]) -> Any:
-    """Surfels under an emitter of the scene."""
     return lit_scene(emitter, raw=every_channel("split_sum", "sh", False), aovs="s:specular")
 
 
 def map_of(rows: int, columns: int, folder: Path) -> dict[str, Any]:
-    """An `envmap` with a file of its own."""
     path = folder / f"{rows}x{columns}.exr"
     mi.Bitmap(np.resize(sky(rows), (rows, columns, 3))).write(str(path))
     return {"type": "envmap", "filename": str(path), "scale": 0.7}
@@ -95,15 +84,9 @@ def textured_scene(method: str) -> Any:
         return {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
 
     bsdf = {"type": "refgs_bsdf", "albedo": texture(3), "metallic": texture(1), "roughness": texture(1)}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": method, "max_depth": 3},
-            "sensor": sensor(),
-            "ball": {"type": "sphere", "bsdf": bsdf},
-            "sky": {"type": "constant"},
-        }
-    )
+    scene = {"type": "scene", "integrator": {"type": method, "max_depth": 3}, "sensor": sensor()}
+    ball = {"type": "sphere", "bsdf": bsdf}
+    return mi.load_dict(scene | {"ball": ball, "sky": {"type": "constant"}})
 
 
 def traced(folder: Path, **changes: Any) -> Any:
@@ -127,16 +110,13 @@ SCENES: dict[str, Callable[[Path], Any]] = {
     "BSDF, prb": lambda _: textured_scene("prb"),
 }
 
-
-SAMPLE = {"traced bounces", "BSDF, prb"}
-"""Scenes that are tested without `-m slow`; cases of `test_option_pairs` with a prior test others."""
+SAMPLE = {"traced bounces", "BSDF, prb"}  # tested without `-m slow`; `test_option_pairs` tests others
 
 
 # ---------------- losses ----------------
 
 
 def is_trained(key: str) -> bool:
-    """Whether a parameter belongs to the surfels, a light or a BSDF."""
     return key.startswith("integrator.") or key.endswith((".data", "sky.scale", "sky.radiance.value"))
 
 
@@ -150,7 +130,6 @@ class Losses:
         self.shape = {key: tuple(self.params[key].shape) for key in kept}
         self.keys = kept
         rng = np.random.default_rng(0)
-        self.direction = {key: rng.normal(size=x.shape).astype(np.float32) for key, x in self.base.items()}
         self.picked = {key: mi.UInt32(rng.integers(0, x.size, 2 * x.size)) for key, x in self.base.items()}
         image = mi.render(scene, spp=1)
         self.weight = mi.TensorXf(RENDERED * rng.normal(size=image.shape).astype(np.float32))
@@ -185,15 +164,12 @@ class Losses:
         self.params.update()
         return made
 
-    # ---------------- by name ----------------
-
     def rendered(self, spp: int, channels: slice) -> Any:
         """A weighted sum of some channels of an image with so many samples per pixel."""
         image = mi.render(self.scene, self.params, spp=spp, seed=1)
         return dr.sum((image * self.weight)[..., channels], axis=None).array
 
     def frame(self) -> Any:
-        """A weighted sum over a frame of the renderer below the plugin."""
         of = self.scene.integrator()
         camera = Camera.from_sensor(self.scene.sensors()[0])
         light = of.shading.light_of(of.light)
@@ -224,8 +200,6 @@ class Losses:
             for column in other.T.astype(np.uint32)
         )
 
-    # ---------------- their derivatives ----------------
-
     def gradient(self, *names: str) -> dict[str, np.ndarray]:
         """Reverse mode: the gradient of the sum of these losses, made in this order."""
         leaves = self.leaves()
@@ -236,22 +210,6 @@ class Losses:
     def gradients(self) -> dict[str, dict[str, np.ndarray]]:
         """The gradient of each loss alone."""
         return {name: self.gradient(name) for name in self.terms}
-
-    def tangent(self, *names: str) -> dict[str, np.ndarray]:
-        """Forward mode: the derivative of the sum of these losses along one direction of all parameters."""
-        leaves = self.leaves()
-        for key, leaf in leaves.items():
-            v = mi.Float(self.direction[key])
-            kind = type(leaf)
-            dr.set_grad(leaf, kind(v, self.shape[key]) if kind is mi.TensorXf else dr.unravel(kind, v))
-        # Mitsuba's integrators want what lies before the parameters to be done with.
-        dr.enqueue(dr.ADMode.Forward, leaves)
-        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
-        total = sum((self.terms[name]() for name in names), start=mi.Float(0))
-        return {"all parameters": np.array(dr.forward_to(total))}
-
-
-# ---------------- the law ----------------
 
 
 @pytest.fixture(
@@ -266,13 +224,10 @@ def losses(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def check_additive(
-    derivative: Callable[..., dict[str, np.ndarray]],
-    alone: dict[str, dict[str, np.ndarray]],
-    orders: list[tuple[str, ...]],
+    losses: Losses, alone: dict[str, dict[str, np.ndarray]], orders: list[tuple[str, ...]]
 ) -> None:
-    """The derivative of a sum of losses, in each of the orders, is the sum of their own derivatives."""
     for order in orders:
-        for key, found in derivative(*order).items():
+        for key, found in losses.gradient(*order).items():
             parts = [alone[name][key] for name in order]
             sizes = [np.abs(part).max() for part in parts]
             error, least = np.abs(found - sum(parts)).max(), min(size for size in sizes if size)
@@ -281,21 +236,12 @@ def check_additive(
             assert not wrong, f"{key}: {', then '.join(order)}: off by {error:.1e}, gradients {sizes}"
 
 
-def all_at_once(names: list[str]) -> list[tuple[str, ...]]:
-    """Two orders, in which each of the names comes before each other one."""
-    return [tuple(names), tuple(reversed(names))]
-
-
 @pytest.mark.parametrize("threads", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_gradients_of_losses_add(losses: Losses, threads: int, set_threads: Callable[[int], None]) -> None:
+    """In two orders, in which each loss comes before each other one."""
     set_threads(threads)
-    check_additive(losses.gradient, losses.gradients, all_at_once([*losses.terms]))
-
-
-@pytest.mark.slow
-def test_tangents_of_losses_add(losses: Losses) -> None:
-    alone = {name: losses.tangent(name) for name in losses.terms}
-    check_additive(losses.tangent, alone, all_at_once([*losses.terms]))
+    names = (*losses.terms,)
+    check_additive(losses, losses.gradients, [names, names[::-1]])
 
 
 def test_gradients_of_every_pair_of_losses_add(set_threads: Callable[[int], None]) -> None:
@@ -305,7 +251,7 @@ def test_gradients_of_every_pair_of_losses_add(set_threads: Callable[[int], None
     for key in ("integrator.albedo", "integrator.roughness", "integrator.light"):
         losses.keys = [key]
         alone = {name: losses.gradient(name) for name in losses.terms}
-        check_additive(losses.gradient, alone, [*permutations(losses.terms, 2)])
+        check_additive(losses, alone, [*permutations(losses.terms, 2)])
 
 
 def test_every_parameter_has_a_gradient(losses: Losses) -> None:

@@ -1,8 +1,6 @@
 """Every two values of any two options in some image: the float64 reference's, with its derivatives.
 
-Without `-m slow`, only enough of the cases to have each value once. Rays beyond the mirror ray are no option
-here, because the reference does not trace them. `-k "[17]"` runs case 17 alone. With `--hypothesis-profile
-thorough`, every three values of any three options.
+Without `-m slow`, each value once; with `--hypothesis-profile thorough`, every three values of three options.
 """
 
 from __future__ import annotations
@@ -20,20 +18,18 @@ import pytest
 from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.reference.models import MODELS as REFERENCE_MODELS
 from mi_refgs.render.load_scene import reason
+from mi_refgs.shade.options import QUALITY, TRACED
 from mi_refgs.shade.reflectance import MODELS
 from tests.laws.covering import Case, combinations_of, completed, covering_array, marked
-from tests.laws.option_cases import DIMENSIONS, RULES, spec, unlisted_accuracy
+from tests.laws.option_cases import ACCURACY, DIMENSIONS, RULES, spec
 from tests.laws.option_oracle import Oracle
 from tests.laws.option_scenes import AROUND, Built, Values, build, values
 
 SEED = 3
-IMAGE = 3e-4
-"""Largest error of a pixel, relative to its channel's largest value, and 1 at least."""
-DERIVATIVE = 5e-3
-"""Largest error of a derivative, relative to a channel's largest; of a sum, to the root of its squares."""
+IMAGE = 3e-4  # largest error of a pixel, relative to its channel's largest value, and 1 at least
+DERIVATIVE = 5e-3  # of a derivative, relative to a channel's largest; of a sum, to the root of its squares
 STEP = 1e-6  # of central differences of the reference, in units of normal numbers
-KEPT = 0.75
-"""Share of the pixels outside the reference's declared discontinuities, at least."""
+KEPT = 0.75  # share of the pixels outside the reference's declared discontinuities, at least
 GROUPS = {
     "position": "shape", "rotation": "shape", "scale": "shape", "opacity": "shape",
     "background": "background", "light": "light", "data": "light", "radiance": "light",
@@ -48,20 +44,14 @@ def cases(strength: int = 2) -> list[Case]:
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "case" in metafunc.fixturenames:
-        thorough = metafunc.config.getoption("--hypothesis-profile") == "thorough"
-        found = cases(3 if thorough else 2)
-        params = [
-            pytest.param(case, id=str(i), marks=m)
-            for i, (case, m) in enumerate(zip(found, marked(found), strict=True))
-        ]
-        metafunc.parametrize("case", params)
+        found = cases(3 if metafunc.config.getoption("--hypothesis-profile") == "thorough" else 2)
+        pairs = enumerate(zip(found, marked(found), strict=True))
+        metafunc.parametrize("case", [pytest.param(case, id=str(i), marks=m) for i, (case, m) in pairs])
 
 
 def group(name: str) -> str:
     """Values that are moved together."""
-    if name.startswith(AROUND):
-        return "surroundings"
-    return GROUPS.get(name, "materials")
+    return "surroundings" if name.startswith(AROUND) else GROUPS.get(name, "materials")
 
 
 def test_images_and_derivatives_of_all_pairs_of_options(case: Case, tmp_path: Path, set_threads: Any) -> None:
@@ -79,7 +69,7 @@ def check(case: Case, folder: Path) -> None:
     expected, kept = oracle.image(first), ~oracle.undecided()
     assert kept.mean() > KEPT
     samples = 0 if case["input"] == "xml" else case["samples"]
-    moving = [name for name in built.parameters if differentiable(case, name)]
+    moving = [n for n in built.parameters if not (n == "data" and case["map"] == "9 x 14")]  # is resampled
     leaves = {} if case["derivative"] == "none" else attached(built, moving)
     with_prior = case["derivative"] == "reverse with a prior"
     prior = sum((total(leaf) for leaf in leaves.values()), mi.Float(0)) if with_prior else mi.Float(0)
@@ -111,7 +101,6 @@ def check(case: Case, folder: Path) -> None:
 
 
 def attached(built: Built, moving: list[str]) -> dict[str, Any]:
-    """Fresh leaves for the values, set in the scene."""
     params = mi.traverse(built.scene)
     keys = {name: built.parameters[name] for name in moving}
     leaves = {name: type(params[key])(dr.detach(params[key])) for name, key in keys.items()}
@@ -129,11 +118,6 @@ def total(leaf: Any) -> Any:
     return dr.sum(dr.gather(mi.Float, leaf.array, dr.arange(mi.UInt32, dr.width(leaf.array))))
 
 
-def differentiable(case: Case, name: str) -> bool:
-    """A map that must be resampled has derivatives by its scale alone."""
-    return not (name == "data" and case["map"] == "9 x 14")
-
-
 def like(leaf: Any, tangent: np.ndarray) -> np.ndarray:
     """A tangent of a value as one of the parameter: of its rows, its inner columns, its constant."""
     if isinstance(leaf, mi.TensorXf):
@@ -147,11 +131,9 @@ def like(leaf: Any, tangent: np.ndarray) -> np.ndarray:
 
 def moved_by(oracle: Oracle, first: Values, tangent: Values) -> np.ndarray:
     """The image's derivative in a direction, by central differences of the reference."""
-    sides = [
-        oracle.image(first | {name: first[name] + sign * STEP * x for name, x in tangent.items()})
-        for sign in (1, -1)
-    ]
-    return (sides[0] - sides[1]) / (2 * STEP)
+    moved = ({n: first[n] + sign * STEP * x for n, x in tangent.items()} for sign in (1, -1))
+    above, below = (oracle.image(first | values) for values in moved)
+    return (above - below) / (2 * STEP)
 
 
 def compare(
@@ -164,7 +146,6 @@ def compare(
 
 
 def test_every_pair_is_there() -> None:
-    """And those that are not, are forbidden."""
     found = {c for case in cases() for c in combinations_of({n: [v] for n, v in case.items()}, 2)}
     for combination in combinations_of(DIMENSIONS, 2):
         allowed = completed(dict(combination), DIMENSIONS, RULES) is not None
@@ -173,7 +154,7 @@ def test_every_pair_is_there() -> None:
 
 
 def test_every_registered_thing_is_an_option() -> None:
-    assert not unlisted_accuracy()
+    assert not {*QUALITY} - {*TRACED} - {*ACCURACY}
     assert {name.partition("/")[0] for name in DIMENSIONS["shading"]} == {*MODELS} <= {*REFERENCE_MODELS}
     assert {*suffixes()} == {
         "albedo", "metallic", "roughness", "tint", "normal", "depth", "alpha", "visibility", "diffuse",
@@ -182,7 +163,6 @@ def test_every_registered_thing_is_an_option() -> None:
 
 
 def test_what_does_not_go_together_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    """Each forbidden combination, in a case that breaks no other rule where there is one."""
     refusals = [rule for rule in RULES if rule.refusal]
     for rule in refusals:
         forbidden = combinations_of({name: DIMENSIONS[name] for name in rule.names}, len(rule.names))

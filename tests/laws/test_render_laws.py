@@ -28,7 +28,7 @@ from tests.laws.law_scenes import (
     Scene,
     random_scene,
     rotated,
-)
+)  # fmt: skip
 from tests.scenes.integrator import plane_mesh, sky
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -36,8 +36,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "at surfels": {"shade_at": "surfel", "diffuse": "irradiance"},
     "colour": {"reflectance": "radiance"},
 }
-ADJOINT = 1e-5
-"""|⟨δ, Jv⟩ - ⟨Jᵀδ, v⟩| over |δ| |Jv|: float32 sums of a few hundred products."""
+ADJOINT = 1e-5  # |⟨δ, Jv⟩ - ⟨Jᵀδ, v⟩| over |δ| |Jv|: float32 sums of a few hundred products
 
 
 def camera(scene: Scene) -> dict[str, Any]:
@@ -62,7 +61,6 @@ def picture(*arguments: Any, **changes: Any) -> np.ndarray:
 
 
 def envmap(radiance: np.ndarray, turn: np.ndarray | None = None) -> dict[str, Any]:
-    """An emitter of a map (h, 2h, 3), turned by a rotation matrix."""
     to_world = np.eye(4)
     to_world[:3, :3] = np.eye(3) if turn is None else turn
     bitmap = mi.Bitmap(np.ascontiguousarray(radiance, np.float32))
@@ -71,7 +69,6 @@ def envmap(radiance: np.ndarray, turn: np.ndarray | None = None) -> dict[str, An
 
 @cache
 def shared(setting: str) -> mi.Scene:
-    """A scene whose parameters the examples replace."""
     light = EnvironmentLight.from_radiance(sky(LIGHT_ROWS)).raw
     with TemporaryDirectory() as folder:
         mesh = {"mesh": plane_mesh(Path(folder))} if "mesh" in setting else {}
@@ -115,7 +112,6 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
 
 @given(scene=SCENES, seed=SEEDS)
 def test_the_world_has_no_preferred_direction(scene: Scene, seed: int) -> None:
-    """Surfels, camera and light turned together by any rotation."""
     turn = Rotation.random(random_state=seed)
     still = picture(scene, envmap(sky(LIGHT_ROWS)), diffuse="irradiance")
     turned = picture(rotated(scene, turn), envmap(sky(LIGHT_ROWS), turn.as_matrix()), diffuse="irradiance")

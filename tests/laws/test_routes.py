@@ -1,8 +1,6 @@
 """One image by every route: whichever way a scene is rendered, its image and every AOV are the same.
 
-Routes, states of a scene and features are lists that the test crosses: every shading of every method and of
-every registered reflectance model goes through every route, and every pair of the other features occurs;
-without `-m slow`, only enough of the cases to have each model and feature once.
+Every shading of every method and model goes through every route, and every pair of the other features occurs;
 """
 
 from __future__ import annotations
@@ -55,14 +53,10 @@ from tests.scenes.integrator import (
 )
 
 WIDTH, HEIGHT, FOV, NEAR = 16, 12, 40.0, 0.05
-CROP = (4, 3, 9, 7)
-"""Offset and size of a crop window, pixels."""
+CROP = (4, 3, 9, 7)  # offset and size of a crop window, pixels
 TOLERANCE = 1e-5  # of an image or an AOV, in parts of its largest value, at least 1
 
-Maps = dict[str, np.ndarray]
-"""The image (H, W, 4) as IMAGE, linear and premultiplied, and AOVs (H, W, C) by type."""
-
-
+Maps = dict[str, np.ndarray]  # the image (H, W, 4) as IMAGE, linear and premultiplied; AOVs (H, W, C) by type
 # ---------------- what is rendered ----------------
 
 
@@ -89,7 +83,6 @@ SHADINGS = shadings()
 
 
 def sensor(crop: bool = False) -> Any:
-    """The sensor of every scene."""
     film: dict[str, Any] = {"type": "hdrfilm", "pixel_format": "rgba", "component_format": "float32"}
     film |= {"width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}} | (window() if crop else {})
     to_world = mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1])
@@ -98,7 +91,6 @@ def sensor(crop: bool = False) -> Any:
 
 
 def window() -> dict[str, int]:
-    """The crop window, as a film has it."""
     return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), CROP, strict=True))
 
 
@@ -144,7 +136,6 @@ class Case:
 
     @property
     def names(self) -> list[str]:
-        """The AOVs that the surfels have."""
         channels = self.made.trained.surfels.raw
         return [name for name in suffixes() if name in channels or name in GEOMETRY]
 
@@ -155,9 +146,6 @@ class Case:
 
 
 GEOMETRY = ("normal", "depth", "alpha", "visibility", "diffuse", "specular", "indirect")
-
-
-# ---------------- routes ----------------
 
 
 def by_reconstruction(case: Case) -> Maps:
@@ -172,7 +160,6 @@ def by_its_mitsuba_scene(case: Case) -> Maps:
 
 
 def by_scene_file(case: Case) -> Maps:
-    """The image of `mi.load_file` without AOVs; and those."""
     path = case.folder / SCENE
     maps = of_mitsuba(load_scene(path, case.names, case.alone), 0, case)
     scene = load_scene(path, object_only=True) if case.alone else mi.load_file(str(path))
@@ -240,7 +227,6 @@ ROUTES: tuple[Callable[[Case], Maps], ...] = (
     by_viewer_of_a_run,
     by_layers,
 )
-"""Every way to an image; the first one is compared with all others."""
 
 
 def of_mitsuba(scene: Any, view: Any, case: Case) -> Maps:
@@ -252,7 +238,6 @@ def of_mitsuba(scene: Any, view: Any, case: Case) -> Maps:
 
 
 def of_command(case: Case, scene: Path, *more: object) -> Maps:
-    """What `refgs render` writes."""
     path = case.scratch / "out.exr"
     command = ["render", scene, "-o", path, "--samples", case.samples, "--aov", *case.names, *more]
     assert main([str(word) for word in [*command, *(["--object"] if case.alone else [])]]) == 0
@@ -261,7 +246,6 @@ def of_command(case: Case, scene: Path, *more: object) -> Maps:
 
 
 def of_layers(layers: dict[str, np.ndarray], names: Sequence[str]) -> Maps:
-    """AOVs of an EXR file, whose channels are NAME.LETTER."""
     found: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for key in sorted(layers, key=lambda key: "RGBXYZ".find(key[-1])):
         if (name := key.partition(".")[0]) in found:
@@ -269,11 +253,7 @@ def of_layers(layers: dict[str, np.ndarray], names: Sequence[str]) -> Maps:
     return {name: np.stack(values, axis=-1) for name, values in found.items()}
 
 
-# ---------------- states ----------------
-
-
 def run_of(made: Reconstruction, folder: Path) -> Path:
-    """A run folder of a reconstruction, seen by the sensor of all scenes."""
     save(made.trained, folder, made.method, Camera.from_sensor(sensor()))
     return folder
 
@@ -288,14 +268,12 @@ def saved_and_loaded(made: Reconstruction, scratch: Path) -> tuple[Reconstructio
 
 
 def exported(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
-    """By `refgs export -o`, whose folder is no run."""
     run, out = run_of(made, scratch / "fitted"), scratch / "exported"
     assert main(["export", str(run), "-o", str(out)]) == 0
     return made.changed(TrainedScene.read(out)), out
 
 
 def edited(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
-    """In memory, and by `refgs edit`."""
     run, out = run_of(made, scratch / "fitted"), scratch / "edited"
     changes = ["--where", "x > 0.2", "--set", "opacity*=0.5"]
     assert main(["edit", str(run), "-o", str(out), *changes]) == 0
@@ -324,7 +302,6 @@ FEATURES: dict[str, tuple[Any, ...]] = {
     "meshed": (False, True),
     "state": STATES,
 }
-
 
 ROWS = covering_array(FEATURES, (), seed=5)
 

@@ -23,7 +23,7 @@ from tests.laws.law_scenes import (
     draw,
     gradients,
     random_scene,
-)
+)  # fmt: skip
 
 EXACT = 2e-6  # between images of the same float32 arithmetic, but for fused operations and equal sums' order
 GRADIENT = 1e-4  # relative L2 between gradients: sums by scatter come in any order
@@ -32,7 +32,6 @@ BOTH = pytest.mark.parametrize("shading", SHADINGS, ids=("pixel", "surfel"))
 
 
 def assert_same_rows(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
-    """Gradients by channel."""
     for name, values in a.items():
         assert np.linalg.norm(values - b[name]) <= GRADIENT * np.linalg.norm(b[name]) + 1e-7, name
 
