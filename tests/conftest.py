@@ -35,10 +35,7 @@ settings.register_profile(
 settings.register_profile("thorough", settings.get_profile("mi_refgs"), max_examples=400, derandomize=False)
 settings.load_profile("mi_refgs")
 
-THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)
-"""Tests let Mitsuba read EXR files, on machines of one core too."""
-
-
+THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)  # Mitsuba must be able to read EXR files
 LONGEST = (
     "test_tutorials.py",
     "test_additive_gradients.py",
@@ -87,11 +84,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def llvm_ad_rgb() -> Iterator[None]:
-    """Set variant and threads; afterwards wait for kernels, restore the flags, return the test's memory.
-
-    Compiled kernels and registered objects stay: module-scoped fixtures hold scenes, and recompiling costs
-    most of a test's time.
-    """
+    """Set variant and threads; afterwards wait for kernels, restore flags, return memory; kernels stay."""
     mi.set_variant("llvm_ad_rgb")
     if dr.thread_count() != THREADS:  # a command was run with --threads
         dr.set_thread_count(THREADS)

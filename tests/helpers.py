@@ -30,10 +30,10 @@ ROOT = Path(__file__).parents[1]
 def refused(
     action: Sequence[object] | Callable[[], object], *words: object, error: type[Exception] = InputError
 ) -> str:
-    """Require that a command or a call refuses its input; return the message, which contains all `words`.
+    """Require that a command (its arguments) or a call refuses its input; the message contains all `words`.
 
-    A command (its arguments) exits with code 2, prints nothing on stdout, and ends stderr with one sentence
-    that names the remedy. A call raises `error`, or an error of Mitsuba that it caused.
+    A command exits with code 2, prints nothing on stdout, and names the remedy in one sentence. A call raises
+    `error`, or an error of Mitsuba that it caused.
     """
     if callable(action):
         with pytest.raises(Exception) as info:
@@ -58,12 +58,10 @@ def refused(
 
 
 def command_names() -> list[str]:
-    """Return the commands of `refgs`."""
     return [name for group in COMMANDS.values() for name in group]
 
 
 def command_options(command: str | type) -> list[str]:
-    """Return the arguments and options of a command, as `data` and `--output`."""
     kind = command_class(command)[0] if isinstance(command, str) else command
     hints, found = get_type_hints(kind, include_extras=True), []
     for field in fields(kind):
@@ -119,10 +117,7 @@ def run_process(
     environment: Mapping[str, str | None] | None = None,
     seconds: float = 300,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a program, by default Python, in a fresh process, where Python finds mi_refgs below `package`.
-
-    environment: variables that it has, or with None has not, unlike this process.
-    """
+    """Run a program, by default Python, in a fresh process, with these variables, or without where None."""
     variables = {**os.environ, "PYTHONPATH": str(package), **(environment or {})}
     return subprocess.run(
         [str(program), *map(str, arguments)],

@@ -28,19 +28,13 @@ BOUNDED = {
     "view": ["view", "RUN", "--port", "0"],
     "dataset": ["dataset", "SCENE", "-o", "OUT"],
 }
-"""Commands that need memory, and arguments with which each is refused where there is none."""
 
 
 @pytest.mark.parametrize("name", BOUNDED)
 def test_a_command_without_memory_is_refused_in_one_sentence(
-    name: str,
-    data: Path,
-    finished: Path,
-    method: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, data: Path, finished: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:
+) -> None:  # fmt: skip
     monkeypatch.setattr(memory, "available", lambda: 0.0)
     monkeypatch.setattr(memory, "resident", lambda: 1e3)
     places = {"DATA": data, "RUN": finished, "OUT": tmp_path, "SCENE": resource_dir("scenes") / "diffuse.xml"}

@@ -27,13 +27,9 @@ def sheet(height: float, scale: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(scale * corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
-def write(path: Path, mesh: Any) -> Path:
-    path.write_bytes(mesh.export(file_type="ply"))
-    return path
-
-
-def occluder(folder: Path, *parts: trimesh.Trimesh) -> Occluder:
-    return Occluder(read_mesh(write(folder / "elsewhere.ply", trimesh.util.concatenate(parts))))
+def occluder(folder: Path, mesh: Any) -> Occluder:
+    (folder / "elsewhere.ply").write_bytes(mesh.export(file_type="ply"))
+    return Occluder(read_mesh(folder / "elsewhere.ply"))
 
 
 def points(rng: np.random.Generator, height: float, scale: float) -> mi.Point3f:
@@ -44,7 +40,7 @@ def points(rng: np.random.Generator, height: float, scale: float) -> mi.Point3f:
 @pytest.mark.parametrize("scale", SCALES)
 def test_two_plates_occlude_each_other(tmp_path: Path, scale: float, rng: np.random.Generator) -> None:
     """Half a unit apart, seen between them and from outside."""
-    both = occluder(tmp_path, sheet(0, scale), sheet(0.5, scale))
+    both = occluder(tmp_path, trimesh.util.concatenate([sheet(0, scale), sheet(0.5, scale)]))
     slanted = vector(UP + 0.3 * rng.normal(size=(200, 3)) * (1, 1, 0))
     up, down = mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, -1)
     assert not np.any(both.visible(points(rng, 0, scale), slanted, up))
@@ -54,9 +50,7 @@ def test_two_plates_occlude_each_other(tmp_path: Path, scale: float, rng: np.ran
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_a_sheet_hides_nothing_from_its_own_points(
-    tmp_path: Path, scale: float, rng: np.random.Generator
-) -> None:
+def test_a_sheet_hides_nothing_from_its_own_points(tmp_path: Path, scale: float, rng: Any) -> None:
     """From either side, and grazing it by 0.006°; from behind it hides what is in front."""
     alone = occluder(tmp_path, sheet(0, scale))
     for side in (UP, -UP):
@@ -70,8 +64,7 @@ def test_a_sheet_hides_nothing_from_its_own_points(
 @pytest.mark.parametrize("scale", SCALES)
 def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, scale: float) -> None:
     ball = trimesh.creation.icosphere(2, 1.0)
-    scaled = trimesh.Trimesh(scale * ball.vertices, ball.faces, process=False)
-    made = Occluder(read_mesh(write(tmp_path / "ball.ply", scaled)))
+    made = occluder(tmp_path, trimesh.Trimesh(scale * ball.vertices, ball.faces, process=False))
     # Surfels that lie flat on the ball do not agree with its normals: the mesh's own must serve.
     count = len(ball.vertices)
     surfels = Surfels.from_numpy(

@@ -35,7 +35,6 @@ SPACE = (np.full(3, -2.0), np.full(3, 2.0))
 
 
 def ring_of_views(count: int) -> list[np.ndarray]:
-    """Cameras above the floor, at two heights, that look at the ball."""
     angle = 2 * np.pi * np.arange(count) / count
     height = np.where(np.arange(count) % 2 == 0, 0.4, 1.5)
     where = np.stack([2 * np.cos(angle), 2 * np.sin(angle), height], axis=1)
@@ -61,15 +60,11 @@ def camera(pose: np.ndarray) -> Camera:
 
 
 def fuse(
-    depths: list[np.ndarray],
-    poses: list[np.ndarray],
-    resolution: int,
-    region: Region | None,
-    box: Any = SPACE,
+    depths: list[np.ndarray], poses: list[np.ndarray], resolution: int, region: Region | None
 ) -> tsdf.TSDF:
     flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
     alpha = [dr.select(d > 0, mi.Float(1), 0) for d in flat]
-    return tsdf.fuse(flat, alpha, map(camera, poses), box, resolution, carve=False, region=region)
+    return tsdf.fuse(flat, alpha, map(camera, poses), SPACE, resolution, carve=False, region=region)
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,7 @@ from mi_refgs.splat import Camera
 from tests.helpers import refused
 
 WIDTH, HEIGHT = 9, 7
-NODES = np.polynomial.legendre.leggauss(2)[0] / 2
-"""The Gauss-Legendre rule's two nodes, pixels from the centre."""
+NODES = np.polynomial.legendre.leggauss(2)[0] / 2  # the Gauss-Legendre rule's two, pixels from the centre
 
 
 def camera(size: int, focal: float) -> Camera:
@@ -53,7 +52,7 @@ def radiance(points: ShadingPoints) -> RadianceTerms:
 
 
 def found(
-    normal: list[mi.Float], alpha: mi.Float, visibility: mi.Float, *, interpolate: bool = True
+    normal: list[mi.Float], alpha: mi.Float, visibility: mi.Float, interpolate: bool = True
 ) -> mi.Color3f:
     view = oblong()
     points = ShadingPoints(mi.Vector3f(*normal), -dr.normalize(view.rays()), visibility=visibility)

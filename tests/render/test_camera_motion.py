@@ -23,8 +23,7 @@ def displaced(eye: Camera, motion: mi.Float) -> Camera:
     return eye.displaced(rotation, mi.Point3f(CENTRE), translation)
 
 
-MOTION = (0.2 * np.array([0.3, -0.5, 0.4, 0.2, 0.3, -0.1])).astype(np.float32)
-"""Where derivatives are taken: far from the pose itself."""
+MOTION = (0.2 * np.array([0.3, -0.5, 0.4, 0.2, 0.3, -0.1])).astype(np.float32)  # far from the pose itself
 
 
 @pytest.mark.parametrize("far", [0.0, 1e4])
@@ -70,7 +69,6 @@ def test_derivatives_of_open_scene_are_those_of_float64(case: tuple[str, str, fl
 
 
 def test_normals_of_depth_turn_with_camera() -> None:
-    """Those of a fixed depth map."""
     rng = np.random.default_rng(4)
     depth = (3 + 0.05 * rng.normal(size=(8, 9))).astype(np.float32).ravel()
     eye = Camera.from_pose(9, 8, -9, -9, 4.5, 4, camera().to_world)

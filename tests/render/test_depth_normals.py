@@ -33,9 +33,8 @@ def test_neighbours_adjoint_is_the_transpose(size: tuple[int, int], rng: np.rand
     plane = mi.Float(rng.normal(size=width * height).astype(np.float32))
     dr.enable_grad(plane)
     out = neighbours(plane, width, height, steps)
-    dr.backward(
-        sum((o * mi.Float(w.astype(np.float32)) for o, w in zip(out, weights, strict=True)), mi.Float(0))
-    )
+    losses_of = (o * mi.Float(w.astype(np.float32)) for o, w in zip(out, weights, strict=True))
+    dr.backward(sum(losses_of, mi.Float(0)))
     np.testing.assert_allclose(np.array(dr.grad(plane)), np.einsum("ki,kij->j", weights, matrix), atol=1e-5)
 
 
@@ -65,8 +64,7 @@ def found_normals(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_depth_normals_of_a_plane_are_exact() -> None:
-    """A plane n · X = 1 has depth 1 / (n · ray) at the pixel centres, and its normal comes back at every
-    pixel."""
+    """A plane n · X = 1 has depth 1 / (n · ray) at the pixel centres, and its normal comes back."""
     fx, fy, cx, cy = INTRINSICS
     plane = np.array([0.1, -0.2, 0.4])
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
@@ -94,8 +92,7 @@ def test_steps_between_surfaces_have_no_normal(rng: np.random.Generator) -> None
 
 @pytest.mark.parametrize("has_background", [False, True])
 def test_normal_consistency_through_the_depth(rng: np.random.Generator, has_background: bool) -> None:
-    """Value and gradients to N, D, A, and the object's share of it, of the whole chain; two holes in the
-    alpha switch their neighbourhoods off."""
+    """Value and gradients to N, D, A, and the object's share, of the whole chain; alpha has holes."""
     alpha = 0.4 + 0.6 * rng.random((HEIGHT, WIDTH, 1))
     alpha[5, 5], alpha[9, 3:6] = 0, 0
     depth = alpha * (3 + 0.3 * rng.random((HEIGHT, WIDTH, 1)))

@@ -59,15 +59,10 @@ def test_large_gaussians_nearby_do_not_cover_all_directions() -> None:
     rng, colour = np.random.default_rng(0), np.array([0.2, 0.5, 0.8])
     beside = directions[[40]]
     colours = np.concatenate([np.broadcast_to(colour, directions.shape), [[1.0, 0.0, 0.0]]])
-    made = init.from_points(
-        CENTRE + np.concatenate([4 * directions, 0.5 * beside]),
-        -np.concatenate([directions, beside]),
-        colours,
-        rng=rng,
-        attributes=["radiance_sh"],
-        opacity=0.99,
-        primitive="gaussian",
-    )
+    directions = np.concatenate([directions, beside])
+    points = CENTRE + np.append(np.full(len(directions) - 1, 4.0), 0.5)[:, None] * directions
+    how = {"attributes": ["radiance_sh"], "opacity": 0.99, "primitive": "gaussian"}
+    made = init.from_points(points, -directions, colours, rng=rng, **how)  # type: ignore[arg-type]
     raw = made.to_numpy()
     raw["scale"][:] = np.log(0.7)
     raw["scale"][-1] = np.log(0.25)

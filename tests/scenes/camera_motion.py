@@ -29,10 +29,7 @@ def rotation_of(motion: mi.Float) -> tuple[mi.Matrix3f, mi.Vector3f]:
 
 
 def require_slopes(total: Any, define: Any, at: np.ndarray, tolerance: float = 2e-3) -> None:
-    """The gradient of `total`, and its forward derivative, are the differences of `define` at (K,) values.
-
-    `tolerance`: relative to the largest difference; the forward derivative sums up to three of them.
-    """
+    """The gradient of `total`, and its forward derivative, are the differences of `define` at (K,) values."""
     exact = at.astype(np.float64)
     sides = [[define(exact + sign * STEP * axis) for sign in (1, -1)] for axis in np.eye(len(at))]
     expected = np.array([(above - below) / (2 * STEP) for above, below in sides])

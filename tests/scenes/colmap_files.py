@@ -12,16 +12,12 @@ from mi_refgs.data.colmap_model import MODELS
 
 
 class ColmapCamera(NamedTuple):
-    """A camera model with its parameters."""
-
     model: str
     size: tuple[int, int]  # width, height
     values: tuple[float, ...]
 
 
 class ColmapImage(NamedTuple):
-    """An image and its pose, from the world to the camera."""
-
     name: str
     camera: int
     quaternion: Sequence[float]  # w, x, y, z
@@ -33,7 +29,6 @@ Model = tuple[Mapping[int, ColmapCamera], Sequence[ColmapImage], np.ndarray, np.
 
 
 def colmap_text(model: Model) -> dict[str, bytes]:
-    """Contents of cameras, images and points3D; every second image sees points."""
     cameras, images, points, colours = model
     lines = ["# comment"]
     for number, camera in cameras.items():

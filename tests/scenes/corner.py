@@ -19,21 +19,17 @@ from mi_refgs.shade.reflection import reflection
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import unit, vector
 
-VOXEL = 1e-4
-"""So small that the offset of the rays' origins does not matter."""
+VOXEL = 1e-4  # so small that the offset of the rays' origins does not matter
 FLOOR, WALL, EYE = 2.0, 1.5, np.array([1.4, 1.2, 0.3])
 """A floor (y = 0) of depth FLOOR and twice that width, a wall (x = 0) WALL high on it, and the camera."""
-LOW_EYE = np.array([1.4, 0.3, 0.3])
-"""A camera whose mirror rays in the floor are so flat that they meet several walls of a `channel`."""
+LOW_EYE = np.array([1.4, 0.3, 0.3])  # its mirror rays are so flat that they meet several walls of a `channel`
 WALL_COLOUR = (0.9, 0.6, 0.3)
 
 
 def corner(cells: int = 8) -> Mesh:
     """Two plates that meet in a concave edge, each of cells² × 2 triangles; seen from the open side."""
-    grid = np.stack(
-        np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(-1, 1, cells + 1), indexing="ij"), -1
-    )
-    u, z = grid.reshape(-1, 2).T
+    axes = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(-1, 1, cells + 1), indexing="ij")
+    u, z = (axis.ravel() for axis in axes)
     index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]
     faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])

@@ -1,8 +1,4 @@
-"""Dots in space as cameras see them, for readers: a flipped axis or half a pixel moves them.
-
-Cameras follow OpenCV (x right, y down, z forward); the image of a point is (fx x/z + cx, fy y/z + cy), where
-(½, ½) is the centre of the first pixel.
-"""
+"""Dots in space as cameras of OpenCV's axes see them: a flipped axis or half a pixel moves them."""
 
 from __future__ import annotations
 

@@ -71,7 +71,6 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
 
 
 def small_method(folder: Path) -> Method:
-    """The method METHOD, by a file in this folder."""
     path = folder / "small.toml"
     path.write_text(METHOD)
     return load_resolved(path)

@@ -53,9 +53,8 @@ def integrator(raw: dict[str, np.ndarray] | None = None, **changes: object) -> d
 def scene(
     camera: dict | None = None, raw: dict[str, np.ndarray] | None = None, **changes: object
 ) -> mi.Scene:
-    return mi.load_dict(
-        {"type": "scene", "integrator": integrator(raw, **changes), "sensor": camera or sensor()}
-    )
+    inner = integrator(raw, **changes)
+    return mi.load_dict({"type": "scene", "integrator": inner, "sensor": camera or sensor()})
 
 
 def lit_scene(emitter: dict | None, **changes: object) -> mi.Scene:
@@ -79,7 +78,6 @@ def wall(scale: float = 1) -> Mesh:
 
 
 def plane_mesh(folder: Path) -> str:
-    """The file of `wall`."""
     path = folder / "mesh.ply"
     write_mesh(path, wall())
     return str(path)
@@ -96,18 +94,13 @@ def hollow_mesh(folder: Path) -> str:
     return str(path)
 
 
-STEPS = (2e-3, 2e-4)
-"""Widths of differences; the better one counts: rounding spoils the small one, curvature the large one."""
-JUMP = 0.1
-"""Part of the root mean square of the differences: where the two sides differ by more, a surfel has crossed
-the cut at α = 1/255, another surfel of its tile, or the kink of a lookup: there is no derivative."""
-MAX_LEFT_OUT = 0.2
-"""Share of the seen pixels in which that may happen; observed up to 2 % at the better step."""
+STEPS = (2e-3, 2e-4)  # of differences; the better one counts: rounding, or curvature
+JUMP = 0.1  # of their root mean square: where the two sides differ by more, there is no derivative
+MAX_LEFT_OUT = 0.2  # share of the seen pixels in which that may happen; observed up to 2 %
 TANGENT_TOLERANCE = 5e-3  # relative L2; observed 8e-5 … 3e-3
 
 
 def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
-    """Derivatives of mi.render with respect to a parameter; see `check_image_derivatives`."""
     params = mi.traverse(of)
     base = params[key].numpy().copy()  # a view: the parameter is about to be overwritten in place
 
@@ -120,10 +113,7 @@ def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
 
 
 def check_image_derivatives(rendered: Callable[[Any], mi.TensorXf], base: np.ndarray, name: str) -> None:
-    """Forward mode against central differences of images, and reverse mode against forward mode.
-
-    `rendered` returns the image for a tensor of values like `base`.
-    """
+    """Forward mode of a tensor like `base` against central differences of images, reverse against forward."""
     rng = np.random.default_rng(3)
     v = (rng.uniform(0.5, 1, base.shape) * rng.choice([-1, 1], base.shape)).astype(np.float32)
 
@@ -192,13 +182,9 @@ def two_balls() -> Mesh:
 
 
 OTHER_OPTIONS: dict[str, Any] = {
-    "dominant": True,
-    "visibility_rays": 3,
-    "traced_bounces": 1,
-    "ambient_rays": 16,
-    "directions": 5,
+    "dominant": True, "visibility_rays": 3, "traced_bounces": 1, "ambient_rays": 16, "directions": 5,
     "antialias": True,
-}
+}  # fmt: skip
 """A value for each option that is not its default."""
 
 

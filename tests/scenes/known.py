@@ -53,16 +53,16 @@ def write_known_data(folder: Path, spp: int = 64) -> Path:
         '<transform name="to_world"><rotate x="1" angle="90"/></transform></emitter>'
         f"{''.join(balls)}</scene>"
     )
+    spec = {
+        "views": 2,
+        "test_views": 3,
+        "size": SIZE,
+        "spp": spp,
+        "environment_height": 32,
+        "progress": False,
+    }
     return make_dataset(
-        folder / "balls.xml",
-        folder / "data",
-        views=2,
-        test_views=3,
-        size=SIZE,
-        spp=spp,
-        environment_height=32,
-        relight=[folder / "dusk.exr"],
-        progress=False,
+        folder / "balls.xml", folder / "data", relight=[folder / "dusk.exr"], progress=False, **spec
     )
 
 
@@ -121,10 +121,8 @@ def write_known_run(data: Path, folder: Path, **shading: Any) -> Run:
     """The run that has found everything: true materials, surface and light; `shading` as in `Shading`."""
     run = Run(folder)
     run.create(load("ref_gaussian", "quick"), str(data))
-    mesh = known_mesh()
     chosen: dict[str, Any] = {"diffuse": "irradiance", "occlusion": True} | shading
-    wanted = Shading(**chosen)
     light = EnvironmentLight.from_file(data / "environment.exr")
-    scene = TrainedScene(known_surfels(), light, mesh, wanted, 1, 0.0)
+    scene = TrainedScene(known_surfels(), light, known_mesh(), Shading(**chosen), 1, 0.0)
     export(scene, run.path, read_dataset(data, "test").views[0].camera())
     return run

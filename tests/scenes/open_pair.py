@@ -26,8 +26,7 @@ from tests.scenes.integrator import scattered_discs
 FAR, NEAR = 0.0, 0.25  # 1 / distance of what the light shows
 CASES = [("pixel", "irradiance", NEAR, "surfel"), ("surfel", "sh", FAR, "gaussian")]
 CENTRE = np.array([0.2, -0.1, 0.3])  # the point from which the light shows it
-MAPS = ["radiance", "alpha", "depth", "normal", "object_alpha", "albedo", "metallic", "roughness"]
-MAPS += ["background"]
+MAPS = "radiance alpha depth normal object_alpha albedo metallic roughness background".split()
 
 
 @dataclass(frozen=True)
@@ -62,9 +61,7 @@ class Pair:
         pixels = np.arange(self.case.camera.width * self.case.camera.height)
         return exact.product_order(self.case, pixels, self.around)
 
-    def truth(
-        self, values: dict[str, np.ndarray], pose: np.ndarray | None = None
-    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def truth(self, values: dict[str, np.ndarray], pose: np.ndarray | None = None) -> tuple[Any, np.ndarray]:
         """Maps and band in float64, from the camera's own pose or another (4, 4)."""
         case = replace(self.case, raw={n: values[n] for n in self.case.raw})
         if pose is not None:

@@ -1,5 +1,4 @@
-"""Photographs of a patterned block on a patterned ground, ray traced in NumPy, with the cameras that took
-them."""
+"""Photographs of a patterned block on a patterned ground, ray traced in NumPy, with their cameras."""
 
 from __future__ import annotations
 
@@ -12,8 +11,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates, zoom
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 260.0
-BLOCK = np.array([0.7, 0.5, 0.8])
-"""Half widths and the height of the block, whose bottom is at z = 0."""
+BLOCK = np.array([0.7, 0.5, 0.8])  # half widths and the height, whose bottom is at z = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +32,6 @@ def around(count: int, arc: float = 120.0, radius: float = 3.2, height: float = 
 
 
 def look(origin: np.ndarray, target: tuple[float, float, float] = (0.0, 0.0, 0.35)) -> Shot:
-    """A level camera."""
     forward = np.array(target) - origin
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1.0])
@@ -71,9 +68,8 @@ def photograph(shot: Shot, k1: float = 0.0, samples: int = 1) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (level - shot.origin[axis]) / direction[:, axis]
             hit = shot.origin + distance[:, None] * direction
-            inside = (abs(hit[:, :2]) <= (half or BLOCK[:2] + 1e-9)).all(axis=1) & (
-                hit[:, 2] < BLOCK[2] + 1e-9
-            )
+            inside = (abs(hit[:, :2]) <= (half or BLOCK[:2] + 1e-9)).all(axis=1)
+            inside &= hit[:, 2] < BLOCK[2] + 1e-9
             inside &= (hit[:, 2] > -1e-9) & (distance > 0) & (distance < nearest)
         a, b = (hit[inside][:, i] for i in range(3) if i != axis)
         texture = PATTERNS[pattern]

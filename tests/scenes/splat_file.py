@@ -33,7 +33,6 @@ def ball_columns(**values: float) -> dict[str, np.ndarray]:
 
 
 def write_ball(path: Path, **values: float) -> Path:
-    """The file of `ball_columns`."""
     path.write_bytes(ply_bytes(ball_columns(**values)))
     return path
 

@@ -18,9 +18,7 @@ from mi_refgs.reference.footprint import Rules
 from mi_refgs.splat import Camera, Composited, TileLists, list_by_tile, project, splat
 from mi_refgs.surfels.table import Surfels
 
-MAX_LEFT_OUT = 0.05
-"""Share of the covered pixels that may lie in the band around declared discontinuities."""
-
+MAX_LEFT_OUT = 0.05  # share of the covered pixels that may lie in the band around declared discontinuities
 PARAMETERS = ("position", "rotation", "scale", "opacity", "features")
 
 
@@ -75,8 +73,7 @@ def make_scene(seed: int) -> Scene:
 
 
 def make_gaussians(seed: int) -> Scene:
-    """The surfels of `make_scene` with a third axis, needles and pancakes among them, and some whose centres
-    lie beside the image."""
+    """The surfels of `make_scene` with a third axis: needles, pancakes, centres beside the image."""
     scene = make_scene(seed)
     rng, count = np.random.default_rng(seed + 7), len(scene.features)
     scale = np.concatenate([scene.raw["scale"], np.log(rng.uniform(0.005, 0.4, (count, 1)))], axis=1)
@@ -113,16 +110,14 @@ def check_image(scene: Scene, tolerance: float) -> None:
 
 
 def outside_band(maps: reference.Maps) -> np.ndarray:
-    """Pixels (H, W) away from the declared discontinuities: nearly all that are covered, or a test of them
-    would prove little. Observed: at least 96 %."""
+    """Pixels (H, W) away from the declared discontinuities: nearly all that are covered; observed: 96 %."""
     covered = maps.alpha > 0
     assert np.count_nonzero(maps.band & covered) <= MAX_LEFT_OUT * np.count_nonzero(covered)
     return ~maps.band
 
 
 def loss_weights(scene: Scene, seed: int) -> np.ndarray:
-    """Random weights (H, W, 6), zero in the declared band: a step of the differences changes α by up to 3e-4
-    of it."""
+    """Random weights (H, W, 6), zero in the declared band, where differences step across."""
     keep = outside_band(reference.splat(scene.raw, scene.features, scene.camera))
     weights = np.random.default_rng(seed + 100).normal(size=(*keep.shape, 6))
     return np.where(keep[..., None], weights, 0).astype(np.float32).astype(np.float64)
@@ -146,7 +141,7 @@ def fast_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """Derivatives of Σ weights · maps in float64: complex steps of the footprints, sums of compositing."""
+    """Derivatives of Σ weights · maps in float64."""
     adjoints = np.moveaxis(weights, 2, 0).reshape(6, -1)
     return reference.differentiate(scene.raw, scene.features, scene.camera, adjoints)
 
@@ -211,10 +206,7 @@ def check_degenerate(scene: Scene, case: str) -> None:
 
 
 def check_lists(scene: Scene, primitive: Any, most: float) -> TileLists:
-    """Every surfel-tile pair with a pixel at α ≥ ALPHA_MIN is listed once, and at most `most` times as many.
-
-    `primitive`: the module of the footprint in float64. Pairs at the threshold itself may be absent.
-    """
+    """Every surfel-tile pair with a pixel at α ≥ ALPHA_MIN is listed once, at most `most` times as many."""
     camera = scene.fast_camera()
     lists = list_by_tile(project(scene.surfels(), camera), camera)
     begin, end, surfel = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))

@@ -44,14 +44,12 @@ SETTINGS = ["iterations=6", "surfels.count=80", "surfels.max_count=100", "previe
 
 
 def write_method(folder: Path) -> Path:
-    """The method as `tiny.toml` in a folder."""
     path = folder / "tiny.toml"
     path.write_text(METHOD)
     return path
 
 
 def train_command(data: Path, run: Path, method: Path, *more: str) -> list[str]:
-    """Arguments of `refgs train` for the two."""
     options = ["--method", str(method), "--preset", "quick", *more]
     return ["train", str(data), "-o", str(run), *options, "--set", *SETTINGS]
 

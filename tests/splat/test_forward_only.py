@@ -75,7 +75,6 @@ CASES: dict[str, tuple[Shading, dict[str, Any]]] = {
     "tiles of 4 × 4": (TRACED, {}),
     "at surfels": (replace(IRRADIANCE, at="surfel"), {}),
     "Gaussians at pixels": (IRRADIANCE, {"gaussians": True}),
-    "Gaussians at surfels": (replace(IRRADIANCE, at="surfel"), {"gaussians": True}),
     "surroundings": (IRRADIANCE, {"around": True}),
     "surroundings at surfels": (replace(IRRADIANCE, at="surfel"), {"around": True}),
     "lobe samples of the pixel": (replace(IRRADIANCE, occlusion=True, visibility_rays=4), {}),
@@ -88,9 +87,8 @@ CASES: dict[str, tuple[Shading, dict[str, Any]]] = {
 def test_forward_only_image_is_the_same(case: str) -> None:
     shading, more = CASES[case]
     near = scattered_discs()
-    others = Surroundings(
-        Surfels.from_numpy(near | {"position": 3 * near["position"]}), EnvironmentLight.from_radiance(sky())
-    )
+    far = Surfels.from_numpy(near | {"position": 3 * near["position"]})
+    others = Surroundings(far, EnvironmentLight.from_radiance(sky()))
     view = camera_at(more.get("focal", 30.0), more.get("offset", (0, 0)))
     assert_same(*both(things("gaussians" in more), view, shading, others if "around" in more else None))
 
@@ -109,7 +107,6 @@ def test_nothing_in_view_is_black() -> None:
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
 @pytest.mark.parametrize("name", ["", *sorted(ALL)])
 def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And blends no more channels than that takes."""
     composite, blended = splat.composite_compact, []
 
     def counted(lists: splat.TileLists, depth: bool) -> Any:

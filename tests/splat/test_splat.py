@@ -31,7 +31,7 @@ from tests.scenes.splats import (
     loss_weights,
     make_gaussians,
     make_scene,
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,12 @@ PRIMITIVES = [
     Primitive("gaussian", make_gaussians, Gaussian, 1e-5, 1e-3),  # observed 2e-6
 ]
 BOTH = pytest.mark.parametrize("kind", PRIMITIVES, ids=str)
-MANY = pytest.mark.parametrize(
-    "seed",
-    [seed if seed in range(0, 20, 3) else pytest.param(seed, marks=pytest.mark.slow) for seed in range(60)],
-)
-EVERY_TILE = pytest.mark.parametrize(
-    "tile", [size for _, size in constants.TILE_SIZES], indirect=True, ids=str
-)
+SEEDS = [
+    seed if seed in range(0, 20, 3) else pytest.param(seed, marks=pytest.mark.slow) for seed in range(60)
+]
+MANY = pytest.mark.parametrize("seed", SEEDS)
+TILES = [size for _, size in constants.TILE_SIZES]
+EVERY_TILE = pytest.mark.parametrize("tile", TILES, indirect=True, ids=str)
 
 
 @pytest.fixture
@@ -113,10 +112,7 @@ def test_degenerate_rows_stay_finite(kind: Primitive, case: str) -> None:
 def test_tile_lists_hold_what_contributes_and_little_else(
     kind: Primitive, seed: int, thinness: float
 ) -> None:
-    """Every pair of a footprint and a tile with a pixel at α ≥ ALPHA_MIN is listed, and few others.
-
-    Needles too, whose ellipses have matrices with next to no determinant.
-    """
+    """Every pair with a pixel at α ≥ ALPHA_MIN is listed, needles' too, and few others."""
     scene = kind.make(seed)
     scene.raw["scale"][:, 0] += 2 * (thinness < 1)
     scene.raw["scale"][:, 1] += np.log(thinness)
@@ -194,12 +190,9 @@ def test_second_view_compiles_nothing() -> None:
 
 def full_screen(count: int, size: int) -> tuple[Surfels, Camera]:
     """Large discs, parallel to the image, each on every tile."""
-    raw = {
-        "position": np.stack([0 * np.arange(count), 0 * np.arange(count), np.linspace(2, 3, count)], axis=1),
-        "rotation": np.tile([0.0, 0, 0, 1], (count, 1)),
-        "scale": np.full((count, 2), 4.0),
-        "opacity": np.zeros((count, 1)),
-    }
+    none, z = 0 * np.arange(count), np.linspace(2, 3, count)
+    raw = {"position": np.stack([none, none, z], axis=1), "rotation": np.tile([0.0, 0, 0, 1], (count, 1))}
+    raw |= {"scale": np.full((count, 2), 4.0), "opacity": np.zeros((count, 1))}
     return Surfels.from_numpy(raw), Camera.from_pose(size, size, -500, -500, size / 2, size / 2, np.eye(4))
 
 

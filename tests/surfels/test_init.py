@@ -75,7 +75,6 @@ def test_random_normals_are_uniform(rng: np.random.Generator) -> None:
 
 
 def test_attribute_starts_at_its_activated_value(rng: np.random.Generator) -> None:
-    """Whatever the activation; a size that is none is refused."""
     activate: dict[Any, Callable[..., np.ndarray]] = {
         "exp": np.exp, "sigmoid": sigmoid, "identity": np.asarray
     }  # fmt: skip
@@ -92,7 +91,6 @@ def test_attribute_starts_at_its_activated_value(rng: np.random.Generator) -> No
 
 
 def test_harmonics_start_with_a_constant_part(rng: np.random.Generator) -> None:
-    """0.4 from everywhere: the constant coefficient times Y_0, and nothing beside it."""
     surfels = init.from_points(rng.random((5, 3)), rng=rng, degree={"indirect_sh": 1}, indirect_sh=0.4)
     raw = surfels.to_numpy()["indirect_sh"]
     np.testing.assert_allclose(raw[:, :3] * 0.28209479, 0.4, rtol=1e-6)

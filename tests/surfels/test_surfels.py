@@ -57,8 +57,7 @@ def test_quaternion_sign_and_length_do_not_matter(rng: np.random.Generator) -> N
 
 
 def test_degenerate_rows_stay_finite() -> None:
-    """Zero quaternion = identity without gradient; huge logits and log scales saturate; nothing becomes
-    NaN."""
+    """Zero quaternion = identity without gradient; huge logits and log scales saturate; nothing is NaN."""
     huge = 3e38
     rotation = np.array([[0, 0, 0, 0], [1e-35, 0, 0, 0], [huge, huge, -huge, huge], [0, 0, 0, 1]])
     rows = np.array([huge, -huge, 0.0, 60.0])[:, None]
