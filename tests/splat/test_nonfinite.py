@@ -13,7 +13,7 @@ import pytest
 
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from tests.helpers import ROOT, run_python
-from tests.scenes.integrator import COUNT, plane_mesh, raw_channels, scene
+from tests.scenes.integrator import COUNT, lit_scene, plane_mesh, raw_channels, scene, sky
 
 BAD = (np.nan, np.inf, -np.inf, 1e38, -1e38)
 CULPRITS = [3, 8, 11, 17, 20]  # one for each
@@ -119,13 +119,11 @@ def test_unusable_texel_of_the_light_is_black() -> None:
 
 def test_unusable_texel_of_the_scene_light_is_black() -> None:
     def made(values: object) -> np.ndarray:
-        light = {"type": "envmap", "bitmap": mi.Bitmap(sky())}
-        shader = {name: value for name, value in integrator().items() if name != "light"}
-        loaded = mi.load_dict({"type": "scene", "integrator": shader, "sensor": sensor(), "light": light})
+        loaded = lit_scene({"type": "envmap", "bitmap": mi.Bitmap(sky())})
         params = mi.traverse(loaded)
-        data = np.array(params["light.data"].numpy())
+        data = np.array(params["sky.data"].numpy())
         data[7, 11:16, 1] = values
-        params["light.data"] = mi.TensorXf(data)
+        params["sky.data"] = mi.TensorXf(data)
         params.update()
         return mi.render(loaded, spp=1).numpy()
 
