@@ -20,7 +20,7 @@ class PinholeCamera:
     fy: float
     cx: float
     cy: float
-    to_world: np.ndarray  # (4, 4)
+    to_world: Array  # (4, 4)
     near: float = 0.01
     film: tuple[tuple[float, float], tuple[float, float]] | None = None  # borders along x and y; None: all
 
@@ -67,7 +67,7 @@ def sigmoid(x: Array) -> Array:
 PARALLEL = 0.95  # |cos| between the view and `up` above which world y is taken for up
 
 
-def look_at(origin: np.ndarray, target: np.ndarray, up: tuple[float, ...] = (0.0, 0.0, 1.0)) -> np.ndarray:
+def look_at(origin: Array, target: Array, up: tuple[float, ...] = (0.0, 0.0, 1.0)) -> Array:
     """World-from-camera (4, 4), +z towards the target; world y is up where the view runs along `up`."""
     origin, target, upward = (np.asarray(x, dtype=np.float64) for x in (origin, target, up))
     forward = (target - origin) / np.linalg.norm(target - origin)

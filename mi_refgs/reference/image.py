@@ -17,7 +17,7 @@ from mi_refgs import constants as c
 from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
 from mi_refgs.reference.footprint import Rules
 from mi_refgs.reference.light import Light, radiance_of
-from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points, harmonics, positive, unit
+from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points, Taps, harmonics, positive, unit
 from mi_refgs.reference.splat import STEP, Blend, primitive_of
 
 Array = np.ndarray
@@ -26,7 +26,7 @@ TERMS = ("diffuse", "specular", "indirect")
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that an image is rendered from. `order` (N, P): surfels from front to back at each pixel."""
+    """What an image is rendered from. `order` (N, P): surfels from front to back at each pixel."""
 
     raw: dict[str, Array]
     camera: PinholeCamera
@@ -52,7 +52,7 @@ class Image:
     maps: dict[str, Array]
     band: Array  # (P,): a declared discontinuity is near
     shown: Array  # (N, P): surfel contributes
-    taps: list[tuple[Array, Array, Array]] = field(default_factory=list)
+    taps: Taps = field(default_factory=list)
     gradients: dict[str, Array] = field(default_factory=dict)  # of Σ weights · maps; "light": flat levels
 
 
@@ -68,7 +68,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
     blend = Blend.of([raw, around] if around else [raw], camera, scene.order, x, y, scene.rules)
     features_of = Features(scene, raw)
-    taps: list[tuple[Array, Array, Array]] = []
+    taps: Taps = []
     features = features_of(features_of.columns, taps).real
     # Features and alpha are those of the object, the depth is that of everything.
     weight, depth = blend.weight[:count], np.sum(blend.weight * blend.z, 0)
@@ -76,8 +76,8 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     resolve = Resolve(scene, features_of, x, y, sums)
     mean_depth = depth * inverse_alpha(blend.weight.sum(0))
     resolve.depth = mean_depth if around else None
-    pixel_taps: list[tuple[Array, Array, Array]] = []
-    maps = resolve.named(resolve(sums, pixel_taps).real)
+    pixel_taps: Taps = []
+    maps = split(resolve(sums, pixel_taps).real, resolve.maps())
     if around:
         colour = harmonics(around["radiance_sh"], unit(around["position"] - camera.to_world[:3, 3]))
         maps["radiance"] = maps["radiance"] + blend.weight[count:].T @ positive(colour + 0.5)
@@ -99,13 +99,11 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     δraw = itemwise_adjoint(lambda v: features_of(v, []), features_of.columns, δfeatures)
     for name, values in features_of.split(δraw).items():
         gradients[name] = gradients.get(name, np.zeros_like(raw[name])) + values
-    zero = np.abs(raw["rotation"]).max(axis=1, initial=0) < QUATERNION_FLOOR
-    gradients["rotation"][zero] = 0
+    gradients["rotation"][np.abs(raw["rotation"]).max(axis=1, initial=0) < QUATERNION_FLOOR] = 0
     if scene.light is not None:
         δlight = np.zeros((sum(level.size // 3 for level in scene.light.levels), 3))
-        δradiance = [(taps, δfeatures[:, features_of.radiance])] if taps else []
-        δradiance += [(pixel_taps, δout[:, :3])]
-        for found, δcolour in δradiance:
+        parts = [(taps, δfeatures[:, features_of.radiance])] if taps else []
+        for found, δcolour in [*parts, (pixel_taps, δout[:, :3])]:
             for texel, share, factor in found:
                 np.add.at(δlight, texel, share.real[..., None] * (factor.real * δcolour)[:, None])
         gradients["light"] = δlight
@@ -130,9 +128,6 @@ def sample_depth(scene: Scene) -> Array:
     return primitive_of(raw).footprint(raw, scene.camera, scene.rules, x, y).z
 
 
-# ---------------- attributes of surfels ----------------
-
-
 class Features:
     """Features (N, K) of raw columns (N, D), by `layout`: normal, then what is blended besides."""
 
@@ -154,10 +149,9 @@ class Features:
             self.layout |= ({"radiance": 3} if own else {}) | ({"indirect": 3} if self.has_indirect else {})
 
     def split(self, columns: Array) -> dict[str, Array]:
-        """Columns by channel."""
         return split(columns, dict(zip(self.names, self.widths, strict=True)))
 
-    def __call__(self, columns: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
+    def __call__(self, columns: Array, taps: Taps) -> Array:
         raw, scene = self.split(columns), self.scene
         direction = unit(raw["position"] - scene.camera.to_world[:3, 3])
         normal = np.choose(self.normal[:, None], rotation_axes(raw["rotation"]))
@@ -193,7 +187,7 @@ class Resolve:
         if scene.visibility is not None:
             self.found["visibility"] = scene.visibility(unit(sums[:, :3]), self.ray)[:, None]
 
-    def __call__(self, sums: Array, taps: list[tuple[Array, Array, Array]]) -> Array:
+    def __call__(self, sums: Array, taps: Taps) -> Array:
         scene, alpha = self.scene, sums[:, -1:]
         inverse = inverse_alpha(alpha)
         blended = split(sums[:, :-2], self.features.layout)
@@ -205,18 +199,16 @@ class Resolve:
         if scene.at == "surfel":
             maps |= {name: blended[name] for name in ("radiance", *TERMS) if name in blended}
         else:
-            terms = None
-            nodes = self._nodes(blended["normal"], alpha) if scene.antialias else [
-                (blended["normal"], self.ray, self.found)
-            ]  # fmt: skip
+            terms: list[Array] = []
+            nodes = [(blended["normal"], self.ray, self.found)]
+            nodes = self._nodes(blended["normal"], alpha) if scene.antialias else nodes
             for normal, ray, visible in nodes:
-                found: list[tuple[Array, Array, Array]] = []
+                found: Taps = []
                 points = Points(normal, -ray, values | visible, position)
                 here = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
                 taps += [(texel, share, factor * alpha / len(nodes)) for texel, share, factor in found]
                 shares = [term / len(nodes) for term in here]
-                terms = shares if terms is None else [a + b for a, b in zip(terms, shares, strict=True)]
-            assert terms is not None
+                terms = [a + b for a, b in zip(terms, shares, strict=True)] if terms else shares
             maps |= {name: term * alpha for name, term in zip(TERMS, terms, strict=True)}
             maps["radiance"] = sum(terms[1:], terms[0]) * alpha
         return np.concatenate([maps[name] for name in self.maps()], axis=1)
@@ -241,10 +233,6 @@ class Resolve:
         """Columns of each map."""
         widths = {"radiance": 3, "alpha": 1, "depth": 1, "normal": 3, **self.features.materials}
         return widths | (dict.fromkeys(TERMS, 3) if self.scene.terms else {})
-
-    def named(self, values: Array) -> dict[str, Array]:
-        """Columns by map."""
-        return split(values, self.maps())
 
 
 def split(columns: Array, widths: dict[str, int]) -> dict[str, Array]:

@@ -12,22 +12,21 @@ from typing import Any
 
 import numpy as np
 
-Incoming = Callable[[np.ndarray], np.ndarray]  # radiance (n, 3), or any (n, c), from unit directions (n, 3)
-Hit = Callable[[np.ndarray, np.ndarray], "tuple[np.ndarray, np.ndarray, Any] | None"]
+Array = np.ndarray
+Incoming = Callable[[Array], Array]  # radiance (n, 3), or any (n, c), from unit directions (n, 3)
+Hit = Callable[[Array, Array], "tuple[Array, Array, Any] | None"]
 """Where a ray (origin, direction) first ends: place, unit normal against the ray, and any other thing."""
 
-Outgoing = Callable[
-    [Any, np.ndarray, np.ndarray, float, np.ndarray], np.ndarray
-]  # radiance (3,): see `chain`
+Outgoing = Callable[[Any, Array, Array, float, Array], Array]  # radiance (3,): see `chain`
 
 
-def smith_lambda(cosine: float | np.ndarray, α: float) -> np.ndarray:
+def smith_lambda(cosine: float | Array, α: float) -> Array:
     """Smith's Λ of GGX; of directions below the horizon too. [Heitz et al. 2016, eq. 15 ff.]"""
     cosine = np.where(np.abs(cosine) < 1e-9, 1e-9, cosine)
     return (np.sign(cosine) * np.sqrt(1 + α**2 * (1 / np.square(cosine) - 1)) - 1) / 2
 
 
-def frame(normal: np.ndarray) -> np.ndarray:
+def frame(normal: Array) -> Array:
     """Rotation (3, 3) whose rows are two tangents and the unit normal."""
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     side = np.cross(helper, normal)
@@ -36,8 +35,8 @@ def frame(normal: np.ndarray) -> np.ndarray:
 
 
 def lobe_nodes(
-    normal: np.ndarray, view: np.ndarray, roughness: float, rings: int = 200, spokes: int = 200
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    normal: Array, view: Array, roughness: float, rings: int = 200, spokes: int = 200
+) -> tuple[Array, Array, Array]:
     """Directions (n, 3), cosines of view and half vector (n,), and weights (n,) of a quadrature:
 
     Σ weight F(cosine) L(direction) = ∫ f L cosθ dω. Midpoints over the half vectors, drawn from D cosθ.
@@ -60,19 +59,14 @@ def lobe_nodes(
     return light @ rotation, v_h, share * g * v_h / (half[:, 2] * local[2])
 
 
-def schlick(cosine: np.ndarray, f0: np.ndarray) -> np.ndarray:
+def schlick(cosine: Array, f0: Array) -> Array:
     """Fresnel reflectance (n, c) of cosines (n,) and F0 (c,)."""
     return f0 + (1 - f0) * (1 - cosine[:, None]) ** 5
 
 
 def reflected(
-    incoming: Incoming,
-    normal: np.ndarray,
-    view: np.ndarray,
-    roughness: float,
-    f0: np.ndarray,
-    nodes: int = 200,
-) -> np.ndarray:
+    incoming: Incoming, normal: Array, view: Array, roughness: float, f0: Array, nodes: int = 200
+) -> Array:
     """∫ f L cosθ dω (3,): what a GGX surface reflects of any incoming light, with no approximation."""
     direction, v_h, weight = lobe_nodes(normal, view, roughness, nodes, nodes)
     return (weight[:, None] * schlick(v_h, f0) * incoming(direction)).sum(0)
@@ -86,14 +80,14 @@ def split_sum_entry(n_dot_v: float, roughness: float, nodes: int = 800) -> tuple
     return float(weight @ (1 - fresnel)), float(weight @ fresnel)
 
 
-def normal_reflectance(albedo: np.ndarray, metallic: float | np.ndarray) -> np.ndarray:
+def normal_reflectance(albedo: Array, metallic: float | Array) -> Array:
     """F0 of a dielectric of 4 % or a metal of its albedo, or a mixture."""
     return 0.04 * (1 - metallic) + albedo * metallic
 
 
 def diffuse_reflectance(
-    albedo: np.ndarray, metallic: float, roughness: float, n_dot_v: float, nodes: int = 400
-) -> np.ndarray:
+    albedo: Array, metallic: float, roughness: float, n_dot_v: float, nodes: int = 400
+) -> Array:
     """(1 - F0 A - B) (1 - metallic) albedo, (3,): what the base reflects of the rest; 0 from behind."""
     if n_dot_v <= 0:
         return np.zeros(3)
@@ -102,13 +96,8 @@ def diffuse_reflectance(
 
 
 def brdf_cosine(
-    albedo: np.ndarray,
-    metallic: float,
-    roughness: float,
-    normal: np.ndarray,
-    view: np.ndarray,
-    lights: np.ndarray,
-) -> np.ndarray:
+    albedo: Array, metallic: float, roughness: float, normal: Array, view: Array, lights: Array
+) -> Array:
     """BRDF times n·l, (n, 3), for unit directions `lights` (n, 3); zero below the horizon."""
     α2 = roughness**4
     n_l, n_v = lights @ normal, float(normal @ view)
@@ -126,14 +115,14 @@ def brdf_cosine(
 
 def reflected_radiance(
     incoming: Incoming,
-    albedo: np.ndarray,
+    albedo: Array,
     metallic: float,
     roughness: float,
-    normal: np.ndarray,
-    view: np.ndarray,
+    normal: Array,
+    view: Array,
     *,
     nodes: int = 400,
-) -> np.ndarray:
+) -> Array:
     """∫ L f cosθ dω (3,) under `brdf_cosine`, by midpoints: the diffuse part over cos²θ."""
     s, turn = (x.ravel() for x in np.meshgrid(*[(np.arange(nodes) + 0.5) / nodes] * 2))
     φ = 2 * math.pi * turn
@@ -144,7 +133,7 @@ def reflected_radiance(
 
 
 def traced_fraction(
-    free: Incoming, normal: np.ndarray, view: np.ndarray, roughness: float, f0: float, nodes: int = 200
+    free: Incoming, normal: Array, view: Array, roughness: float, f0: float, nodes: int = 200
 ) -> float:
     """∫ V f cosθ dω / ∫ f cosθ dω of the visibility `free` (n, 1): where an average over k rays converges."""
     direction, v_h, weight = lobe_nodes(normal, view, roughness, nodes, nodes)
@@ -152,9 +141,7 @@ def traced_fraction(
     return float((weight * free(direction)[:, 0]).sum() / weight.sum())
 
 
-def chain(
-    hit: Hit, outgoing: Outgoing, origin: np.ndarray, direction: np.ndarray, bounces: int
-) -> np.ndarray | None:
+def chain(hit: Hit, outgoing: Outgoing, origin: Array, direction: Array, bounces: int) -> Array | None:
     """Radiance (3,) that arrives against a ray from what it meets; None if it meets nothing.
 
     That is shaded with what its own mirror ray meets, and so on, `bounces` surfaces in all; what stops the
@@ -174,9 +161,7 @@ def chain(
     return outgoing(surface, normal, -direction, float(free), np.zeros(3) if beyond is None else beyond)
 
 
-def blocked_mean(
-    radiance: np.ndarray, weight: np.ndarray, blocked: np.ndarray, free: np.ndarray, fading: float
-) -> np.ndarray:
+def blocked_mean(radiance: Array, weight: Array, blocked: Array, free: Array, fading: float) -> Array:
     """Mean (3,) of the radiance (k, 3) of those of k ≥ 2 rays that are `blocked` (k,), weighted.
 
     Per colour, where the largest product of weight and radiance exceeds k times the mean of the others, it

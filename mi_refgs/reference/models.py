@@ -189,7 +189,7 @@ def harmonics(coefficients: Array, direction: Array) -> Array:
     return np.einsum("nk,nkc->nc", basis, coefficients.reshape(-1, count, 3))
 
 
-def sh_basis(direction: np.ndarray, degree: int) -> np.ndarray:
+def sh_basis(direction: Array, degree: int) -> Array:
     """Real spherical harmonics (…, (degree + 1)²) of unit directions (…, 3), with Condon-Shortley phase."""
     x, y, z = np.moveaxis(direction, -1, 0)
     cos, sin = [np.ones_like(x)], [np.zeros_like(x)]  # sin^m θ cos mφ, sin^m θ sin mφ

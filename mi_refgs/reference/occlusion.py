@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-Shape = Callable[[np.ndarray], np.ndarray]
+Array = np.ndarray
+Shape = Callable[[Array], Array]
 
 HIT_DISTANCE = 1e-5  # a ray this close to a shape of unit size has hit it
 TRACE_STEPS, TRACE_FAR = 200, 20.0
@@ -26,7 +27,7 @@ def torus(major: float, minor: float) -> Shape:
 
 
 def box(centre: tuple[float, float, float], half: tuple[float, float, float]) -> Shape:
-    def distance(p: np.ndarray) -> np.ndarray:
+    def distance(p: Array) -> Array:
         q = np.abs(p - np.array(centre)) - np.array(half)
         return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
 
@@ -37,13 +38,13 @@ def union(*shapes: Shape) -> Shape:
     return lambda p: np.min([shape(p) for shape in shapes], axis=0)
 
 
-def normal(shape: Shape, points: np.ndarray, step: float = 1e-5) -> np.ndarray:
+def normal(shape: Shape, points: Array, step: float = 1e-5) -> Array:
     """Unit outward normals by central differences."""
     gradient = np.stack([shape(points + step * e) - shape(points - step * e) for e in np.eye(3)], axis=-1)
     return gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
 
 
-def trace(shape: Shape, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def trace(shape: Shape, origin: Array, direction: Array) -> Array:
     """Distance to the shape along unit directions by sphere tracing, infinite for a miss."""
     t, result = np.zeros(len(origin)), np.full(len(origin), np.inf)
     active = np.arange(len(origin))
@@ -56,7 +57,7 @@ def trace(shape: Shape, origin: np.ndarray, direction: np.ndarray) -> np.ndarray
     return result
 
 
-def depth_map(shape: Shape, to_world: np.ndarray, focal: float, size: int) -> np.ndarray:
+def depth_map(shape: Shape, to_world: Array, focal: float, size: int) -> Array:
     """(size, size) camera z of the shape through the pixel centres, 0 for background."""
     j, i = np.mgrid[:size, :size] + 0.5
     local = np.stack([(size / 2 - i) / focal, (size / 2 - j) / focal, np.ones_like(i)], -1).reshape(-1, 3)
@@ -66,12 +67,12 @@ def depth_map(shape: Shape, to_world: np.ndarray, focal: float, size: int) -> np
     return np.where(np.isfinite(t), t / length, 0).reshape(size, size)
 
 
-def visible(shape: Shape, points: np.ndarray, direction: np.ndarray, clearance: float) -> np.ndarray:
+def visible(shape: Shape, points: Array, direction: Array, clearance: float) -> Array:
     """Whether rays from `points` leave the shape, starting `clearance` off it along its normal."""
     return ~np.isfinite(trace(shape, points + clearance * normal(shape, points), direction))
 
 
-def contracted(point: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+def contracted(point: Array, centre: Array, radius: float) -> Array:
     """A world point (3,) in the ball of radius 2. [Barron et al. 2022, eq. 10]"""
     offset = (point - centre) / radius
     length = float(np.linalg.norm(offset))
@@ -79,15 +80,15 @@ def contracted(point: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarr
 
 
 def fuse_point(
-    point: np.ndarray,
-    depths: list[np.ndarray],
-    views: list[tuple[np.ndarray, float, int]],
+    point: Array,
+    depths: list[Array],
+    views: list[tuple[Array, float, int]],
     voxel: float,
     *,
     carve: bool,
     truncation_voxels: float,
     unseen_vote: float,
-    region: tuple[np.ndarray, float] | None = None,
+    region: tuple[Array, float] | None = None,
 ) -> float:
     """Fused signed distance of one point, in truncations: the table at the top of `occlusion.tsdf`, word by
     word. With a region (centre, radius), `voxel` is of its contracted space."""
@@ -138,9 +139,7 @@ def fuse_point(
     return total / weight if weight else 1.0
 
 
-def mesh_hit(
-    vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray
-) -> tuple[float, int, np.ndarray]:
+def mesh_hit(vertices: Array, faces: Array, origin: Array, direction: Array) -> tuple[float, int, Array]:
     """Distance along a ray to the nearest triangle, infinite for a miss; its index; shares (3,) of corners.
 
     Either side counts. [Möller and Trumbore 1997]
@@ -160,21 +159,14 @@ def mesh_hit(
     return (float(t[first]) if hit[first] else np.inf), first, shares
 
 
-def mesh_distance(
-    vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, direction: np.ndarray
-) -> np.ndarray:
+def mesh_distance(vertices: Array, faces: Array, origin: Array, direction: Array) -> Array:
     """Distance (n,) along rays to the nearest of all triangles, either side; infinite for a miss."""
     return np.array([mesh_hit(vertices, faces, o, d)[0] for o, d in zip(origin, direction, strict=True)])
 
 
 def mirror_visibility(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    eye: np.ndarray,
-    normal: np.ndarray,
-    ray: np.ndarray,
-    offset: float,
-) -> np.ndarray:
+    vertices: Array, faces: Array, eye: Array, normal: Array, ray: Array, offset: float
+) -> Array:
     """1 (P,), or 0 where the mirror rays of unit rays (P, 3) from the eye to the mesh are blocked.
 
     They start `offset` off the mesh along the unit normals (P, 3).
@@ -189,21 +181,21 @@ def mirror_visibility(
     return np.where(hit & np.isfinite(mesh_distance(vertices, faces, start, mirror)), 0.0, 1.0)
 
 
-Radiance = Callable[[np.ndarray], np.ndarray]
+Radiance = Callable[[Array], Array]
 
 
 def ambient(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    normals: np.ndarray,
-    directions: np.ndarray,
+    vertices: Array,
+    faces: Array,
+    normals: Array,
+    directions: Array,
     light: Radiance,
-    outgoing: Callable[[np.ndarray, np.ndarray, bool, np.ndarray], np.ndarray],
+    outgoing: Callable[[Array, Array, bool, Array], Array],
     *,
     offset: float,
     bounces: int,
     brightest: float,
-) -> np.ndarray:
+) -> Array:
     """Ratios (V, 3) by the formula at the head of `shade.ambient`.
 
     normals (V, 3), directions (V, K, 3), unit, with density cosine / π; light(ω) is radiance (3,), blurred.

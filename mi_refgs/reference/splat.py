@@ -21,7 +21,7 @@ Array = np.ndarray
 STEP = 1e-40
 
 
-def primitive_of(raw: dict[str, np.ndarray]) -> Any:
+def primitive_of(raw: dict[str, Array]) -> Any:
     return Gaussian if raw["scale"].shape[1] == 3 else Surfel
 
 
@@ -29,10 +29,10 @@ def primitive_of(raw: dict[str, np.ndarray]) -> Any:
 class Maps:
     """Blended maps of shape (H, W, …) and the pixels where a declared discontinuity is near."""
 
-    features: np.ndarray
-    depth: np.ndarray
-    alpha: np.ndarray
-    band: np.ndarray
+    features: Array
+    depth: Array
+    alpha: Array
+    band: Array
 
 
 @dataclass(frozen=True)

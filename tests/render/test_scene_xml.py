@@ -33,7 +33,7 @@ from tests.scenes.integrator import (
     raw_channels,
     sensor,
     sky,
-)
+)  # fmt: skip
 
 
 def shading_with(option: str) -> Shading:
@@ -94,9 +94,7 @@ def test_square_pixels_are_the_view_itself(cx: float, cy: float, sign: float, tm
 
 
 @pytest.mark.parametrize("ratio", [1.001, 1.1, 1 / 1.1, 2.0])
-def test_other_pixels_keep_directions_and_extent(
-    ratio: float, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_other_pixels_keep_directions_and_extent(ratio: float, tmp_path: Path, rng: Any) -> None:
     camera = view(ratio, cx=7.0, cy=6.5)
     scene, seen, _ = shown(tmp_path, fitted(tmp_path, Shading("surfel")), camera)
     exported = Camera.from_sensor(scene.sensors()[0])
@@ -111,7 +109,6 @@ def test_other_pixels_keep_directions_and_extent(
 
 
 def pixels(camera: Camera, point: Any) -> np.ndarray:
-    """Where points land, (2, N)."""
     local = camera.to_camera(point)
     return np.array([camera.fx * local.x / local.z + camera.cx, camera.fy * local.y / local.z + camera.cy])
 
@@ -124,9 +121,6 @@ def test_what_no_scene_can_say_is_refused(tmp_path: Path) -> None:
         write_scene_xml(tmp_path / "no" / "scene.xml", SceneFiles("a.ply"), Shading(), [view()])
     with pytest.raises(InputError, match="mesh: there is none"):
         write_scene_xml(tmp_path / "s.xml", SceneFiles("a.ply"), Shading(occlusion=True), [view()])
-
-
-# ---------------- rays only where they are needed ----------------
 
 
 @pytest.mark.parametrize("options", [{}, {"visibility_rays": 2}, {"traced_bounces": 1}])

@@ -75,9 +75,6 @@ def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[st
         assert dr.grad(total).numpy()[0] == pytest.approx(expected, abs=0.01 * size), name
 
 
-# ---------------- what a camera shows of it ----------------
-
-
 def test_what_lies_behind_is_exposed_as_the_rest_is() -> None:
     """Composited in linear radiance, whatever the images are; a gain is of object and background alike."""
     half = mi.Float([0.5, 0.5])

@@ -18,8 +18,6 @@ from tests.scenes.colmap_files import ColmapCamera, ColmapImage, Model, colmap_b
 from tests.scenes.dots import COLOURS, POINTS, Shot
 
 SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
-
-
 MODEL, VALUES = "PINHOLE", (110.0, 104.0, 50.3, 34.6)
 
 
@@ -34,13 +32,9 @@ def model_of(shots: list[Shot], camera: str, values: tuple[float, ...]) -> Model
 
 
 def _write(
-    contents: Callable[[Model], dict[str, bytes]],
-    ending: str,
-    model: Path,
-    shots: list[Shot],
-    camera: str = MODEL,
-    values: tuple[float, ...] = VALUES,
-) -> None:
+    contents: Callable[[Model], dict[str, bytes]], ending: str, model: Path, shots: list[Shot],
+    camera: str = MODEL, values: tuple[float, ...] = VALUES,
+) -> None:  # fmt: skip
     model.mkdir(parents=True, exist_ok=True)
     for name, content in contents(model_of(shots, camera, values)).items():
         (model / f"{name}.{ending}").write_bytes(content)
@@ -78,7 +72,6 @@ def write_nerfstudio(folder: Path, shots: list[Shot] = SHOTS, **content: Any) ->
 
 
 def write_transforms(folder: Path, frames: list[dict[str, Any]], **content: Any) -> Path:
-    """Files of both splits with the same frames."""
     for split in ("train", "test"):
         (folder / f"transforms_{split}.json").write_text(json.dumps(content | {"frames": frames}))
     return folder
