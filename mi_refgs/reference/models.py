@@ -212,9 +212,6 @@ def sh_basis(direction: Array, degree: int) -> Array:
     return np.stack(out, axis=-1)
 
 
-# ---------------- functions of complex steps ----------------
-
-
 def positive(x: Array) -> Array:
     """max(0, x) with slope 1 at 0."""
     return np.where(x.real < 0, 0, x)

@@ -143,9 +143,6 @@ def _without_empty_tables(scene: SurfelScene, request: Request) -> tuple[SurfelS
     return scene, replace(request, attribution=None)
 
 
-# ---------------- the two orders ----------------
-
-
 @dataclass(frozen=True)
 class _View:
     """A scene, as a camera sees its surfels: what both orders start from."""

@@ -143,8 +143,6 @@ class Surfels:
             return [mi.Float() for _ in range(width)]
         return columns_of(tensor.array, width)
 
-    # ---------------- activated values ----------------
-
     def value(self, name: str) -> Any:
         """Activated mi.Float of one column, mi.Color3f of three, else a list (SH: of mi.Color3f)."""
         columns = self.columns(name)
@@ -207,8 +205,6 @@ class Surfels:
         t_v = 2 * entry(x, y, -z, w), entry(w, w, y, y) - entry(x, x, z, z), 2 * entry(y, z, x, w)
         n = 2 * entry(x, z, y, w), 2 * entry(y, z, -x, w), entry(w, w, z, z) - entry(x, x, y, y)
         return mi.Vector3f(*t_u), mi.Vector3f(*t_v), mi.Vector3f(*n)
-
-    # ---------------- copies ----------------
 
     def gather(self, parent: UInt32) -> Surfels:
         """Copies, detached: surfel i of the result is surfel parent[i] (mi.UInt32)."""

@@ -92,8 +92,6 @@ class Oracle:
         """Pixels (H, W) of which a sample is near a discontinuity."""
         return self._blocks(self.band.astype(float)[:, None])[self.window][..., 0] > 0
 
-    # ---------------- maps of the samples ----------------
-
     def _tables(self, values: Values) -> tuple[dict[str, Array], dict[str, Array]]:
         """Raw channels of the object, and of the surroundings, which may have no rows."""
         own = {n: values[n] for n in self.own}
@@ -120,8 +118,6 @@ class Oracle:
             offset = OFFSET_VOXELS * found.voxel
             self.visible = occlusion.mirror_visibility(found.vertices, found.faces, eye, normal, ray, offset)
         return self.visible
-
-    # ---------------- the film ----------------
 
     def _blocks(self, values: Array) -> Array:
         k = self.per_axis

@@ -32,9 +32,6 @@ NEIGHBOURS = 4
 AROUND = "surroundings_"
 
 
-# ---------------- what is rendered ----------------
-
-
 def every_channel(model: str, diffuse: Any, gaussians: bool) -> dict[str, np.ndarray]:
     raw, rng = raw_channels(COUNT), np.random.default_rng(5)
     if gaussians:
@@ -111,9 +108,6 @@ SCENES: dict[str, Callable[[Path], Any]] = {
 }
 
 SAMPLE = {"traced bounces", "BSDF, prb"}  # tested without `-m slow`; `test_option_pairs` tests others
-
-
-# ---------------- losses ----------------
 
 
 def is_trained(key: str) -> bool:

@@ -57,7 +57,6 @@ CROP = (4, 3, 9, 7)  # offset and size of a crop window, pixels
 TOLERANCE = 1e-5  # of an image or an AOV, in parts of its largest value, at least 1
 
 Maps = dict[str, np.ndarray]  # the image (H, W, 4) as IMAGE, linear and premultiplied; AOVs (H, W, C) by type
-# ---------------- what is rendered ----------------
 
 
 def shadings() -> list[tuple[Shading, str]]:
@@ -326,9 +325,6 @@ def cases() -> Iterator[Any]:
         state = row["state"].__name__
         name = f"{primitive}-{shading.at}-{shading.reflectance}-{shading.diffuse}-{rays}-{options}-{state}"
         yield pytest.param(shading, primitive, row, index % 3, id=name, marks=marks)
-
-
-# ---------------- the law ----------------
 
 
 def assert_same(expected: Maps, found: Maps, route: str) -> None:

@@ -38,8 +38,6 @@ def test_neighbours_adjoint_is_the_transpose(size: tuple[int, int], rng: np.rand
     np.testing.assert_allclose(np.array(dr.grad(plane)), np.einsum("ki,kij->j", weights, matrix), atol=1e-5)
 
 
-# ---------------- depth normals ----------------
-
 INTRINSICS = (-21.0, -19.0, 7.3, 8.1)  # Mitsuba's signs, off-centre
 ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
 ROTATION = ROTATION * np.sign(np.linalg.det(ROTATION))

@@ -69,9 +69,6 @@ def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
     np.testing.assert_allclose(found[keep], expected.maps["radiance"][keep], atol=3e-4)
 
 
-# ---------------- attributes of one surfel ----------------
-
-
 @pytest.mark.parametrize("degrees", [0, 50, 80, 100, 115, 130, 180])
 def test_normals_are_turned_to_the_camera_unless_they_only_lean_away(degrees: float) -> None:
     """A surfel turned about +y; up to 14° (a cosine of ¼) behind the silhouette its normal stays."""

@@ -97,9 +97,6 @@ def test_harmonics_start_with_a_constant_part(rng: np.random.Generator) -> None:
     assert np.all(raw[:, 3:] == 0)
 
 
-# ---------------- order in memory ----------------
-
-
 def steps(points: np.ndarray) -> float:
     """Mean distance from each point to the next."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).mean())

@@ -117,9 +117,6 @@ def registered() -> Iterator[None]:
     attributes.ATTRIBUTES.unregister("radius")
 
 
-# ---------------- what the generic code then does ----------------
-
-
 def balls(count: int = 30) -> Surfels:
     rng = np.random.default_rng(0)
     points = 0.4 * rng.normal(size=(count, 3))

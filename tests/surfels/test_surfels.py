@@ -20,9 +20,6 @@ def raw_table(count: int, rng: np.random.Generator, degree: int = 2) -> dict[str
     }
 
 
-# ---------------- values ----------------
-
-
 @pytest.mark.parametrize("count", [1, 2, 37])
 def test_activations(count: int, rng: np.random.Generator) -> None:
     raw = raw_table(count, rng)
@@ -76,9 +73,6 @@ def test_degenerate_rows_stay_finite() -> None:
     assert np.all(dr.grad(surfels.raw["rotation"]).numpy()[:2] == 0)
 
 
-# ---------------- derivatives ----------------
-
-
 def everything(surfels: Surfels) -> object:
     """Every accessor of every channel, with a weight of its own per entry."""
     arrays = [*surfels.position(), *surfels.scale(), surfels.opacity()]
@@ -121,9 +115,6 @@ def test_gradients_of_every_channel(rng: np.random.Generator) -> None:
         dr.set_grad(other.raw[name], mi.TensorXf(values))
     expected = sum(np.sum(dr.grad(surfels.raw[name]).numpy() * values) for name, values in direction.items())
     assert dr.forward_to(dr.sum(everything(other)))[0] == pytest.approx(expected, rel=1e-4)
-
-
-# ---------------- rows ----------------
 
 
 def test_gather_copies_rows_and_detaches(rng: np.random.Generator) -> None:

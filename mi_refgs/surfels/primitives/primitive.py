@@ -80,8 +80,6 @@ class Primitive(ABC):
     rows_as: Mapping[str, Callable[[list[Float]], list[Float]]] = MappingProxyType({})
     first_order: bool = False  # splatted by the derivative of the projection at its centre
 
-    # ---------------- footprints, under AD ----------------
-
     @abstractmethod
     def project(self, surfels: Surfels, camera: Camera) -> Footprints:
         """Footprints of all surfels; rectangles have no derivative, culled surfels cover no pixel."""
@@ -102,8 +100,6 @@ class Primitive(ABC):
     def normal(self, surfels: Surfels) -> Vector3f:
         """Unit normals in the world, not yet turned towards a camera."""
 
-    # ---------------- tile lists, without derivatives ----------------
-
     @abstractmethod
     def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
         """Whether footprints may reach ALPHA_MIN inside a rectangle from `low` to `high`, pixels."""
@@ -111,8 +107,6 @@ class Primitive(ABC):
     @abstractmethod
     def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
         """Depth near given points, the centres of tiles: the sort key."""
-
-    # ---------------- edits of the surfel model, NumPy ----------------
 
     @abstractmethod
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
@@ -209,9 +203,6 @@ def evaluating_both(first: Primitive, second: Primitive) -> Primitive:
     what = f"'{second.name}' is not splatted together with '{first.name}'"
     remedy = "give both the same primitive, or surfel and gaussian (surroundings.primitive of a method)"
     raise InputError(what, "surroundings", "scale", remedy)
-
-
-# ---------------- what all primitives share ----------------
 
 
 def projected(surfels: Surfels, camera: Camera) -> tuple[Bool, Float, Float, Vector2f]:
