@@ -115,12 +115,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     primitive_of(scene.surfels.raw)
     scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
     view = _View.of(*_without_empty_tables(scene, request), camera)
-    frame, buffer = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
-    if request.forward_only:
-        frame = frame.only(request.aovs)
-        if buffer.pixels is not None:  # the background is in raster order
-            raster = buffer.pixels.to_raster(replace(frame, background=None))
-            frame = replace(raster, background=frame.background)
+    frame = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
     return boundary(frame, "shade backward")
 
 
@@ -191,6 +186,14 @@ class _View:
             blended = splat(self.geometry, values, self.camera)
         return GBuffer.of(blended, slots)
 
+    def frame(self, buffer: GBuffer, **fields: Any) -> Frame:
+        """The frame of a G-buffer and of what was shaded, in raster order."""
+        frame = Frame(buffer.alpha, buffer.depth, attribution=buffer.attribution, **fields)
+        if self.request.forward_only:
+            frame = frame.only(self.request.aovs)
+            frame = frame if buffer.pixels is None else buffer.pixels.to_raster(frame)
+        return replace(frame, background=self.background)
+
 
 def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView:
     """Unit direction from the camera to each surfel, and its normal turned towards the camera.
@@ -205,7 +208,7 @@ def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView
     return SurfelView(direction, facing, sh_degree)
 
 
-def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
+def _shade_at_surfels(view: _View) -> Frame:
     """Forward shading: shade the surfels, then blend their radiance."""
     scene, points, asked = view.scene, view.points, view.asked
     # Radiance of each surfel.
@@ -229,21 +232,17 @@ def _shade_at_surfels(view: _View) -> tuple[Frame, GBuffer]:
     # Frame.
     blended = buffer.slots
     blended_terms = RadianceTerms(**{name: blended[name] for name in asked_terms}).filled()
-    frame = Frame(
-        alpha=buffer.alpha,
-        depth=buffer.depth,
+    return view.frame(
+        buffer,
         normal=blended.get("normal"),
         radiance=blended["radiance"],
         terms=blended_terms if asked & {*TERMS} else None,
         maps={name: buffer.divided(name) for name in materials},
-        background=view.background,
         object_alpha=blended.get(OBJECT, None if view.others else buffer.alpha),
-        attribution=buffer.attribution,
     )
-    return frame, buffer
 
 
-def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
+def _shade_at_pixels(view: _View) -> Frame:
     """Deferred shading: blend the attributes of the surfels, then shade the pixels."""
     scene, camera, shading = view.scene, view.camera, view.scene.shading
     # G-buffer: the model's attributes and the requested ones.
@@ -281,15 +280,5 @@ def _shade_at_pixels(view: _View) -> tuple[Frame, GBuffer]:
     else:
         shaded = shaded_at(points)
     terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
-    frame = Frame(
-        alpha=buffer.alpha,
-        depth=buffer.depth,
-        normal=normal,
-        radiance=terms.total() + buffer.slots[AROUND] if view.others else terms.total(),
-        terms=terms,
-        maps=maps,
-        background=view.background,
-        object_alpha=alpha,
-        attribution=buffer.attribution,
-    )
-    return frame, buffer
+    radiance = terms.total() + buffer.slots[AROUND] if view.others else terms.total()
+    return view.frame(buffer, normal=normal, radiance=radiance, terms=terms, maps=maps, object_alpha=alpha)

@@ -77,13 +77,6 @@ def test_quality_options_round_trip(option: str, tmp_path: Path) -> None:
     assert np.abs(plain.radiance.numpy().T.reshape(HEIGHT, WIDTH, 3) - seen[..., :3]).max() > 1e-3
 
 
-def test_other_shading_options_round_trip(tmp_path: Path) -> None:
-    for shading in (Shading("surfel"), Shading("surfel", "radiance"), Shading(diffuse="irradiance")):
-        scene, seen, expected = shown(tmp_path, fitted(tmp_path, shading), view())
-        assert scene.integrator().shading == shading
-        np.testing.assert_allclose(seen, expected, atol=1e-5)
-
-
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize(("cx", "cy"), [(WIDTH / 2, HEIGHT / 2), (3.3, 10.1), (-1.0, 13.5)])
 def test_square_pixels_are_the_view_itself(cx: float, cy: float, sign: float, tmp_path: Path) -> None:
