@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pytest
 
-from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import splat as reference
 from mi_refgs.reference.camera import look_at
-from mi_refgs.reference.footprint import Rules
-from mi_refgs.splat import Camera, Composited, TileLists, list_by_tile, project, splat
+from mi_refgs.splat import Camera, Composited, splat
 from mi_refgs.surfels.table import Surfels
 
 MAX_LEFT_OUT = 0.05  # share of the covered pixels that may lie in the band around declared discontinuities
@@ -146,29 +142,6 @@ def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
     return reference.differentiate(scene.raw, scene.features, scene.camera, adjoints)
 
 
-def check_reference_slopes(scene: Scene) -> None:
-    """The reference's derivatives are its differences, for the strongest opacity and for a few others."""
-    weights = loss_weights(scene, 1)
-
-    def maps(raw: dict[str, np.ndarray]) -> np.ndarray:
-        found = reference.splat(raw, scene.features, scene.camera)
-        return np.concatenate([found.features, found.depth[..., None], found.alpha[..., None]], axis=-1)
-
-    gradients = exact_gradients(scene, weights)
-    strongest = int(np.argmax(np.abs(gradients["opacity"])))
-    for name, values in scene.raw.items():
-        slopes = gradients[name]
-        for row in (strongest, *range(0, len(values), max(len(values) // 3, 1))):
-            for column in range(values.shape[1]):
-                sides = []
-                for step in (1e-6, -1e-6):
-                    moved = scene.raw | {name: values.copy()}
-                    moved[name][row, column] += step
-                    sides.append(np.sum(weights * maps(moved)))
-                difference = (sides[0] - sides[1]) / 2e-6
-                assert slopes[row, column] == pytest.approx(difference, abs=1e-5 * np.abs(slopes).max()), name
-
-
 def check_gradients(scene: Scene, seed: int, tolerance: float) -> None:
     """Adjoints against float64, and none missing: a derivative that is not 0 never comes back as 0."""
     weights = loss_weights(scene, seed)
@@ -180,47 +153,6 @@ def check_gradients(scene: Scene, seed: int, tolerance: float) -> None:
         assert np.all(np.abs(got[name]).max(axis=1)[strong] > 0), name
 
 
-DEGENERATE: dict[str, tuple[str, slice, Any]] = {
-    "scales of 0": ("scale", slice(None), -1e4),
-    "scales without end": ("scale", slice(None), 1e4),
-    "one scale without end": ("scale", slice(1), 1e4),
-    "quaternions of 0": ("rotation", slice(None), 0),
-    "opacity of 1": ("opacity", slice(None), 1e4),
-    "at the camera": ("position", slice(None), None),
-    "none": ("position", slice(0), 0),
-}
-"""Attribute, columns and their raw value."""
-
-
-def check_degenerate(scene: Scene, case: str) -> None:
-    """Images and gradients of degenerate surfels, or of none, are finite."""
-    name, columns, value = DEGENERATE[case]
-    raw = {key: values[: 0 if case == "none" else None].copy() for key, values in scene.raw.items()}
-    raw[name][:, columns] = scene.camera.to_world[:3, 3] if value is None else value
-    scene = Scene(raw, scene.features[: len(raw[name])], scene.camera)
-    maps = fast_maps(scene)
-    assert all(np.isfinite(x.numpy()).all() for x in [*maps.features, maps.depth, maps.alpha])
-    if len(scene.features):
-        gradients = fast_gradients(scene, np.ones((scene.camera.height, scene.camera.width, 6)))
-        assert all(np.isfinite(x).all() for x in gradients.values())
-
-
-def check_lists(scene: Scene, primitive: Any, most: float) -> TileLists:
-    """Every surfel-tile pair with a pixel at α ≥ ALPHA_MIN is listed once, at most `most` times as many."""
-    camera = scene.fast_camera()
-    lists = list_by_tile(project(scene.surfels(), camera), camera)
-    begin, end, surfel = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
-    listed = {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
-    assert len(listed) == lists.pairs, "a pair is listed twice"
-    y, x = (v.ravel() for v in np.mgrid[0 : camera.height, 0 : camera.width])
-    alpha = primitive.footprint(scene.raw, scene.camera, Rules(), x + 0.5, y + 0.5).alpha
-    alpha[primitive.culled(scene.raw, scene.camera, Rules())] = 0
-    tile = y // camera.tile[1] * camera.tiles[0] + x // camera.tile[0]
-    needed = {(int(i), int(tile[k])) for i, k in zip(*np.nonzero(alpha >= ALPHA_MIN * 1.001), strict=True)}
-    assert needed <= listed and len(listed) - 20 <= most * max(len(needed), 1)
-    return lists
-
-
 def gradient_errors(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> dict[str, float]:
     """Relative L2 error per parameter class."""
     errors = {}
@@ -229,23 +161,3 @@ def gradient_errors(got: dict[str, np.ndarray], expected: dict[str, np.ndarray])
         scale = np.linalg.norm(expected[name])
         errors[name] = float(np.linalg.norm(got[name] - expected[name]) / scale) if scale > 1e-9 else 0.0
     return errors
-
-
-def check_transpose(scene: Scene, seed: int) -> None:
-    weights = loss_weights(scene, seed)
-    rng = np.random.default_rng(seed)
-    direction = {name: rng.normal(size=values.shape) for name, values in scene.raw.items()}
-    direction["features"] = rng.normal(size=scene.features.shape)
-    reverse = fast_gradients(scene, weights)
-    surfels, features = scene.surfels(), scene.columns()
-    dr.enable_grad(surfels.raw, features)
-    for name in scene.raw:
-        dr.set_grad(surfels.raw[name], mi.TensorXf(direction[name].astype(np.float32)))
-    for k, column in enumerate(features):
-        dr.set_grad(column, mi.Float(np.ascontiguousarray(direction["features"][:, k].astype(np.float32))))
-    forward = dr.forward_to(fast_loss(scene, surfels, features, weights), flags=dr.ADFlag.Default)[0]
-    for name in PARAMETERS:
-        assert np.any(reverse[name]), name
-    expected = sum(np.sum(reverse[name] * direction[name]) for name in PARAMETERS)
-    size = np.sqrt(sum(np.sum((reverse[name] * direction[name]) ** 2) for name in PARAMETERS))
-    assert abs(forward - expected) <= 1e-3 * size
