@@ -15,7 +15,6 @@ from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.data.images import mask_in
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.images import ENDINGS, exif_tags, image_size, open_image, read_mask, to_8_bits
-from mi_refgs.io.progress import with_bar
 
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()  # for a message
 FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point

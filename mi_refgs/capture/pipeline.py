@@ -28,7 +28,7 @@ from mi_refgs.data.region import Region, write_region
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import read_json, replace_file, write_json
 from mi_refgs.io.images import image_size
-from mi_refgs.progress import with_bar
+from mi_refgs.io.progress import with_bar
 
 PLOT = "capture.png"
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
