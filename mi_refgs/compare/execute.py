@@ -20,15 +20,10 @@ from mi_refgs.runs.interrupt import held_interrupts
 
 Report = Callable[[Job, str | None], None]
 """Called with each job that ended: the reason is None if it is done."""
-
-LOG = "job.log"
-"""File of a run folder: output of its processes."""
-RETRIES = 2
-"""Restarts from the checkpoint of a job whose process was killed or crashed."""
-POLL = 0.2
-"""Seconds between checks of processes and interrupts."""
-CONNECT = "20s"
-"""Time limit for the connection to a scheduler."""
+LOG = "job.log"  # of a run folder: output of its processes
+RETRIES = 2  # restarts from the checkpoint of a job whose process was killed or crashed
+POLL = 0.2  # seconds between checks of processes and interrupts
+CONNECT = "20s"  # time limit for the connection to a scheduler
 
 
 def execute(job: Job, stop: threading.Event | None = None) -> str | None:
@@ -36,7 +31,6 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
 
     A process that a signal ended (a crash) is restarted from its checkpoint at most RETRIES times. When
     `stop` is set, the process saves its state and ends; the result is then None.
-    Raises InputError if the run folder cannot be written.
     """
     if stop is not None and stop.is_set():
         return None
@@ -59,10 +53,7 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
 
 
 def execute_all(jobs: Sequence[Job], workers: int, report: Report) -> None:
-    """Run jobs, `workers` at once.
-
-    Raises KeyboardInterrupt or TerminatedError after a signal, when all processes have saved their state.
-    """
+    """Run jobs, `workers` at once; after a signal, raise when all processes have saved their state."""
     stop = threading.Event()
     with held_interrupts() as release, ThreadPoolExecutor(workers) as pool:
         pending = {pool.submit(execute, job, stop): job for job in jobs}
@@ -78,7 +69,6 @@ def execute_all(jobs: Sequence[Job], workers: int, report: Report) -> None:
 
 
 def _process(job: Job, stop: threading.Event | None) -> int:
-    """Run one process of a job; returns its exit code."""
     package = str(Path(__file__).resolve().parents[2])
     paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
     try:
@@ -110,10 +100,7 @@ def _process(job: Job, stop: threading.Event | None) -> int:
 
 
 def threads_each(workers: int, threads: int | None) -> int | None:
-    """Return the threads per process: `threads`, or an equal share of the cores.
-
-    Raises InputError for fewer than one worker, or too many.
-    """
+    """Return the threads per process: `threads`, or an equal share of the cores."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not 1 <= workers <= 4 * cores:
         raise InputError(f"{workers} is out of range", "--workers", remedy=f"give 1 to {4 * cores}")
@@ -126,13 +113,11 @@ def threads_each(workers: int, threads: int | None) -> int | None:
 
 
 def run_on_cluster(jobs: Sequence[Job], address: str, report: Report) -> None:
-    """Run jobs on the scheduler at `address`.
+    """Run jobs on the scheduler at `address`; a signal cancels them.
 
     Workers must see the data sets and the comparison's folder under the same paths. A job whose worker died
-    is restarted from its checkpoint on another one, at most RETRIES times.
-
-    Raises InputError without dask.distributed and for a scheduler that does not answer; KeyboardInterrupt or
-    TerminatedError after a signal, when the jobs are cancelled.
+    is restarted from its checkpoint on another one, at most RETRIES times. Raises InputError without
+    dask.distributed and for a scheduler that does not answer.
     """
     try:
         import dask

@@ -25,12 +25,9 @@ from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.views import read_views, sized
 
-RUNS = "runs"
-"""Folder of the runs: runs/<data>/<method>/seed<k>."""
+RUNS = "runs"  # runs/<data>/<method>/seed<k>
 SETTINGS, TABLE, TABLE_TEXT, PAGE = "compare.json", "table.json", "table.md", "index.html"
-PICTURES = "pictures"  # folder of the page's images
-JOB, FAILED = "job.json", "failed.json"
-"""Files of a run folder: its job, and why it failed."""
+JOB, FAILED = "job.json", "failed.json"  # of a run folder: its job, and why it failed
 MAX_SEED = 2**31 - 1
 
 
@@ -49,17 +46,14 @@ class Job:
 
     @property
     def run(self) -> Run:
-        """The run folder."""
         return Run(self.folder)
 
     @property
     def name(self) -> str:
-        """Name of the method."""
         return Path(self.variant).stem
 
     @property
     def title(self) -> str:
-        """Data set, method and seed as text."""
         return f"{Path(self.data).name} × {self.name} × seed {self.seed}"
 
     def method(self) -> Method:
@@ -105,9 +99,8 @@ def plan(
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
-            raise InputError(
-                f"{seed} is out of range", "--seeds", remedy=f"give whole numbers from 0 to {MAX_SEED}"
-            )
+            remedy = f"give whole numbers from 0 to {MAX_SEED}"
+            raise InputError(f"{seed} is out of range", "--seeds", remedy=remedy)
     if any(setting.partition("=")[0].strip() == "seed" for setting in shared.settings):
         raise InputError("a comparison takes its seeds from --seeds", "--set", "seed", "drop it here")
     jobs = [
@@ -135,10 +128,7 @@ def settings_of(folder: Path) -> dict[str, Any]:
 
 
 def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequence[str]) -> None:
-    """Write the settings of the comparison and the jobs, which are rows of the table from now on.
-
-    Raises InputError where that is impossible.
-    """
+    """Write the settings of the comparison and the jobs, which are rows of the table from now on."""
     own_folder(folder, "compare")
     for job in planned:
         job.write()

@@ -27,12 +27,6 @@ class Statistic:
     sd: float | None
     values: tuple[float, ...]
 
-    @staticmethod
-    def of(values: Sequence[float]) -> Statistic:
-        """Return the statistic of at least one value."""
-        sd = statistics.stdev(values) if len(values) > 1 else None
-        return Statistic(statistics.fmean(values), sd, tuple(values))
-
 
 @dataclass
 class Row:
@@ -52,8 +46,6 @@ class Row:
 
 @dataclass
 class Scene:
-    """Rows of a data set."""
-
     name: str
     path: str
     rows: list[Row] = field(default_factory=list)
@@ -73,7 +65,6 @@ class Table:
 
     @property
     def complete(self) -> bool:
-        """Whether every job is done."""
         rows = [row for scene in self.scenes for row in scene.rows]
         return not any(row.failed or row.unfinished for row in rows)
 
@@ -145,7 +136,8 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
     for column in COLUMNS:
         values = [m[column.key] for m in found]
         if values and all(value is not None for value in values):
-            row.numbers[column.key] = Statistic.of([float(value) for value in values])
+            sd = statistics.stdev(values) if len(values) > 1 else None
+            row.numbers[column.key] = Statistic(statistics.fmean(values), sd, tuple(map(float, values)))
             continue
         row.numbers[column.key] = None
         reasons = [m.get(f"{column.reason}_reason") for m in found if m[column.key] is None]
@@ -172,7 +164,7 @@ def markdown(table: Table) -> str:
 
 
 def heading(scene: Scene) -> str:
-    """Return the name of the scene with the images over which its numbers are means."""
+    """Return the name of the scene, and the images over which its numbers are means."""
     if not scene.image_size:
         return scene.name
     width, height = scene.image_size

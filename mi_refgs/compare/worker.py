@@ -13,24 +13,15 @@ import threading
 import time
 import traceback
 from pathlib import Path
-from typing import Any
 
 from mi_refgs.compare.jobs import FAILED, Job
-from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.methods.method import Method
 from mi_refgs.runs.interrupt import TerminatedError
 from mi_refgs.runs.run import Run
 
-DONE, FAILURE, STOPPED = 0, 2, 143
-"""Exit codes."""
-CURVE, CURVE_KEYS = "curve.jsonl", ("iteration", "seconds", "psnr")
-CURVE_POINTS, CURVE_VIEWS = 20, 8
-"""Measurements during a fit, evenly spaced, and test views per measurement, evenly spaced."""
-PATIENCE = 60.0
-"""Seconds to wait for an earlier process to leave the folder."""
-GRACE = 30.0
-"""Seconds between SIGTERM and the end of this process by force."""
+DONE, FAILURE, STOPPED = 0, 2, 143  # exit codes
+PATIENCE = 60.0  # seconds to wait for an earlier process to leave the folder
+GRACE = 30.0  # seconds between SIGTERM and the end of this process by force
 
 
 def main(folder: Path) -> int:
@@ -52,10 +43,7 @@ def main(folder: Path) -> int:
 
 
 def fit_and_measure(job: Job) -> None:
-    """Train from the newest checkpoint, if any, to the end; then write artefacts and metrics.
-
-    Raises InputError as training and evaluation do, and KeyboardInterrupt for Ctrl-C and SIGTERM.
-    """
+    """Train from the newest checkpoint, if any, to the end; then write artefacts and metrics."""
     import drjit as dr
     import mitsuba as mi
 
@@ -78,37 +66,9 @@ def fit_and_measure(job: Job) -> None:
     trainer = begin(method, views, run, warn=warn)
     if trainer.iteration:
         print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
-    trainer.train(Curve(job, method, trainer.iteration))
+    trainer.train()
     finish(trainer, run)
     evaluate(run, data)
-
-
-class Curve:
-    """Measures PSNR on a few test views between steps of a fit; its clock does not count."""
-
-    def __init__(self, job: Job, method: Method, begin: int) -> None:
-        from mi_refgs.runs.views import read_views
-
-        self.run = job.run
-        self.data = read_views(method, Path(job.data), "test", truth=False)
-        self.views = [self.data.views[i] for i in evenly_spread(len(self.data.views), CURVE_VIEWS)]
-        points = [round(method.iterations * (k + 1) / CURVE_POINTS) for k in range(CURVE_POINTS)]
-        self.due = [point for point in points if point > begin]
-
-    def __call__(self, trainer: Any) -> None:
-        from mi_refgs.evaluation.images import RenderedView
-        from mi_refgs.evaluation.metrics import psnr
-
-        passed = [point for point in self.due if point <= trainer.iteration]
-        if not passed:
-            return
-        self.due = self.due[len(passed) :]  # one point for all that a trial has passed
-        values = [
-            psnr(RenderedView.of(trainer.view(view.camera()), self.data, view).image, view.load().displayed)
-            for view in self.views
-        ]
-        line = {"iteration": trainer.iteration, "seconds": round(trainer.fit.seconds, 3)}
-        self.run.log(line | {"psnr": round(sum(values) / len(values), 4)}, CURVE)
 
 
 def _end_with_parent() -> None:

@@ -27,9 +27,9 @@ RECORDINGS = 8  # image sizes whose kernels are kept ready: to trace them takes 
 _replayed = functools.partial(replayed, limit=RECORDINGS)
 
 
-def window(radius: int = WINDOW_RADIUS) -> list[float]:
-    """The 2 radius + 1 weights of the one-dimensional window; they sum to 1."""
-    weights = [math.exp(-0.5 * (k / WINDOW_SIGMA) ** 2) for k in range(-radius, radius + 1)]
+def window() -> list[float]:
+    """The weights of the one-dimensional window; they sum to 1."""
+    weights = [math.exp(-0.5 * (k / WINDOW_SIGMA) ** 2) for k in range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)]
     return [weight / sum(weights) for weight in weights]
 
 

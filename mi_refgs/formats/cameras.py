@@ -20,7 +20,6 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 
 TRANSFORMS = "transforms.json"
-IMAGE_FOLDER = re.compile(r"images(_\d+)?")  # folders to which COLMAP's names are relative
 SIZE_MAX = 2**14  # pixels along a side of an image, at most
 
 
@@ -41,7 +40,10 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     poses = [shot.camera.pose() for shot in shots]
     cameras = [((file.width, file.height, *map(float, file.intrinsics)), file.lens) for file in files]
     numbered = {camera: i for i, camera in enumerate(dict.fromkeys(cameras), 1)}
-    below = _below_images(names)
+    folder = re.match(r"images(_\d+)?/", names[0])  # to which COLMAP's names are relative
+    below = names
+    if folder and all(name.startswith(folder[0]) for name in names):
+        below = [name.removeprefix(folder[0]) for name in names]
     tests = [name for name, shot in zip(below, shots, strict=True) if shot.split == "test"]
     write_model(sparse, numbered, below, poses, [numbered[camera] for camera in cameras], tests)
     written = "cameras.txt", "images.txt", "points3D.txt", "test.txt"
@@ -56,8 +58,7 @@ def transforms(shots: Sequence[Shot]) -> dict[str, Any]:
         file = _file(shot)
         name, lens = file.path.as_posix(), file.lens
         listed[shot.split].append(name)
-        frame: dict[str, Any] = {"file_path": name}
-        frame |= {"w": file.width, "h": file.height}
+        frame: dict[str, Any] = {"file_path": name, "w": file.width, "h": file.height}
         frame |= zip(("fl_x", "fl_y", "cx", "cy"), map(float, file.intrinsics), strict=True)
         if file.mask is not None and file.mask.below is None:
             frame["mask_path"] = file.mask.path.as_posix()
@@ -76,14 +77,6 @@ def _file(shot: Shot) -> FileCamera:
     c, ending = shot.camera, "" if Path(shot.name).suffix.lower() in ENDINGS else ENDINGS[0]
     intrinsics = (-float(c.fx[0]), -float(c.fy[0]), float(c.cx[0]), float(c.cy[0]))
     return FileCamera(Path(f"{shot.name}{ending}"), c.width, c.height, intrinsics)
-
-
-def _below_images(names: Sequence[str]) -> list[str]:
-    """Remove the folder of images from the names, if all of them are in one."""
-    first = names[0].partition("/")[0]
-    if IMAGE_FOLDER.fullmatch(first) and all(name.startswith(f"{first}/") for name in names):
-        return [name.partition("/")[2] for name in names]
-    return list(names)
 
 
 def read_cameras(path: Path) -> list[Camera]:

@@ -27,10 +27,8 @@ def write(
     background map is the layer background, which R, G, B do not contain: add (1 - A) times it.
     """
     if not 0 <= view < len(shots):
-        count = len(shots)
-        raise InputError(
-            f"{view} is out of range", "--view", remedy=f"there are {count}, give 0 to {count - 1}"
-        )
+        remedy = f"there are {len(shots)}, give 0 to {len(shots) - 1}"
+        raise InputError(f"{view} is out of range", "--view", remedy=remedy)
     camera = shots[view].camera
     shown = replace(trained, surroundings=None) if object else trained
     frame = shown.renderer(samples=samples)(camera)

@@ -34,10 +34,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Option:
-    """An option of a format: `--name` on the command line, a keyword of its `write` in Python.
-
-    Formats may share an option, which is then the same in all of them.
-    """
+    """An option of formats: `--name` on the command line, a keyword of their `write` in Python."""
 
     name: str  # with underscores; the command line has hyphens
     default: Any  # int, float, str, or False for a switch
@@ -61,18 +58,14 @@ class Format:
 
     @property
     def writer(self) -> Callable[..., list[Path]]:
-        """The function `write`, imported."""
         if not isinstance(self.write, str):
             return self.write
         module, _, name = self.write.partition(":")
-        found: Callable[..., list[Path]] = getattr(
-            importlib.import_module(f"mi_refgs.formats.{module}"), name
-        )
-        return found
+        return cast(Any, getattr(importlib.import_module(f"mi_refgs.formats.{module}"), name))
 
     @property
     def description(self) -> str:
-        """The docstring of `write`, which describes the file; the documentation shows it."""
+        """The docstring of `write`, which the documentation shows."""
         return inspect.getdoc(self.writer) or self.summary
 
 
@@ -90,19 +83,15 @@ def import_extra(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise InputError(
-            f"{name} is not installed", "--to", remedy='pip install "mi_refgs[export]"'
-        ) from None
+        remedy = 'pip install "mi_refgs[export]"'
+        raise InputError(f"{name} is not installed", "--to", remedy=remedy) from None
 
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def remember_last(function: F) -> F:
-    """Decorate a function of a scene so that it keeps its last result per scene, as long as the scene exists.
-
-    Several formats of one export require the same result.
-    """
+    """Keep the last result of a function per scene, as long as the scene exists, for the next format."""
     results: WeakKeyDictionary[TrainedScene, tuple[Any, Any]] = WeakKeyDictionary()
 
     def cached(scene: TrainedScene, *args: Any) -> Any:
@@ -148,10 +137,7 @@ def write(
 
 
 def _target(made: Format, output: Path, several: bool) -> Path:
-    """Return the path of a format: `output`, or a path in it if it is a folder or there are several formats.
-
-    Raises InputError for a file name of another suffix, or a folder that cannot be made.
-    """
+    """Return the path of a format: `output`, or a path in it for a folder or several formats."""
     if several or output.is_dir() or (made.suffix and not output.suffix):
         output = output / f"{made.name}{made.suffix}"
     elif made.suffix and output.suffix.lower() != made.suffix:

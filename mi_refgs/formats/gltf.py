@@ -9,6 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from mi_refgs.formats.baking import bake
 from mi_refgs.formats.format import Shot
@@ -19,14 +23,10 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import SH_DC, sigmoid
 
 Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))  # glTF's world from ours
-Y_UP_QUATERNION = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
-"""The same as a quaternion (x, y, z, w): the turn by -90° about x that takes +z to +y."""
+Y_UP_QUATERNION = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)  # the same (x, y, z, w): the turn by -90° about x
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, POINTS, VERTICES = 5126, 0, 34962
 """glTF's numbers of a component type, of a mode, and of a buffer's use."""
-
-
-# ---------------- meshes ----------------
 
 
 def write_mesh(
@@ -37,11 +37,6 @@ def write_mesh(
     glTF is in metres with +y up, our world has +z up: (x, y, z) becomes (x, z, −y). It has no environment
     light.
     """
-    import trimesh
-    from PIL import Image
-    from trimesh.visual.material import PBRMaterial
-    from trimesh.visual.texture import TextureVisuals
-
     made = bake(trained, shots, faces, texture)
     # By the specification, roughness is green and metallic is blue.
     surface = np.stack([np.zeros_like(made.roughness), made.roughness, made.metallic], axis=-1)
@@ -58,12 +53,8 @@ def write_mesh(
     mesh = trimesh.Trimesh(vertices, made.faces, vertex_normals=normals, visual=visual, process=False)
     scene = trimesh.Scene()
     scene.add_geometry(mesh, node_name="object", geom_name="object")
-    data = trimesh.exchange.gltf.export_glb(scene, include_normals=True)
-    write_bytes(target, data)
+    write_bytes(target, trimesh.exchange.gltf.export_glb(scene, include_normals=True))
     return [target]
-
-
-# ---------------- Gaussians ----------------
 
 
 def write_gaussians(

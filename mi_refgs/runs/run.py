@@ -162,9 +162,9 @@ class Run:
             kept = [line for line in text.splitlines() if _logged(line) <= iteration]
             write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
 
-    def log(self, line: dict[str, Any], name: str = LOG) -> None:
-        """Append a JSON line with an `iteration` to a log, with null for numbers that are not finite."""
-        path = self.path / name
+    def log(self, line: dict[str, Any]) -> None:
+        """Append a JSON line with an `iteration` to the log, with null for numbers that are not finite."""
+        path = self.path / LOG
         line = {k: None if isinstance(x, float) and not math.isfinite(x) else x for k, x in line.items()}
         try:
             with path.open("a", encoding="utf-8") as file:

@@ -86,11 +86,6 @@ def test_comparison_has_a_run_per_job(compared: tuple[Path, int]) -> None:
     for variant, seed in (("tiny", 0), ("other", 0), ("other", 1)):
         run = Run(folder / "runs" / "ball" / variant / f"seed{seed}")
         assert run.method().seed == seed and run.method().iterations == 6
-        curve = [json.loads(line) for line in (run.path / "curve.jsonl").read_text().splitlines()]
-        assert [point["iteration"] for point in curve] == [1, 2, 3, 4, 5, 6]
-        assert all(np.diff([point["seconds"] for point in curve]) > 0)
-        metrics = json.loads((run.path / "metrics.json").read_text())
-        assert abs(curve[-1]["psnr"] - metrics["psnr"]) < 0.01  # both on the two test views
 
 
 def test_failed_job_is_a_row_with_its_reason(compared: tuple[Path, int]) -> None:
@@ -144,11 +139,6 @@ def test_interrupted_job_resumes_from_checkpoint(
     assert main(command(ball, tmp_path, variants[1])) == 0
     for name in ("surfels.ply", "envmap.exr"):
         assert (run / name).read_bytes() == (done / name).read_bytes(), name
-    first, again = (
-        [json.loads(line) for line in (folder / "curve.jsonl").read_text().splitlines()]
-        for folder in (done, run)
-    )
-    assert [(p["iteration"], p["psnr"]) for p in again] == [(p["iteration"], p["psnr"]) for p in first]
 
 
 def test_job_is_finished_with_metrics_of_last_checkpoint(
@@ -293,12 +283,11 @@ def test_other_settings_are_refused_by_the_run_itself(
 # ---------- The page ----------
 
 
-def test_page_has_table_plot_failures_and_deviations(compared: tuple[Path, int]) -> None:
+def test_page_has_table_failures_and_deviations(compared: tuple[Path, int]) -> None:
     folder, _ = compared
     page = (folder / "index.html").read_text()
     tags = re.findall(r"<(/?)(table|tr|td|th|h2|p|b|ol|li|pre)>", page)
     assert sum(not closing for closing, _ in tags) == sum(bool(closing) for closing, _ in tags) > 20
-    assert 'src="pictures/0_psnr.png"' in page and (folder / "pictures/0_psnr.png").stat().st_size > 1000
     command_line = json.loads((folder / "compare.json").read_text())["command"]
     for said in ("a ball <and> no scene", "llvm_ad_rgb", "cannot be created", command_line):
         assert html.escape(said) in page, said
