@@ -124,14 +124,16 @@ def write(
         able = ", ".join(made.name for made in FORMATS.values() if name in [o.name for o in made.options])
         remedy = f"leave it out, or choose a format that has it ({able or 'none'})"
         raise InputError(f"no option of {', '.join(names)}", f"--{name.replace('_', '-')}", remedy=remedy)
-    found, shots = {}, tuple(shots)
+    found, shots, owner = {}, tuple(shots), f"export of {source and source.resolve()}"
+    if len(chosen) > 1:
+        own_folder(Path(output), owner)
     for made in chosen:
         target = _target(made, Path(output), len(chosen) > 1)
         own = {option.name: given.get(option.name, option.default) for option in made.options}
         if made.suffix and target == Path(output):
             require_no_run(target)
         else:
-            own_folder(target.parent if made.suffix else target, f"export of {source and source.resolve()}")
+            own_folder(target.parent if made.suffix else target, owner)
         found[made.name] = made.writer(trained, target, shots, **own)
     return found
 

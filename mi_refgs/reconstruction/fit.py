@@ -21,8 +21,7 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
 
-PSNR_MEMORY = 0.9
-"""Weight of the old value in the running PSNR of the bar; single views are up to 5 dB off the mean."""
+PSNR_MEMORY = 0.9  # weight of the old value in the running PSNR of the bar
 
 
 def fit(
@@ -116,7 +115,6 @@ class ProgressBar(Previews):
 
     def step(self, trainer: Trainer) -> None:
         if trainer.iteration % trainer.method.log_every == 0:
-            # The numbers wait for the device, as the log of this iteration did already.
             numbers = trainer.statistics()
             new = float(numbers["psnr"])
             self.psnr = new if self.psnr is None else PSNR_MEMORY * self.psnr + (1 - PSNR_MEMORY) * new

@@ -38,7 +38,6 @@ class NewLight:
     exposure: float = 0.0  # stops: radiance times 2^exposure
 
     def __post_init__(self) -> None:
-        """Raise InputError for a missing file, or a number out of range."""
         require_file(self.path)
         _require_range(self.rotate, self.exposure)
 
@@ -55,12 +54,11 @@ class NewLight:
         return f"{digest} world={self.world} rotate={self.rotate % 360!r} exposure={self.exposure!r}"
 
     def read(self) -> EnvironmentLight:
-        """Read the light, of at most HEIGHT rows; raises InputError for a file that is no lat-long image."""
+        """Read the light, of at most HEIGHT rows."""
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
 
 
 def _require_range(rotate: float, exposure: float) -> None:
-    """Raise InputError for a number out of range."""
     if not np.isfinite(rotate):
         raise InputError(f"{rotate} is no angle", "light", "rotation", "give degrees")
     if not abs(exposure) <= EXPOSURE_MAX:
@@ -71,16 +69,12 @@ def _require_range(rotate: float, exposure: float) -> None:
 def world_light(
     radiance: np.ndarray, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
 ) -> EnvironmentLight:
-    """Convert lat-long radiance (h, w, 3) to a light of at most HEIGHT rows; options as in `NewLight`.
-
-    Raises InputError for an array that is no such map, and for a number out of range.
-    """
+    """Convert lat-long radiance (h, w, 3) to a light of at most HEIGHT rows; options as in `NewLight`."""
     _require_range(rotate, exposure)
     radiance = np.ascontiguousarray(radiance, dtype=np.float32)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
-        raise InputError(
-            f"{radiance.shape} is no lat-long map", "light", remedy="give linear radiance (h, w, 3)"
-        )
+        remedy = "give linear radiance (h, w, 3)"
+        raise InputError(f"{radiance.shape} is no lat-long map", "light", remedy=remedy)
     turned: Any = mi.ScalarTransform4f()
     if rotate % 360:
         turned = turned.rotate([0, 0, 1], rotate)
@@ -99,13 +93,18 @@ AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray
 def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> EnvironmentLight:
     """Convert a light, its file or its radiance (h, w, 3) to a light; options as in `NewLight`.
 
-    An `EnvironmentLight` is in world directions already; a `NewLight` has options of its own.
+    An `EnvironmentLight` is in world directions already. Raises InputError for options of a `NewLight`.
     """
+    if isinstance(light, NewLight):
+        if world or rotate or exposure:
+            remedy = "give them to NewLight"
+            raise InputError("it has its own world, rotate and exposure", "light", "NewLight", remedy)
+        return light.read()
     if isinstance(light, EnvironmentLight):
         return world_light(light.radiance().numpy(), True, rotate, exposure)
     if isinstance(light, np.ndarray):
         return world_light(light, world, rotate, exposure)
-    return (light if isinstance(light, NewLight) else NewLight(Path(light), world, rotate, exposure)).read()
+    return NewLight(Path(light), world, rotate, exposure).read()
 
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:

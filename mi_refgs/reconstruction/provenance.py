@@ -9,7 +9,6 @@ from typing import Any
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
-from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
 from mi_refgs.formats import Shot
@@ -39,16 +38,14 @@ class Provenance:
     @staticmethod
     def of(run: Run) -> Provenance:
         """Read a run folder; raises InputError if it is none, or has a record that cannot be used."""
-        method = run.method()
-        record = run.path / EDITS
-        edits = read_json(record).get("edits", []) if record.is_file() else []
-        exposure = run.path / EXPOSURE_FILE
-        records = {CAMERAS: run.cameras(), EXPOSURE_FILE: read_json(exposure) if exposure.is_file() else {}}
-        records = {name: record for name, record in records.items() if record}
-        return Provenance(method, run.dataset(), run.region(), tuple(edits), records)
+        method, (edits, exposure) = run.method(), (run.path / name for name in (EDITS, EXPOSURE_FILE))
+        made = read_json(edits).get("edits", []) if edits.is_file() else []
+        records = {CAMERAS: cameras} if (cameras := run.cameras()) else {}
+        records |= {EXPOSURE_FILE: read_json(exposure)} if exposure.is_file() else {}
+        return Provenance(method, run.dataset(), run.region(), tuple(made), records)
 
     def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
-        """Write a scene as a run folder (`runs.export.save`); raises InputError as that does."""
+        """Write a scene as a run folder (`runs.export.save`)."""
         records = self.records | ({EDITS: {"edits": self.edits}} if self.edits else {})
         save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
@@ -62,7 +59,6 @@ class Provenance:
 
     @property
     def has_data(self) -> bool:
-        """Whether the data set is known and exists."""
         return self.data is not None and self.data.is_dir()
 
     def views(self, split: str) -> Dataset:
@@ -74,12 +70,13 @@ class Provenance:
         return with_poses(views, self.records.get(CAMERAS, {}))
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
-        """Return the named cameras of some splits; without a data set, cameras around the surfels.
-
-        Decodes no image. Raises InputError for a data set that exists and cannot be read.
-        """
+        """Return the named cameras of some splits, without images; around the surfels without a data set."""
         if self.data is None or not self.has_data:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
+
+        def relative(path: Path) -> Path:
+            return Path(os.path.relpath(path, self.data))
+
         shots = []
         for split in splits:
             data = read_views(self.method, self.data, split, truth=False)
@@ -88,19 +85,16 @@ class Provenance:
                 whole = self.method.downscaled(1)
                 originals = read_views(whole, self.data, split, truth=False).views
             for view, original in zip(views, originals, strict=True):
-                shots.append(Shot(view.name, split, view.camera(), self._relative(original.file)))
+                file = original.file
+                if file is not None:  # paths are relative to the data set
+                    mask = file.mask and replace(file.mask, path=relative(file.mask.path))
+                    file = replace(file, path=relative(file.path), mask=mask)
+                shots.append(Shot(view.name, split, view.camera(), file))
         return shots
 
     def first_camera(self, trained: TrainedScene) -> Camera:
         """Return the camera of the first test view; without a data set, the first around the surfels."""
         return self.shots(trained, "test")[0].camera
-
-    def _relative(self, file: FileCamera | None) -> FileCamera | None:
-        """Make the paths of an image file and its mask relative to the data set."""
-        if file is None:
-            return None
-        mask = file.mask and replace(file.mask, path=Path(os.path.relpath(file.mask.path, self.data)))
-        return replace(file, path=Path(os.path.relpath(file.path, self.data)), mask=mask)
 
     def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
         """Return cameras on a circle around the object, z up, at the distance and height of the test views.
@@ -108,11 +102,9 @@ class Provenance:
         Raises InputError as `shots` does, and for a number below 1.
         """
         if count < 1:
-            raise InputError(
-                f"{count} is out of range", "turntable", remedy="give a number of cameras from 1"
-            )
-        cameras = [shot.camera for shot in self.shots(trained, "test")]
-        if trained.surroundings is None:
-            return turntable_cameras(trained, cameras, count)
-        surfels = replace(trained, mesh=None)  # the mesh contains the background, too
-        return turntable_cameras(surfels, cameras, count, self.region)
+            remedy = "give a number of cameras from 1"
+            raise InputError(f"{count} is out of range", "turntable", remedy=remedy)
+        cameras, region = [shot.camera for shot in self.shots(trained, "test")], None
+        if trained.surroundings is not None:  # the mesh contains the background, too
+            trained, region = replace(trained, mesh=None), self.region
+        return turntable_cameras(trained, cameras, count, region)

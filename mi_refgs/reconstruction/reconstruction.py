@@ -72,21 +72,14 @@ class Reconstruction:
 
     @property
     def method(self) -> Method:
-        """The method that was fitted."""
         return self.provenance.method
 
     def views(self, split: str = "test") -> Dataset:
-        """Read the "test" or "train" views of the data set; `view.load().image` is (H, W, 3).
-
-        Raises InputError for a data set that is unknown, missing or unreadable.
-        """
+        """Read the "test" or "train" views of the data set; `view.load().image` is (H, W, 3)."""
         return self.provenance.views(split)
 
     def cameras(self, split: str = "test") -> list[Camera]:
-        """Return the cameras of the "test" or "train" views; without a data set, cameras around the object.
-
-        Raises InputError for a data set that exists and cannot be read.
-        """
+        """Return the cameras of the "test" or "train" views; without a data set, some around the object."""
         return [shot.camera for shot in self.provenance.shots(self.trained, split)]
 
     def turntable(self, count: int) -> list[Camera]:
@@ -103,9 +96,8 @@ class Reconstruction:
         if isinstance(camera, int | np.integer):
             known = self.cameras(split)
             if not -len(known) <= camera < len(known):
-                raise InputError(
-                    f"{split} has {len(known)}", "camera", f"{camera}", f"give 0 to {len(known) - 1}"
-                )
+                remedy = f"give 0 to {len(known) - 1}"
+                raise InputError(f"{split} has {len(known)}", "camera", f"{camera}", remedy)
             found = known[camera]
         elif isinstance(camera, View):
             found = camera.camera()
@@ -131,8 +123,7 @@ class Reconstruction:
         """Render a camera (H, W, 4): linear RGB, premultiplied by alpha, and alpha.
 
         samples: samples per pixel; 4 are 2 × 2, box filtered, 1 is the pixel centre, as in training.
-        object_only: render without the background Gaussians; alpha is 1 everywhere with them. Raises
-        InputError as `camera` does.
+        object_only: render without the background Gaussians; alpha is 1 everywhere with them.
         """
         seen = self.camera(camera, size)
         frame = self._frame(seen, samples, object_only, aovs=False)
@@ -203,8 +194,7 @@ class Reconstruction:
     def save(self, folder: str | Path) -> Reconstruction:
         """Write a run folder without checkpoints, which every command reads, and load it.
 
-        It renders the same images, bit for bit. Raises InputError for a folder that contains a run, has a
-        foreign file in the way or cannot be written.
+        It renders the same images, bit for bit. Raises InputError for a folder that has other files.
         """
         self.provenance.save(self.trained, Path(folder), self.cameras()[0])
         return load(folder)
@@ -212,9 +202,9 @@ class Reconstruction:
     def export(self, form: str, path: str | Path, **options: Any) -> list[Path]:
         """Write a file or folder of another program, such as "3dgs-ply" or "cameras"; returns the files.
 
-        `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. In a
-        folder, only `overwrite` replaces foreign files. Raises InputError for an unknown format or option, a
-        scene that the format cannot represent, a missing package, and a path that cannot be written.
+        `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. Raises
+        InputError for an unknown format or option, a scene that the format cannot represent, a missing
+        package, and a path that cannot be written.
         """
         shots = self.provenance.shots(self.trained, "test", "train")
         return formats.write(self.trained, [form], Path(path), shots, options, self.folder)[form]
@@ -230,7 +220,7 @@ class Reconstruction:
         row is straight up, along +z, unless it is in `world` directions already, as an `EnvironmentLight`,
         environment.exr and envmap.exr are. rotate: degrees about +z, counter-clockwise seen from above.
         exposure: stops. Raises InputError for a reconstruction without light or materials
-        (`runs.relightable`) and a light that cannot be used.
+        (`runs.relightable`), a light that cannot be used, and options of a `NewLight`, which has its own.
         """
         scene = replace(relightable(self.trained), light=any_light(light, world, rotate, exposure))
         return self.changed(scene)
@@ -251,11 +241,7 @@ class Reconstruction:
         return replace(self, trained=trained, folder=None)
 
     def evaluate(
-        self,
-        data: str | Path | None = None,
-        *,
-        samples: int = 1,
-        progress: bool = False,
+        self, data: str | Path | None = None, *, samples: int = 1, progress: bool = False
     ) -> dict[str, Any]:
         """Measure the run on its test views, or on those of `data`, as `refgs eval` does.
 
@@ -271,8 +257,7 @@ def load(run: str | Path, *, write: bool = True) -> Reconstruction:
     """Read a run folder.
 
     Where a checkpoint is newer than the files of the scene, these are written first, unless `write` is off.
-    Raises InputError for a folder that is no run, contains neither a scene nor a checkpoint, or has a file
-    that cannot be used; and if no Mitsuba variant is set that the renderer supports.
+    Raises InputError for a folder that is no run or cannot be used, and without a supported Mitsuba variant.
     """
     require_supported_variant("mi_refgs.load")
     folder = Run(run)
@@ -290,7 +275,7 @@ def import_splats(
     linear: its colours are linear radiance, as this package fits them; otherwise they are display-encoded, as
     3DGS and 2DGS write them. box: two corners (6,); surfels whose centre is outside are left out. It has
     neither light nor mesh, and its cameras are around the object, z up. Raises InputError for any other file,
-    a box without surfels, and if no Mitsuba variant is set that the renderer supports.
+    a box without surfels, and without a supported Mitsuba variant.
     """
     require_supported_variant("mi_refgs.import_splats")
     trained = read_splats(Path(path), linear)

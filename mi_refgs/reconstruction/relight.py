@@ -73,12 +73,8 @@ def relight(
     (`truth_under`), the test views are compared with it.
 
     Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
-    folder that cannot be written or contains a run, images of another light, or foreign files of these names.
+    folder that cannot be written or has other files.
     """
-    if turntable < 0:
-        remedy = "give a number of views from 1"
-        raise InputError(f"{turntable} is out of range", "--turntable", remedy=remedy)
-
     # The views, and the ground truth under this light.
     fitted = load(run.path)
     fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
@@ -129,7 +125,9 @@ def relight(
     } | {"psnr": None, "psnr_scaled": None, "score_reason": reason}
     truth: list[np.ndarray] = []
     if true_views is not None and views is not None:
-        truth = _truth(true_views, light.exposure)
+        for view in (view.load() for view in true_views.views):
+            alpha = np.ones_like(view.image[..., 0]) if view.alpha is None else view.alpha
+            truth.append(np.dstack([view.image * np.float32(2.0**light.exposure), alpha]))
         result |= score([view.name for view in views.views], ours, truth, background) | {"score_reason": None}
         result["caption"] = caption(truth[0].shape[1::-1], relit=True)
     assert relit.trained.light is not None
@@ -142,24 +140,13 @@ def relight(
 
 def _true_views(method: Method, folder: Path, views: Dataset) -> Dataset:
     """Read the test views under a light of the data set; raises InputError unless they have its cameras."""
-    found = read_dataset(
-        folder, "test", downscale=method.data.downscale or 1, background="black", images="exr", truth=False
-    )
-    if len(found.views) != len(views.views) or any(
-        np.abs(a.to_world - b.to_world).max() > 1e-6 for a, b in zip(found.views, views.views, strict=True)
-    ):
+    options: dict[str, Any] = {"downscale": method.data.downscale or 1, "images": "exr", "truth": False}
+    found = read_dataset(folder, "test", background="black", **options)
+    theirs, ours = ([view.to_world for view in data.views] for data in (found, views))
+    if len(theirs) != len(ours) or np.abs(np.subtract(theirs, ours)).max() > 1e-6:
         what = f"not the cameras of {views.path}"
         raise InputError(what, folder / "transforms_test.json", remedy="make it again")
     return found
-
-
-def _truth(views: Dataset, exposure: float) -> list[np.ndarray]:
-    """Return premultiplied linear RGBA (H, W, 4) of views."""
-    images = []
-    for view in (view.load() for view in views.views):
-        alpha = np.ones_like(view.image[..., 0]) if view.alpha is None else view.alpha
-        images.append(np.dstack([view.image * np.float32(2.0**exposure), alpha]))
-    return images
 
 
 def _rows(
@@ -181,15 +168,12 @@ def _rows(
     return [dict(frames[i : i + columns]) for i in range(0, len(frames), columns)]
 
 
-# ---------------- scores ----------------
-
-
 def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
     """Fit the scale of radiance per channel (3,) that minimises the error of displayed images.
 
-    Light and albedo of a fit share an unknown scale, which tints everything under another light. It is one
-    for all images, by least squares of displayed colours inside the object: of radiance, lamps alone would be
-    fitted. 1 for a channel that is black in either.
+    Light and albedo of a fit share an unknown scale. It is one for all images, by least squares of displayed
+    colours inside the object: of radiance, lamps alone would be fitted. 1 for a channel that is black in
+    either.
     """
     a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))
     inside = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)

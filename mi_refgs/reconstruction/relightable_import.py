@@ -27,7 +27,6 @@ from mi_refgs.runs.run import Run
 from mi_refgs.splat import Camera
 
 DATA = "data"  # folder of the rendered views, in the run folder
-FILES = (TRANSFORMS, "train/*.png", "test/*.png")
 PURPOSE = "relighting"  # of the default method: `auto` would keep colours alone, which are those of the file
 VIEWS = {"train": 100, "test": 12}
 ELEVATION = (-90.0, 90.0)  # degrees: files of other programs have any side up

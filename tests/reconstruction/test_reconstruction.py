@@ -275,6 +275,7 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
         (lambda r: r.relight("none.exr"), "none.exr: file: missing"),
         (lambda r: r.relight(Path.cwd()), "file: is a folder; name a file in it"),
         (lambda r: r.relight(np.ones((4, 8))), "is no lat-long map; give linear radiance"),
+        (lambda r: r.relight(NewLight(Path(__file__)), rotate=30), "light: NewLight: it has its own world, "),
         (lambda r: r.export("obj", "x.obj"), "--to: .obj. is unknown; use"),
         (lambda r: r.edit(where="metallic > 2", cut=True), "none of the 6000 surfels is in it; choose"),
         (lambda r: r.changed(r.trained).evaluate(), "only in memory; measure what save"),

@@ -216,7 +216,7 @@ def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.exr").write_text("no image")
     refused(lambda: relight(run, light, known / "run"), "belongs to a run")
     refused(lambda: relight(run, light, known / "data"), "has other files")
-    refused(lambda: relight(run, light, turntable=-1), "--turntable: -1")
+    refused(lambda: relight(run, light, turntable=-1), "turntable: -1 is out of range")
     refused(lambda: relight(run, NewLight(tmp_path / "bad.exr"), tmp_path / "out"), "bad.exr")
     refused(lambda: NewLight(tmp_path / "none.exr"), "none.exr")
     for angle, stops, wrong in (
