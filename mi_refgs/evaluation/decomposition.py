@@ -21,7 +21,6 @@ from mi_refgs.evaluation.surface import NO_SURFACE
 from mi_refgs.io.images import psnr_of
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.reflectance import Reflectance
 from mi_refgs.splat import Camera
 
 KNOWN_SHARE = 0.5  # fraction of a pixel that a true material must cover for it to count
@@ -39,7 +38,6 @@ class _Sums:
     """(4, C): Σ ours², Σ ours · true, Σ true², Σ |ours - true|."""
 
     def add(self, ours: np.ndarray, true: np.ndarray) -> None:
-        """Add pixels (P, C)."""
         a, b = ours.astype(np.float64), true.astype(np.float64)
         self.count += len(a)
         self.sums = self.sums + np.stack([a**2, a * b, b**2, np.abs(a - b)]).sum(axis=1)
@@ -126,16 +124,16 @@ def material_maps(
     makes of it, with `samples` per pixel: the fitted attribute is only the colour of metals.
     """
     if "radiance_sh" not in fitted.shading.required_attributes:
-        return lambda camera, rendered: _comparable(fitted.shading.model, rendered.maps)
+
+        def comparable(camera: Camera, rendered: RenderedView) -> dict[str, np.ndarray]:
+            """Convert MATERIALS by `Reflectance.textures`; leave them out if it does not convert them."""
+            others = {name: shown for name, shown in rendered.maps.items() if name not in MATERIALS}
+            return others | (fitted.shading.model.textures(rendered.maps) or {})
+
+        return comparable
     try:
         scene = relightable(fitted)
     except InputError:  # without light or materials there is no albedo
         return lambda camera, rendered: {n: m for n, m in rendered.maps.items() if n != "albedo"}
     render = replace(scene, shading=scene.shading.untraced()).renderer(samples=samples)
     return lambda camera, rendered: RenderedView.maps_of(render(camera), *rendered.alpha.shape)
-
-
-def _comparable(model: Reflectance, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return maps with MATERIALS as `Reflectance.textures` converts them; without them if it does not."""
-    others = {name: shown for name, shown in maps.items() if name not in MATERIALS}
-    return others | (model.textures(maps) or {})

@@ -20,11 +20,8 @@ from mi_refgs.evaluation.surface import TrueSurface
 from mi_refgs.kernels.device import upload
 
 OUTLINE_PIXELS = 2  # distance from the object's outline, along rows or columns, of silhouette pixels
-CREASE_DEGREES = 25.0
-"""Turn of the normal between neighbouring pixels from which a surface is creased. A sphere turns as much only
-in its outermost pixel, which is silhouette, unless its radius is less than 3 pixels."""
+CREASE_DEGREES = 25.0  # turn of the normal between neighbouring pixels from which a surface is creased
 CLASSES = tuple(PIXEL_CLASSES)
-NO_BUDGET = "the data set has no ground-truth depth and normals"
 
 
 def classify(view: View, surface: TrueSurface | None) -> np.ndarray | None:
@@ -96,7 +93,8 @@ class ErrorBudget:
         """
         pixels, squared, angle, known = self.sums
         if not pixels.any():
-            return {"error_budget": None, "error_budget_reason": NO_BUDGET}
+            reason = "the data set has no ground-truth depth and normals"
+            return {"error_budget": None, "error_budget_reason": reason}
         budget = {
             name: {
                 "pixels": float(pixels[i] / pixels.sum()),

@@ -18,7 +18,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.decomposition import Decomposition, material_maps
 from mi_refgs.evaluation.error_budget import ErrorBudget, classify
-from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, on_white, panels
+from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, over_colour, panels
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
@@ -36,7 +36,7 @@ from mi_refgs.shade.light.light_file import read_radiance
 
 FOLDER = "eval"
 SHEET, METRICS = "contact_sheet.png", "metrics.json"
-LONGEST_STEM = 60  # characters of the view's name in an image's file name; file systems allow 255 bytes
+LONGEST_STEM = 60  # characters of a view in a file's name; file systems allow 255 bytes
 SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
 ORANGE = np.array([0.75, 0.3, 0.0])  # of concave pixels
 MEANS = """psnr psnr_gain psnr_registered ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
@@ -47,8 +47,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     """Render the test views, measure them, and write metrics.json, renders and a contact sheet.
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
-    Every key of the upper level is always present. Where a score does not apply it is null, and `NAME_reason`
-    says why. An entry of `views` has only the scores of that view.
+    Every key of the upper level is always present; a score that does not apply is null, and `NAME_reason`
+    says why.
 
     `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
     `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
@@ -66,10 +66,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
                                    with the environment map prefiltered beforehand
     `caption`                      scale, mask and frame of these numbers
 
-    Renders have `samples` per pixel, box filtered (`render.samples`).
-
-    Raises InputError for a folder that is no run or contains neither a scene nor a checkpoint, for data
-    that is gone, and for a foreign file in the run that has the name of a result.
+    Renders have `samples` per pixel, box filtered (`render.samples`). Raises InputError for a folder that is
+    no run or contains neither a scene nor a checkpoint, and for data that is gone.
     """
     # The scene, its test views, and the files to write.
     method = run.method()
@@ -90,13 +88,8 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     light_scores, footer = _light(fitted, views)
     cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
     size = [views.views[0].width, views.views[0].height]
-    result: dict[str, Any] = (
-        _means(scores)
-        | light_scores
-        | errors.result()
-        | budget.result()
-        | surface_scores(fitted.mesh, surface, views.views)
-    )
+    result = _means(scores) | light_scores | errors.result() | budget.result()
+    result |= surface_scores(fitted.mesh, surface, views.views)
     result |= {
         "caption": caption(size),
         "exposure": (run.path / EXPOSURE_FILE).is_file(),
@@ -139,9 +132,7 @@ def _measure(
     Returns their scores; and what the sheet shows of some: the render, the view, and more images by title.
     """
     render, maps_of = fitted.renderer(samples=samples), material_maps(fitted, samples)
-    object_only = (
-        replace(fitted, surroundings=None).renderer(samples=samples) if fitted.surroundings else None
-    )
+    object_only = replace(fitted, surroundings=None).renderer(samples=samples)
     in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
     per_view: list[dict[str, Any]] = []
     shown = []
@@ -164,10 +155,10 @@ def _measure(
         # Images.
         write_png(images[index], rendered.image)
         if index in in_sheet:
-            more = (
-                {} if concave is None else {"concave": on_white(concave[..., None] * ORANGE, view.covered())}
-            )
-            if object_only is not None:
+            more: dict[str, np.ndarray] = {}
+            if concave is not None:
+                more["concave"] = over_colour(concave[..., None] * ORANGE, view.covered())
+            if fitted.surroundings is not None:
                 more["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
             shown.append((rendered, view, more))
     return per_view, shown
@@ -182,17 +173,18 @@ def _register(
     def shown(view: View) -> np.ndarray:
         return image_of(displayed_of(render(view.camera()), views), view)
 
-    rows = with_bar(
-        list(zip(per_view, views.views, strict=True)), "register", unit="view", disable=not progress
-    )
-    for scores, view in rows:
+    pairs = list(zip(per_view, views.views, strict=True))
+    for scores, view in with_bar(pairs, "register", unit="view", disable=not progress):
         moved = registered(view, shown, views.scene_extent)
         scores["psnr_registered"] = metrics.psnr(shown(moved), moved.displayed)
 
 
 def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the mean scores of the views, and why some are missing."""
-    result: dict[str, Any] = {name: _mean(per_view, name) for name in MEANS}
+    result: dict[str, Any] = {}
+    for name in MEANS:
+        values = [scores[name] for scores in per_view if scores.get(name) is not None]
+        result[name] = float(np.mean(values)) if values else None
     for name in ("flip", "lpips"):
         result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
     for name, key, reason in (
@@ -237,11 +229,6 @@ def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[st
         return nothing | {"env_reason": "the data set has no environment.exr"}, light_panels(light)
     truth = read_radiance(data.environment, len(light))
     return metrics.environment(light, truth) | {"env_reason": None}, light_panels(light, truth)
-
-
-def _mean(per_view: list[dict[str, Any]], name: str) -> float | None:
-    values = [scores[name] for scores in per_view if scores.get(name) is not None]
-    return float(np.mean(values)) if values else None
 
 
 def read_metrics(run: Run) -> dict[str, Any] | None:

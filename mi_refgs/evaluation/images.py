@@ -10,7 +10,9 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import map_coordinates
+from skimage.transform import resize_local_mean
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
@@ -22,10 +24,8 @@ from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.types import Array
 
-LIGHT_KEY = 0.36
-"""Average luminance of a displayed environment before the tone curve x / (1 + x), which maps it to 0.55."""
-CELL_MIN = 128
-"""Pixels: smaller images are enlarged by a whole factor, so that a sheet of thumbnails can be read."""
+LIGHT_KEY = 0.36  # average luminance of a displayed environment before the tone curve, which maps it to 0.55
+CELL_MIN = 128  # pixels: smaller images are enlarged by a whole factor
 MARGIN = 4  # pixels between images
 TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 14
 """Heights of titles in pixels, and widths of images per height: the longest title then fits."""
@@ -80,9 +80,6 @@ class RenderedView:
         return {name: image_array(m, height, width) for name, m in frame.maps.items()}
 
 
-# ---------------- panels ----------------
-
-
 def panels(rendered: RenderedView, view: View, scale: np.ndarray | float = 1.0) -> dict[str, np.ndarray]:
     """Return fitted maps next to the ground truth that a loaded view has, by title; albedo after a scale."""
     pairs = {"image": [rendered.image, view.displayed]}
@@ -96,44 +93,31 @@ def panels(rendered: RenderedView, view: View, scale: np.ndarray | float = 1.0) 
             if (true := view.materials.get(name)) is not None:
                 pairs[name].append(material_colours(true[..., :-1], true[..., -1]))
     sides = {1: "fitted", 2: "fitted | ground truth"}
-    return {f"{name}: {sides[len(pair)]}": np.clip(side_by_side(pair), 0, 1) for name, pair in pairs.items()}
+    found = {}
+    for name, pair in pairs.items():
+        gap = np.ones((view.height, MARGIN // 2, 3))
+        row = np.concatenate([part for image in pair for part in (gap, image)][1:], axis=1)
+        found[f"{name}: {sides[len(pair)]}"] = np.clip(row, 0, 1)
+    return found
 
 
 def normal_colours(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Convert unit normals (H, W, 3) to colours over white."""
-    return on_white(0.5 + 0.5 * normal, alpha)
+    return over_colour(0.5 + 0.5 * normal, alpha)
 
 
 def material_colours(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert a linear colour (H, W, 3) per pixel to colours over white, a number to greys over BESIDE_GREYS.
-
-    Numbers are (H, W) or (H, W, 1).
-    """
+    """Convert linear colours (H, W, 3) to colours over white, numbers (H, W[, 1]) to greys over pale blue."""
     values = values.reshape(*alpha.shape, -1)
     if values.shape[-1] == 3:
-        return on_white(srgb_from_linear(values), alpha)
-    return over(BESIDE_GREYS, np.repeat(values, 3, axis=-1), alpha)
+        return over_colour(srgb_from_linear(values), alpha)
+    return over_colour(np.repeat(values, 3, axis=-1), alpha, BESIDE_GREYS)
 
 
-def on_white(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Composite an image (H, W, 3) over white by alpha (H, W)."""
-    return over(np.ones(3), image, alpha)
-
-
-def over(background: np.ndarray, image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Composite an image (H, W, 3) over a colour (3,) by alpha (H, W)."""
+def over_colour(image: np.ndarray, alpha: np.ndarray, colour: np.ndarray | float = 1.0) -> np.ndarray:
+    """Composite an image (H, W, 3) by alpha (H, W) over a colour (3,), by default white."""
     alpha = np.clip(alpha, 0, 1)[..., None]
-    return alpha * image + (1 - alpha) * background
-
-
-def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Place images of one height side by side."""
-    gap = np.ones((images[0].shape[0], MARGIN // 2, 3))
-    parts = [part for image in images for part in (gap, image)]
-    return np.concatenate(parts[1:], axis=1)
-
-
-# ---------------- environment maps ----------------
+    return alpha * image + (1 - alpha) * colour
 
 
 def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -151,8 +135,16 @@ def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str
 
 
 def light_image(radiance: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """Tone-map a map (h, 2h, 3) at the exposure of `reference`, or of itself, with +z at the top."""
-    return upright(tonemap(radiance, radiance if reference is None else reference))
+    """Map a lat-long map (h, 2h, 3) of any range to an image with +z at the top.
+
+    The curve is x / (1 + x) [Reinhard et al. 2002, eq. 3]. The exposure maps the average luminance of
+    `reference`, or of the map itself, over the sphere to LIGHT_KEY.
+    """
+    reference = radiance if reference is None else reference
+    rows = np.sin((np.arange(len(reference)) + 0.5) / len(reference) * np.pi)
+    mean = float(np.average((reference @ LUMINANCE).mean(axis=1), weights=rows))
+    scaled = np.maximum(radiance, 0) * (LIGHT_KEY / max(mean, 1e-8))
+    return upright(np.clip(srgb_from_linear(scaled / (1 + scaled)), 0, 1))
 
 
 def upright(image: np.ndarray) -> np.ndarray:
@@ -164,20 +156,6 @@ def upright(image: np.ndarray) -> np.ndarray:
     wrapped = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="wrap")
     planes = [map_coordinates(wrapped[..., i], (row, column + 1), order=1, mode="nearest") for i in range(3)]
     return np.stack(planes, axis=-1)
-
-
-def tonemap(radiance: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Map radiance of any range to an image: x / (1 + x) [Reinhard et al. 2002, eq. 3], sRGB-encoded.
-
-    The exposure maps the average luminance of `reference` (h, w, 3) over the sphere to LIGHT_KEY.
-    """
-    rows = np.sin((np.arange(len(reference)) + 0.5) / len(reference) * np.pi)
-    mean = float(np.average((reference @ LUMINANCE).mean(axis=1), weights=rows))
-    scaled = np.maximum(radiance, 0) * (LIGHT_KEY / max(mean, 1e-8))
-    return np.clip(srgb_from_linear(scaled / (1 + scaled)), 0, 1)
-
-
-# ---------------- contact sheets ----------------
 
 
 def contact_sheet(
@@ -193,15 +171,15 @@ def contact_sheet(
     if footer:
         width = max(line.shape[1] for line in lines)
         part = (width - MARGIN * (len(footer) - 1)) // max(len(footer), 2)
-        lines.append(_line({title: _resized(image, part) for title, image in footer.items()}, size))
+        sizes = {title: (round(len(image) * part / image.shape[1]), part) for title, image in footer.items()}
+        shown = {title: resize_local_mean(footer[title], shape) for title, shape in sizes.items()}
+        lines.append(_line(shown, size))
     width = max(line.shape[1] for line in lines)
     return np.concatenate([_padded(line, MARGIN, width - line.shape[1]) for line in lines])
 
 
 def _line(cells: dict[str, np.ndarray], size: int) -> np.ndarray:
     """Place images with titles of a size side by side."""
-    from PIL import Image, ImageDraw, ImageFont
-
     font = ImageFont.load_default(size)
     title_height = round(1.2 * size) + 2
     height = max(image.shape[0] for image in cells.values())
@@ -217,12 +195,3 @@ def _line(cells: dict[str, np.ndarray], size: int) -> np.ndarray:
 def _padded(image: np.ndarray, below: int, right: int) -> np.ndarray:
     """Pad an image with white."""
     return np.pad(image, ((0, below), (0, right), (0, 0)), constant_values=1)
-
-
-def _resized(image: np.ndarray, width: int) -> np.ndarray:
-    """Resize an image to another width, keeping its aspect; each channel by Pillow's box filter."""
-    from PIL import Image
-
-    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
-    channels = [Image.fromarray(np.ascontiguousarray(image[..., i], dtype=np.float32)) for i in range(3)]
-    return np.stack([np.asarray(c.resize(size, Image.Resampling.BOX)) for c in channels], axis=-1)

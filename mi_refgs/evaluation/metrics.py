@@ -27,14 +27,9 @@ from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.splat import Camera
 
 FOREGROUND_ALPHA = 0.5  # true alpha above which a pixel is foreground
-FLAT = 1e-12
-"""Variance of encoded values below which a map is constant but for rounding and has no correlation."""
-WARM_UP_FRAMES = 2
-"""Frames before the timing: the first compiles or loads the kernels, the second fills the memory pools."""
+FLAT = 1e-12  # variance of encoded values below which a map is constant and has no correlation
+WARM_UP_FRAMES = 2  # before the timing: they compile kernels and fill the memory pools
 TIMED_FRAMES = 20  # frames whose median is reported; the views repeat if there are fewer
-
-
-# ---------------- images ----------------
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | EllipsisType = ...) -> float:
@@ -46,11 +41,7 @@ def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | EllipsisType 
     return psnr_of(float(np.mean((image - truth)[where] ** 2)))
 
 
-def ssim(
-    image: np.ndarray,  # (H, W, 3)
-    truth: np.ndarray,  # (H, W, 3)
-    where: np.ndarray | EllipsisType = ...,
-) -> float:
+def ssim(image: np.ndarray, truth: np.ndarray, where: np.ndarray | EllipsisType = ...) -> float:
     """Compute the structural similarity that the loss uses (`fitting.ssim`); `where` as in `psnr`.
 
     Outside of the image the window reads zeros, as in 3DGS and Ref-Gaussian; means are over every pixel.
@@ -103,28 +94,17 @@ def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.clip(np.asarray(image, np.float64), 0, 1), np.clip(np.asarray(truth, np.float64), 0, 1)
 
 
-# ---------------- normals ----------------
-
-
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
     """Compute the mean angle in degrees between normal maps, over the foreground and over the whole image.
 
     `normal` is rendered, of any length; `truth` (H, W, 3) is 0 where nothing is hit; `alpha` (H, W) is true.
-    Foreground is alpha > 0.5 with a true normal; a missing rendered normal counts 90° there.
-    `normal_mae_deg` is the mean over the foreground; `normal_mae_deg_full` divides the same sum by all
-    pixels, so the background counts as 0°, as in most papers. Both are 0 for an image without foreground.
+    A missing rendered normal counts 90° on the foreground (`foreground`). `normal_mae_deg_full` divides the
+    same sum by all pixels, so the background counts as 0°, as in most papers.
     """
-    if normal.shape != truth.shape or normal.shape[:2] != np.shape(alpha):
-        sizes = f"{normal.shape}, {truth.shape}, {np.shape(alpha)}"
-        raise InputError(
-            f"shapes {sizes} do not fit", "metrics", "normal", "render at the size of the data set"
-        )
     scored = foreground(truth, alpha)
     total = float(np.sum(angle_deg(normal, truth)[scored]))
-    return {
-        "normal_mae_deg": total / max(int(scored.sum()), 1),
-        "normal_mae_deg_full": total / scored.size,
-    }
+    count = max(int(scored.sum()), 1)
+    return {"normal_mae_deg": total / count, "normal_mae_deg_full": total / scored.size}
 
 
 def foreground(truth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -141,9 +121,6 @@ def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.where((cosine == 0) & (sine == 0), 90.0, np.degrees(np.arctan2(sine, cosine)))
 
 
-# ---------------- light ----------------
-
-
 def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     """Compare a fitted environment map with the ground truth after a least-squares scale per channel.
 
@@ -153,10 +130,8 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     sRGB encoding and clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
-    for name, array in (("fitted", light), ("ground-truth", truth)):
-        if array.ndim != 3 or array.shape[2] != 3 or array.shape[0] < 2 or not np.all(np.isfinite(array)):
-            need = "need finite (h, w, 3) values, h ≥ 2; write the map again"
-            raise InputError(f"{name} environment: {need}", "metrics")
+    if not np.all(np.isfinite(truth)):
+        raise InputError("need finite values; write the map again", "metrics", "ground-truth environment")
     rows = lobe_matrices.resampling(len(truth), len(light)).toarray()
     columns = lobe_matrices.resampling(truth.shape[1], light.shape[1], periodic=True).toarray()
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)
@@ -175,9 +150,6 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
         "env_psnr": psnr_of(error),
         "env_correlation": correlation,
     }
-
-
-# ---------------- time ----------------
 
 
 def frame_milliseconds(render: Callable[[Camera], Frame], cameras: Sequence[Camera], data: Dataset) -> float:

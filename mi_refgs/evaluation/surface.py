@@ -22,19 +22,17 @@ from mi_refgs.shade.ggx_sampling import lobe_turn
 from mi_refgs.synthesis.settings import SURFACE
 from mi_refgs.types import Bool, Float, Point3f, UInt32, Vector3f
 
-OPEN_RAYS = 64
-"""Rays over the hemisphere of each point: the fraction of unoccluded ones is accurate to 1/64 or better."""
+OPEN_RAYS = 64  # over the hemisphere of each point: ambient visibility is accurate to 1/64 or better
 CONCAVE_BELOW = 0.9
 """Ambient visibility below which a point is concave. It is 1 on a convex object, ½ in a corner of two walls,
-1 - h / 2R everywhere inside a spherical cap of height h and radius R. At 0.9 a tenth of the diffuse
-light is not that of the environment; the error of OPEN_RAYS is below that."""
+1 - h / 2R everywhere inside a spherical cap of height h and radius R."""
 QUERIES = 20_000  # points per surface whose distances are averaged
-TARGETS = 200_000
-"""Points on a surface among which the nearest are searched: 0.01 apart on an object of size 2."""
+TARGETS = 200_000  # points on a surface among which the nearest are searched
 CANDIDATES = 8  # nearest of these points, to whose triangles the distance is computed
-GRAZING = 0.1  # cosine to the viewing ray below which a view does not see a point: its pixel may see the back
-NEAR_TRUTH = 1.2
-"""Radius, relative to the true surface's, beyond which an open scene's mesh is not compared with it."""
+GRAZING = 0.1  # cosine to the viewing ray below which a view does not see a point
+NEAR_TRUTH = (
+    1.2  # radius, in radii of the true surface, within which an open scene's mesh is compared with it
+)
 SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
 NO_SURFACE = f"the data set has no true surface: {SURFACE}, which `refgs dataset` writes"
 
@@ -48,10 +46,7 @@ class TrueSurface:
 
     @staticmethod
     def read(folder: Path, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> TrueSurface | None:
-        """Read the surface of a data set, relative to `Dataset.offset`; None where there is none.
-
-        Raises InputError for a file that cannot be read.
-        """
+        """Read the surface of a data set, relative to `Dataset.offset`; None where there is none."""
         path = folder / SURFACE
         if not path.is_file():
             return None

@@ -21,10 +21,11 @@ MAX_DEPTH = 6  # edges of a path, as in `refgs dataset`
 SAMPLES = 256  # samples per pixel by default; -D spp=16 on Mitsuba's command line chooses others
 SCENE, MESH, LIGHT = "scene.xml", "mesh.ply", "envmap.exr"
 TEXTURES = {"base_color": "albedo.png", "roughness": "roughness.png", "metallic": "metallic.png"}
-DIFFUSE_RATIO = (-0.119, 0.182, -0.102, 0.958)
-"""Reflectance of our diffuse base under constant light, divided by that of `principled`: a cubic in the
-roughness, accurate to 0.2 %. Ours receives the light that the specular layer transmits; that of `principled`
-receives all light. [Burley 2015, "Extending the Disney BRDF to a BSDF", §4]"""
+ROUGHNESSES = (0.0, 0.125, 0.1875, 0.25, 0.5, 0.75, 1.0)
+DIFFUSE_RATIO = (0.9594, 0.9471, 0.9431, 0.9410, 0.9391, 0.9330, 0.9210)
+"""Reflectance of our diffuse base under constant light, divided by that of `principled`, by roughness. Ours
+receives the light that the specular layer transmits; that of `principled` receives all light, by quadrature of
+[Burley 2015, "Extending the Disney BRDF to a BSDF", §4]."""
 
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int) -> list[Path]:
@@ -76,5 +77,5 @@ def _ply(made: TexturedMesh) -> bytes:
 
 def base_colour(made: TexturedMesh) -> np.ndarray:
     """Return the `base_color` (N, N, 3) with which `principled` reflects as much constant light as ours."""
-    dielectric = np.polyval(DIFFUSE_RATIO, made.roughness)
+    dielectric = np.interp(made.roughness, ROUGHNESSES, DIFFUSE_RATIO)
     return made.albedo * (made.metallic + (1 - made.metallic) * dielectric)[..., None].astype(np.float32)

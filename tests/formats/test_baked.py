@@ -16,7 +16,7 @@ import trimesh
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot, baking, write
 from mi_refgs.formats.baking import TexturedMesh, bake, simplified, texels, unwrap
-from mi_refgs.formats.mitsuba_scene import DIFFUSE_RATIO, base_colour
+from mi_refgs.formats.mitsuba_scene import DIFFUSE_RATIO, ROUGHNESSES, base_colour
 from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.images import linear_from_srgb, read_png
 from mi_refgs.occlusion.mesh import Mesh
@@ -235,7 +235,7 @@ def test_plain_mitsuba_reads_texture_encodings(exported: Exported) -> None:
 @pytest.mark.parametrize("roughness", [0.2, 0.9])
 def test_principled_albedo_equals_ours(roughness: float) -> None:
     """Mean albedo over all view directions: sampled weights against the split-sum table."""
-    rgb = {"type": "rgb", "value": [0.6 * float(np.polyval(DIFFUSE_RATIO, roughness))] * 3}
+    rgb = {"type": "rgb", "value": [float(0.6 * np.interp(roughness, ROUGHNESSES, DIFFUSE_RATIO))] * 3}
     bsdf = mi.load_dict({"type": "principled", "base_color": rgb, "roughness": roughness, "specular": 0.5})
     count = 1 << 18
     random = mi.PCG32(count)
