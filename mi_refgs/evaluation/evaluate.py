@@ -132,7 +132,8 @@ def _measure(
     Returns their scores; and what the sheet shows of some: the render, the view, and more images by title.
     """
     render, maps_of = fitted.renderer(samples=samples), material_maps(fitted, samples)
-    object_only = replace(fitted, surroundings=None).renderer(samples=samples)
+    around = fitted.surroundings is not None
+    object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
     in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
     per_view: list[dict[str, Any]] = []
     shown = []
@@ -158,7 +159,7 @@ def _measure(
             more: dict[str, np.ndarray] = {}
             if concave is not None:
                 more["concave"] = over_colour(concave[..., None] * ORANGE, view.covered())
-            if fitted.surroundings is not None:
+            if object_only is not None:
                 more["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
             shown.append((rendered, view, more))
     return per_view, shown

@@ -6,13 +6,14 @@ point of the mesh. Points that no view sees get those of the surfels around the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
+from scipy import ndimage
 
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError, SceneError
@@ -31,20 +32,15 @@ from mi_refgs.shade.reflectance import Reflectance
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Array, Float, Point2f, Point3f, UInt32, Vector3f
 
-PACKAGES = "fast_simplification", "xatlas"
-"""Packages of the extra that baking needs; trimesh calls the former."""
-SMOOTHING = 30
-"""Steps of Taubin's filter, which removes the stairs of the voxels from a surface and keeps its volume.
-[Taubin 1995, "A Signal Processing Approach to Fair Surface Design"]"""
+PACKAGES = "fast_simplification", "xatlas"  # of the extra; trimesh calls the former
+SMOOTHING = 30  # steps of the filter that removes stairs of voxels and keeps the volume [Taubin 1995]
 PADDING = 4  # texels between charts, so that two mip levels, and bilinear lookup in them, see no other chart
 FLAT = 1e-6  # voxel of the texture's plane as a mesh: its rays have length 1 and need next to no offset
 VIEWS = 64  # rendered views, spread evenly over the cameras of the fit; about a third of them see a point
 VIEW_SIZE = 512  # pixels along the longer side of a rendered view: four per voxel of an object of 128 voxels
 OUTLINES = 8  # approximate number of views whose outlines show how far the mesh lies below the surface
-GROWTH, HALVINGS = 2.0, 6
-"""Voxels by which the mesh is moved outwards, at most, and bisection steps: to 1/32 voxel."""
-UNSEEN = 1e-2
-"""Weight of the surfels around a vertex, where each view weighs up to 1: they decide where no view sees."""
+GROWTH, HALVINGS = 2.0, 6  # voxels by which the mesh is moved outwards, at most, and bisection steps
+UNSEEN = 1e-2  # weight of the surfels around a vertex, where each view weighs up to 1
 COLUMNS = 8  # columns per point: albedo (3), metallic, roughness, normal (3)
 
 
@@ -66,9 +62,8 @@ class TexturedMesh:
 def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int) -> TexturedMesh:
     """Bake the object to a mesh of at most about `faces` triangles with textures of texture² texels.
 
-    Background Gaussians are left out; the light is that of the fit (`runs.relightable` says which materials
-    the object gets). Raises InputError for a scene without mesh, light or materials, numbers out of range,
-    and missing packages.
+    Background Gaussians are left out (`runs.relightable` says which materials the object gets). Raises
+    InputError for a scene without mesh, light or materials, numbers out of range, and missing packages.
     """
     if faces < 100:
         raise InputError(f"{faces} is out of range", "--faces", remedy="give a number from 100")
@@ -80,14 +75,12 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
         import_extra(package)
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
-        raise SceneError(
-            "the run has none", "mesh", remedy="fit one with occlusion, as `--for relighting` does"
-        )
+        remedy = "fit one with occlusion, as `--for relighting` does"
+        raise SceneError("the run has none", "mesh", remedy=remedy)
     model = scene.shading.model
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
-        raise SceneError(
-            f"{model.name} has no textures", "reflectance", remedy="export `scene.xml`, or another model"
-        )
+        remedy = "export `scene.xml`, or another model"
+        raise SceneError(f"{model.name} has no textures", "reflectance", remedy=remedy)
 
     # Views that show the object's materials.
     plain = replace(scene, shading=scene.shading.untraced())
@@ -100,12 +93,11 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
         covered, triangle, barycentric = texels(cut_faces, uv, texture)
         # Materials and normals at vertices and texels.
         points, start = _points(mesh, scene, triangle, barycentric)
-
-        def rendered(view: Camera) -> tuple[Frame, list[Float]]:
-            frame = renderer(view)
-            return frame, _columns(model, frame.maps)
-
-        found = _mean_of_views(views, rendered, points, start, OFFSET_VOXELS * mesh.voxel)
+        frames = map(renderer, views)
+        pairs = (
+            (view, frame, _columns(model, frame.maps)) for view, frame in zip(views, frames, strict=True)
+        )
+        found = _mean_of_views(pairs, points, start, OFFSET_VOXELS * mesh.voxel)
     count = len(mesh.vertices)
     maps = _padded(covered, found[count:, :5])
     return TexturedMesh(
@@ -120,18 +112,11 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
     )
 
 
-# ---------------- the mesh and its texture coordinates ----------------
-
-
 def simplified(mesh: Mesh, faces: int) -> Mesh:
-    """Smooth a mesh, reduce it to at most about `faces` triangles (quadric edge collapse), remove floaters.
-
-    Raises InputError for a mesh without faces.
-    """
+    """Smooth a mesh, reduce it to at most about `faces` triangles by edge collapse, and remove floaters."""
     if not len(mesh.faces):
-        raise SceneError(
-            "the run has none that textures could be baked to", "mesh", remedy="train it for longer"
-        )
+        what = "the run has none that textures could be baked to"
+        raise SceneError(what, "mesh", remedy="train it for longer")
     low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0).max()
     made = trimesh.Trimesh((mesh.vertices - low) / size, mesh.faces, process=False)
     trimesh.smoothing.filter_taubin(made, iterations=SMOOTHING)
@@ -178,10 +163,7 @@ def texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, UI
 
 
 def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Frame]) -> Mesh:
-    """Move a mesh along its normals until it covers as many pixels of the views as the surfels do.
-
-    The mesh is made of expected depths, which lie behind the first of the surfels that they average.
-    """
+    """Move a mesh of expected depths along its normals until it covers as many pixels as the surfels do."""
     covered = sum(float(dr.sum(renderer(view).object_alpha)[0]) for view in views)
     normals = _normals(mesh)
 
@@ -210,23 +192,16 @@ def _normals(mesh: Mesh) -> np.ndarray:
     return np.array(trimesh.Trimesh(scaled, mesh.faces, process=False).vertex_normals, np.float32)
 
 
-# ---------------- materials and normals ----------------
-
-
 def _columns(model: Reflectance, values: Mapping[str, Array]) -> list[Float]:
-    """Return albedo, metallic and roughness of attributes by name."""
     made = model.textures(values)
     assert made is not None  # `bake` refuses others
     return [*made["albedo"], made["metallic"], made["roughness"]]
 
 
 def _points(
-    mesh: Mesh,
-    scene: TrainedScene,
-    triangle: UInt32,  # (T,)
-    barycentric: Point2f,  # (T,)
+    mesh: Mesh, scene: TrainedScene, triangle: UInt32, barycentric: Point2f
 ) -> tuple[Point3f, list[Float]]:
-    """Return the mesh's vertices, then the points on its triangles: positions (V + T,) and their COLUMNS.
+    """Return the mesh's vertices, then T points on its triangles: positions (V + T,) and their COLUMNS.
 
     Materials are those of the surfels around the vertices, normals those of the mesh.
     """
@@ -248,8 +223,7 @@ def _points(
 
 
 def _mean_of_views(
-    views: Sequence[Camera],
-    renderer: Callable[[Camera], tuple[Frame, list[Float]]],
+    views: Iterable[tuple[Camera, Frame, list[Float]]],  # with albedo, metallic and roughness of the pixels
     points: Point3f,  # (P,)
     start: list[Float],  # COLUMNS × (P,)
     reach: float,  # scene units
@@ -263,7 +237,7 @@ def _mean_of_views(
     weight = dr.full(mi.Float, UNSEEN, dr.width(points))
     total = [UNSEEN * column for column in start]
     for view in views:
-        own, values = _sample_view(view, *renderer(view), points, outward, dr.opaque(mi.Float, reach))
+        own, values = _sample_view(*view, points, outward, dr.opaque(mi.Float, reach))
         weight += own
         total = [a + b for a, b in zip(total, values, strict=True)]
         dr.eval(weight, total)
@@ -311,13 +285,7 @@ def _sample_view(
 
 
 def _padded(covered: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return textures (N, N, C) of values (T, C) of the texels that are `covered` (N, N).
-
-    Other texels get the value of the nearest covered one, so that no lookup at the edge of a chart, or in a
-    mip level, reads a texel outside the surface.
-    """
-    from scipy import ndimage
-
+    """Return textures (N, N, C) of values (T, C) of `covered` (N, N) texels; others get the nearest value."""
     image = np.zeros((*covered.shape, values.shape[1]), np.float32)
     image[covered] = values
     rows, columns = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)

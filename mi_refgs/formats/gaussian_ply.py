@@ -42,8 +42,7 @@ def write(
 def read_splats(path: Path, linear: bool = False) -> TrainedScene:
     """Read a PLY file of 3D Gaussians or surfels: positions, rotations, scales, opacities and colours.
 
-    `linear`: its colours are linear radiance, as this package writes them. Raises InputError for any other
-    file.
+    `linear`: its colours are linear radiance, as this package writes them.
     """
     _require_splat_file(path)
     surfels = read_ply(path)

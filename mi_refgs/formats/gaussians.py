@@ -38,22 +38,19 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 THIN = 0.01  # third standard deviation of a surfel relative to its shorter one: thicker ones widen outlines
-INSET = 0.8
-"""Pixels of the training cameras by which surfels move inwards: alpha of a ring is then 34.9 dB from that of
-the surfels, without 24.0 dB."""
+INSET = 0.8  # pixels of the training cameras by which surfels move inwards
 SEEN = 0.5  # blended weight, in pixels over these views, above which a surfel counts as seen
 VIEWS = 64  # maximum number of renders that colours are fitted to
 PIXELS = 400**2  # maximum number of pixels per render: colours need no more, and time grows with it
-STEPS = 3  # conjugate-gradient steps after the first; two improve a chair by 2.8 dB
-DAMPING = 0.1  # λ, over the 1/4π that Y² is on average; the factor l² gains 2 to 3 dB in other views
+STEPS = 3  # conjugate-gradient steps after the first
+DAMPING = 0.1  # λ, over the 1/4π that Y² is on average
 
 
 @remember_last
 def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_only: bool) -> Surfels:
     """Return the scene as 3D Gaussians whose radiance_sh of `degree` are display-encoded.
 
-    `object_only`: without the background Gaussians; the environment is never included. Raises InputError for
-    a degree out of range, and for a scene without surfels.
+    `object_only`: without the background Gaussians; the environment is never included.
     """
     if not 0 <= degree <= MAX_SH_DEGREE:
         raise InputError(f"{degree} is out of range", "--degree", remedy=f"give 0 to {MAX_SH_DEGREE}")
@@ -68,7 +65,10 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
 
     # Training cameras, spread evenly over all of them, of at most PIXELS.
     chosen = [shot.camera for shot in shots if shot.split == "train"] or [shot.camera for shot in shots]
-    cameras = [_limited(chosen[i]) for i in evenly_spread(len(chosen), VIEWS)]
+    cameras = []
+    for camera in (chosen[i] for i in evenly_spread(len(chosen), VIEWS)):
+        factor, side = (camera.width * camera.height / PIXELS) ** 0.5, max(camera.width, camera.height)
+        cameras.append(camera if factor <= 1 else camera.resized(round(side / factor)))
 
     # Geometry: surfels get a thin third axis, and move inwards.
     parts = [_geometry(table) for table in tables]
@@ -87,14 +87,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     return Surfels.from_numpy(raw | {"radiance_sh": sh})
 
 
-def _limited(camera: Camera) -> Camera:
-    """Return a camera of at most about PIXELS."""
-    factor = (camera.width * camera.height / PIXELS) ** 0.5
-    return camera if factor <= 1 else camera.resized(round(max(camera.width, camera.height) / factor))
-
-
 def _is_flat(table: Surfels) -> bool:
-    """Whether the table is of surfels."""
     return table.raw["scale"].shape[1] == 2
 
 
@@ -164,10 +157,7 @@ class _ColourFit:
         self.ridge = np.zeros((table.count, self.terms))
 
     def solve(self) -> np.ndarray:
-        """Return coefficients (N, 3 terms) float32 in the order of an attribute's columns.
-
-        Gaussians that no view sees get the coefficients of the nearest one that is seen.
-        """
+        """Return coefficients (N, 3 terms) float32; unseen Gaussians get those of the nearest seen one."""
         right, inverse, weight = self._preconditioner()
         shape = right.shape
 

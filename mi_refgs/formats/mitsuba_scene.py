@@ -24,7 +24,7 @@ TEXTURES = {"base_color": "albedo.png", "roughness": "roughness.png", "metallic"
 ROUGHNESSES = (0.0, 0.125, 0.1875, 0.25, 0.5, 0.75, 1.0)
 DIFFUSE_RATIO = (0.9594, 0.9471, 0.9431, 0.9410, 0.9391, 0.9330, 0.9210)
 """Reflectance of our diffuse base under constant light, divided by that of `principled`, by roughness. Ours
-receives the light that the specular layer transmits; that of `principled` receives all light, by quadrature of
+receives the light that the specular layer transmits; that of `principled` receives all light, and is Disney's
 [Burley 2015, "Extending the Disney BRDF to a BSDF", §4]."""
 
 

@@ -19,8 +19,7 @@ from mi_refgs.surfels.table import Surfels
 AROUND = {"test": 4, "train": 60}  # cameras around an object without a data set
 SIZE, FIELD_OF_VIEW = 512, 40.0  # pixels and degrees of their square images
 ELEVATION = (-10.0, 70.0)  # degrees
-INSIDE = 0.98
-"""Fraction of the surfels, by opacity, in the sphere that fills these images: strays lie far out."""
+INSIDE = 0.98  # fraction of the surfels, by opacity, in the sphere that fills these images; others are strays
 SIGMAS = 2.0  # standard deviations around its centre up to which a surfel is in that sphere
 
 
@@ -32,8 +31,7 @@ def shots_around(
 ) -> list[Shot]:
     """Return cameras on a sphere around the surfels, z up, evenly spread within each split.
 
-    The images show everything but strays (INSIDE). The first camera of a split is at middle height. Raises
-    InputError if there are no surfels.
+    The images show everything but strays (INSIDE). The first camera of a split is at middle height.
     """
     position, weight = _weighted(surfels)
     middle = _middle(position, weight)

@@ -41,10 +41,10 @@ def fit(
     long, "quick", "standard" (the default), "paper", or iterations and largest number of surfels,
     "1000:20000". settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"].
 
-    output: the run folder, which is kept. Without one a temporary folder is used, which is removed with the
-    last `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`, if there is
-    one; other arguments are those that it was started with, or absent. progress: True shows messages and a
-    bar on standard error, False only Python's warnings; a `Progress` is called after each step.
+    output: the run folder. Without one a temporary folder is used, which is removed with the last
+    `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`, if there is one;
+    other arguments are those that it was started with, or absent. progress: True shows messages and a bar on
+    standard error, False only Python's warnings; a `Progress` is called after each step.
 
     Raises InputError for bad input, and KeyboardInterrupt with a message that says where the checkpoints are.
     """
@@ -109,9 +109,8 @@ class ProgressBar(Previews):
 
     def begin(self, trainer: Trainer) -> None:
         super().begin(trainer)
-        # A short memory: the first steps compile kernels.
-        options: dict[str, Any] = {"initial": trainer.iteration, "smoothing": 0.05}
-        self.bar = progress_bar(trainer.method.iterations, trainer.method.name, **options)
+        method, begin = trainer.method, trainer.iteration
+        self.bar = progress_bar(method.iterations, method.name, initial=begin, smoothing=0.05)
 
     def step(self, trainer: Trainer) -> None:
         if trainer.iteration % trainer.method.log_every == 0:

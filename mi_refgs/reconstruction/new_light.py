@@ -23,9 +23,8 @@ from mi_refgs.synthesis.pathtrace import ENVIRONMENT_OVERSAMPLING, environment_i
 from mi_refgs.synthesis.settings import RELIGHT, Z_UP, recorded_lights
 
 HEIGHT = 256  # maximum number of rows of a light: a texel is 0.7°, an eighth of the lobe of roughness 0.1
-READ_ROWS = ENVIRONMENT_OVERSAMPLING * HEIGHT
-"""Rows to which a larger map is averaged first: a rotated map is sampled at as many."""
-EXPOSURE_MAX = 10.0  # stops; a light stores no radiance below 1e-4, so that a much darker one would be grey
+READ_ROWS = ENVIRONMENT_OVERSAMPLING * HEIGHT  # to which a larger map is averaged first
+EXPOSURE_MAX = 10.0  # stops; a light stores no radiance below 1e-4
 
 
 @dataclass(frozen=True)
@@ -40,12 +39,6 @@ class NewLight:
     def __post_init__(self) -> None:
         require_file(self.path)
         _require_range(self.rotate, self.exposure)
-
-    @property
-    def suffix(self) -> str:
-        """Return the part of a folder's name for rotation and exposure, such as "_r90_e-1", or nothing."""
-        turned = f"_r{self.rotate:g}" if self.rotate % 360 else ""
-        return turned + (f"_e{self.exposure:+g}" if self.exposure else "")
 
     @property
     def identity(self) -> str:

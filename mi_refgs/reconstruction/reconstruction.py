@@ -68,8 +68,6 @@ class Reconstruction:
         ]
         return "Reconstruction[\n  " + ",\n  ".join(parts) + "\n]"
 
-    # ---------------- cameras ----------------
-
     @property
     def method(self) -> Method:
         return self.provenance.method
@@ -168,8 +166,6 @@ class Reconstruction:
             scene = replace(self.trained, surroundings=None) if object_only else self.trained
             self._renderers[key] = scene.renderer(aovs=aovs, samples=samples)
         return self._renderers[key](camera)
-
-    # ---------------- other programs ----------------
 
     def scene(
         self,

@@ -1,13 +1,11 @@
-"""Render the scene of a run under another light into a folder, and score it where there is ground truth.
+"""Render the scene of a run under another light, scored where there is ground truth. Its folder contains
 
-The folder contains
-
-    test/r_000.png, .exr    the test views as a data set has them: straight sRGB, premultiplied linear RGBA
-    turntable/t_000.png     or these, of cameras around the object
-    scene.xml, surfels.ply, envmap.exr, mesh.ply, model.json    from which `mi.load_file` renders the same
-    relight.json            the settings, and the score where the data set has ground truth under this light
-    sheet.png               relit images and the ground truth; and the environment map
-    turntable/relight.json, sheet.png    the same of a turntable, with the frames
+test/r_000.png, .exr    the test views as a data set has them: straight sRGB, premultiplied linear RGBA
+turntable/t_000.png     or these, of cameras around the object
+scene.xml, surfels.ply, envmap.exr, mesh.ply, model.json    from which `mi.load_file` renders the same
+relight.json            the settings, and the score where the data set has ground truth under this light
+sheet.png               relit images and the ground truth; and the environment map
+turntable/relight.json, sheet.png    the same of a turntable, with the frames
 """
 
 from __future__ import annotations
@@ -90,7 +88,9 @@ def relight(
 
     # The folder.
     name = light.path.stem if true_views is None else light.path.parent.name
-    folder = run.path / "relight" / f"{name}{light.suffix}" if out is None else out
+    name += f"_r{light.rotate:g}" if light.rotate % 360 else ""
+    name += f"_e{light.exposure:+g}" if light.exposure else ""
+    folder = run.path / "relight" / name if out is None else out
     inside = folder.resolve().is_relative_to(run.path.resolve())  # both may then move together
     owner = f"relight {requested.identity}" + ("" if inside else f" of {run.path.resolve()}")
     own_folder(folder, owner)
@@ -154,14 +154,9 @@ def _rows(
 ) -> list[dict[str, np.ndarray]]:
     """Return the rows of the sheet: relit, relit after the scale, and ground truth; or all frames."""
     if truth:
-        return [
-            {
-                "relit": displayed_over(ours[i], background),
-                "relit, per-channel scale": displayed_over(ours[i], background, scale),
-                "ground truth": displayed_over(truth[i], background),
-            }
-            for i in evenly_spread(len(ours), SHEET_VIEWS)
-        ]
+        titles = "relit", "relit, per-channel scale", "ground truth"
+        shown = [(ours[i], ours[i] * [*scale, 1], truth[i]) for i in evenly_spread(len(ours), SHEET_VIEWS)]
+        return [{t: displayed_over(x, background) for t, x in zip(titles, row, strict=True)} for row in shown]
     frames = [(str(i), displayed_over(image, background)) for i, image in enumerate(ours)]
     lines = -(-len(frames) // SHEET_COLUMNS)
     columns = -(-len(frames) // lines)  # rows of equal length: 8 frames are 4 and 4, not 6 and 2
@@ -177,8 +172,7 @@ def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.
     """
     a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))
     inside = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
-    chosen = inside[:: max(1, len(inside) // SCALE_PIXELS)]
-    a, b = a[chosen], b[chosen]
+    a, b = (x[inside[:: max(1, len(inside) // SCALE_PIXELS)]] for x in (a, b))
     scale = np.ones(3)
     for c in range(3):
         goal, mean = encoded_over_black(b[:, c], b[:, 3]), (a[:, c].sum(), b[:, c].sum())
@@ -205,10 +199,10 @@ def score(
     views = []
     for name, own, true in zip(names, ours, truth, strict=True):
         goal = displayed_over(true, background)
-        plain, scaled = displayed_over(own, background), displayed_over(own, background, scale)
         found: dict[str, Any] = {"name": name}
-        for key, measure in (("psnr", metrics.psnr), ("ssim", metrics.ssim)):
-            found |= {key: measure(plain, goal), f"{key}_scaled": measure(scaled, goal)}
+        for suffix, factor in (("", 1.0), ("_scaled", scale)):
+            shown = displayed_over(own, background, factor)
+            found |= {f"psnr{suffix}": metrics.psnr(shown, goal), f"ssim{suffix}": metrics.ssim(shown, goal)}
         views.append(found)
     means = {k: float(np.mean([v[k] for v in views])) for k in views[0] if k != "name"}
     return means | {"scale": [float(x) for x in scale], "views": views}

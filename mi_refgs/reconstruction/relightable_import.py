@@ -63,11 +63,10 @@ def import_relightable(
         method = methods.for_purpose(PURPOSE)
     wanted = runner.load_method(None if method is None else str(method), preset)
     made = import_splats(path, linear=linear, box=box)
-    given = [
-        Shot(f"{split}/r_{i:03d}", split, camera)
-        for split in VIEWS
-        for i, camera in enumerate(held_out(cameras or (), split))
-    ]
+    given = []
+    for split in VIEWS:
+        chosen = enumerate(held_out(cameras or (), split))
+        given += [Shot(f"{split}/r_{i:03d}", split, camera) for i, camera in chosen]
     views, owner = run.path / DATA, f"import of {path.resolve()}"
     if not (resume and run.exists()):
         run.require_none()
@@ -96,7 +95,6 @@ def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> 
 
 
 def _write_views(made: Reconstruction, shots: Sequence[Shot], folder: Path, bar: bool) -> None:
-    """Render the views, and write them and then their cameras."""
     try:
         for shot in with_bar(shots, "views", unit="view", disable=not bar):
             write_png(folder / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from mi_refgs.cli.evaluate import table
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.evaluation.error_budget import CLASSES, ErrorBudget, classify
-from mi_refgs.evaluation.evaluate import evaluate
 from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.evaluation.surface import TrueSurface
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
-from tests.scenes.known import write_known_run
 
 SIZE, DISTANCE = 60, 60.0
 """Pixels per side; distance of the camera from the origin on the x axis, where a pixel is 1 unit wide."""
@@ -94,9 +89,8 @@ def test_shares_of_planted_errors() -> None:
         turn = np.radians(degrees)[classes]
         normal = np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
         image = np.where(classes == 0, -0.7, error[classes])  # below 0 is displayed as the true 0
-        budget.add(
-            RenderedView(np.repeat(image[..., None], 3, -1), view.covered(), normal, {}), view, classes
-        )
+        rendered = RenderedView(np.repeat(image[..., None], 3, -1), view.covered(), normal, {})
+        budget.add(rendered, view, classes)
         counts += np.bincount(classes.ravel(), minlength=len(CLASSES))
     error[0] = 0
     found = budget.result()["error_budget"]
@@ -105,24 +99,3 @@ def test_shares_of_planted_errors() -> None:
     shares = counts * error**2 / np.sum(counts * error**2)
     np.testing.assert_allclose([row["squared_error"] for row in found.values()], shares)
     np.testing.assert_allclose([row["normal_mae_deg"] for row in found.values()], degrees, atol=1e-6)
-
-
-def test_no_ground_truth_prints_nothing() -> None:
-    budget, view = ErrorBudget(), view_of(0, 0)
-    bare = View("", SIZE, SIZE, SIZE, SIZE, SIZE / 2, SIZE / 2, view.to_world, view.pixels)
-    assert classify(bare, walls(1)) is None
-    budget.add(RenderedView(view.image, view.covered(), np.zeros((SIZE, SIZE, 3)), {}), bare, None)
-    found = budget.result()
-    assert found["error_budget"] is None and "no ground-truth depth" in found["error_budget_reason"]
-
-
-def test_evaluate_prints_the_budget(known: Path, tmp_path: Path) -> None:
-    """Two balls beside each other: no creases, and some of their mirror rays meet the other ball."""
-    result = evaluate(write_known_run(known / "data", tmp_path / "run"))
-    budget = result["error_budget"]
-    assert list(budget) == ["silhouette", "crease", "mirror_blocked", "mirror_free", "background"]
-    for key in ("pixels", "squared_error"):
-        assert sum(row[key] for row in budget.values()) == pytest.approx(1)
-    assert budget["mirror_blocked"]["pixels"] < 0.3 * budget["mirror_free"]["pixels"]
-    assert "smooth, mirror ray blocked" in table(result)
-    assert "error budget" not in table(result | {"error_budget": None})

@@ -90,9 +90,6 @@ def theirs(tmp_path: Path, rng: np.random.Generator) -> Path:
     return path
 
 
-# ---------------- images ----------------
-
-
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_splat_file_matches_float64_reference(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
     raw, path, c = raw_of(*LAYOUTS[name], rng), tmp_path / "theirs.ply", pinhole()
@@ -105,13 +102,6 @@ def test_splat_file_matches_float64_reference(name: str, tmp_path: Path, rng: np
     assert goal.max() > 1 and goal.std() > 0.1 and band.mean() < 0.2
     assert np.abs(shown - goal)[~band].max() < 2e-4
     assert GAUSSIAN_LOW_PASS == 0.3  # theirs
-
-
-def test_mesh_formats_of_an_imported_run_are_refused(theirs: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    assert main(["import", str(theirs), "-o", str(run)]) == 0
-    command = ["export", run, "--to", "mitsuba", "-o", tmp_path / "out"]
-    refused(command, f"{run}: reflectance: displayed shows the light of the fit only; fit one")
 
 
 def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path) -> None:
@@ -162,9 +152,6 @@ def test_displayed_model_inverts_the_srgb_encoding() -> None:
     np.testing.assert_allclose(np.array(dr.grad(out.x)), slope, rtol=1e-4)
 
 
-# ---------------- other files ----------------
-
-
 def broken(kind: str, whole: bytes) -> bytes:
     """A file that is wrong in one way."""
     header, end, body = whole.partition(b"end_header\n")
@@ -205,9 +192,6 @@ def test_other_ply_files_are_refused(
     assert not (tmp_path / "run").exists()
 
 
-# ---------------- cameras ----------------
-
-
 def transforms() -> dict[str, object]:
     frame = {"transform_matrix": (pinhole().to_world @ MITSUBA_FROM_OPENGL).tolist()}
     return {"w": 64, "h": 48, "camera_angle_x": 0.8, "frames": [frame, {**frame, "w": 32, "fl_x": 40.0}]}
@@ -243,28 +227,9 @@ def test_bad_transforms_file_is_refused(change: dict[str, object], message: str,
     refused(lambda: read_cameras(file), file, message)
 
 
-def test_render_uses_cameras_of_a_file(theirs: Path, tmp_path: Path) -> None:
-    """The image of a camera that is no sensor of the run; wrong frames are refused."""
-    file, run, out = tmp_path / "camera.json", tmp_path / "run", tmp_path / "out.exr"
-    file.write_text(json.dumps(transforms()))
-    assert main(["import", str(theirs), "-o", str(run)]) == 0
-    command = ["render", str(run), "-o", str(out), "--camera", str(file), "--sensor"]
-    assert main([*command, "1"]) == 0
-    camera = read_cameras(file)[1]
-    goal = mi_refgs.load(run).render(camera)
-    channels = read_exr(out)
-    picture = np.stack([channels[name] for name in "RGBA"], axis=-1)
-    assert picture.shape == goal.shape == (camera.height, camera.width, 4) and goal[..., 3].max() > 0.5
-    np.testing.assert_allclose(picture, goal, atol=2e-3)
-    refused([*command, "2"], f"{file}: --sensor: 2: the file has 2 frames; give 0 to 1")
-
-
 @pytest.mark.parametrize("scale", [1e-4, 1e5])
 def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path: Path) -> None:
-    """A black ball in white light, whose camera has no near plane: it is not cut off.
-
-    The scene is any of Mitsuba's; it has no sensor, and is refused without cameras.
-    """
+    """A black ball in white light is not cut off; the scene of Mitsuba's has no sensor."""
     scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.exr"
     scene.write_text(
         '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
@@ -276,6 +241,9 @@ def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path
     file.write_text(json.dumps({"w": 16, "h": 12, "camera_angle_x": 0.8, "frames": [frame]}))
     command = ["render", str(scene), "-o", str(out)]
     refused(command, "sensor: the scene has none; add one, or give a file with --camera")
+    refused(
+        [*command, "--camera", file, "--sensor", "2"], f"{file}: --sensor: 2: the file has 1 frames; give"
+    )
     assert main([*command, "--camera", str(file)]) == 0
     seen = read_exr(out)["R"]
     assert seen.shape == (12, 16) and seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)

@@ -45,14 +45,6 @@ def test_panorama_zenith_is_z_and_rotates_about_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(brighter, 2**1.5 * plain, rtol=1e-3, atol=3e-4)
 
 
-def test_panorama_equals_environment_of_the_data_set(known: Path) -> None:
-    """The file that `refgs dataset --relight` was given, and the environment.exr that it made of it."""
-    panorama = NewLight(known / "dusk.exr").read()
-    world = NewLight(known / "data/relight/dusk/environment.exr", world=True).read()
-    a, b = (np.array(x.radiance()).reshape(32, 64, 3) for x in (panorama, world))
-    np.testing.assert_allclose(a, b, atol=1e-3)
-
-
 def test_ground_truth_is_found_by_the_content_of_the_light(known: Path, tmp_path: Path) -> None:
     data = known / "data"
     shutil.copy(known / "dusk.exr", tmp_path / "other name.exr")
