@@ -27,8 +27,8 @@ CLASSES = tuple(PIXEL_CLASSES)
 def classify(view: View, surface: TrueSurface | None) -> np.ndarray | None:
     """Return the index in CLASSES (H, W) of each pixel of a loaded view; None without true depth and normals.
 
-    A pixel of several classes is silhouette first, then crease. At a depth edge, the line between the points
-    of neighbouring pixels leaves the tangent plane of either by more than CREASE_DEGREES.
+    At a depth edge, the line between the points of neighbouring pixels leaves the tangent plane of either by
+    more than CREASE_DEGREES.
     """
     if view.depth is None or view.normal is None:
         return None
@@ -86,11 +86,8 @@ class ErrorBudget:
         self.sums += [np.bincount(classes.ravel(), x.ravel(), len(CLASSES)) for x in values]
 
     def result(self) -> dict[str, Any]:
-        """Return `error_budget` of metrics.json, None with a reason if no view has ground truth.
-
-        Each class that occurs has `pixels` (fraction of all), `squared_error` (fraction of the sum over all
-        pixels; 0 if there is none) and `normal_mae_deg`, None where it has no true normal.
-        """
+        """Return `error_budget` of metrics.json: per class the shares of `pixels` and of `squared_error`, and
+        `normal_mae_deg`. None, with a reason, if no view has ground truth."""
         pixels, squared, angle, known = self.sums
         if not pixels.any():
             reason = "the data set has no ground-truth depth and normals"

@@ -50,21 +50,18 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     Every key of the upper level is always present; a score that does not apply is null, and `NAME_reason`
     says why.
 
-    `psnr_region`, `ssim_region`   pixels whose ray meets the data's region of interest; `region_share` of all
-    `normal_…`                     pixels with true alpha above ½ (where there is alpha) and a true normal
-    `…_concave`                    pixels where the true surface is concave (`evaluation.surface`)
-    `error_budget`                 shares of the squared error per class of pixels, pooled over the views
-                                   (`evaluation.error_budget`)
-    `psnr_gain`                    after one gain per channel and view (`data.exposure.fitted_gain`), which
-                                   compares methods on images of different exposure
-    `psnr_registered`              with the pose at which a render fits the view best (`data.registration`),
-                                   if the fit corrected its cameras: all may have moved with the scene
-    `exposure`, `cameras`          whether the fit had gains of its training views, and corrected cameras
-    `image_size`                   of the test views as they are read, each pixel the mean of `downscale`²
-                                   pixels of the file; scores of different sizes are not comparable
-    `ms_per_frame`                 median over single synchronised frames of the displayed image without AOVs,
-                                   with the environment map prefiltered beforehand
-    `caption`                      scale, mask and frame of these numbers
+    `…_region`            pixels whose ray meets the data's region of interest; `region_share` of all
+    `normal_…`            pixels with true alpha above ½ (where there is alpha) and a true normal
+    `…_concave`           pixels where the true surface is concave (`evaluation.surface`)
+    `error_budget`        shares of the squared error per class of pixels (`evaluation.error_budget`)
+    `psnr_gain`           after one gain per channel and view (`data.exposure.fitted_gain`)
+    `psnr_registered`     with the pose at which a render fits the view best (`data.registration`), if the fit
+                          corrected its cameras: all may have moved with the scene
+    `exposure`, `cameras` whether the fit had gains of its training views, and corrected cameras
+    `image_size`          of the test views as they are read, each pixel the mean of `downscale`² of the file
+    `ms_per_frame`        median over single synchronised frames of the displayed image without AOVs, with the
+                          environment map prefiltered beforehand
+    `caption`             scale, mask and frame of these numbers
 
     Renders have `samples` per pixel, box filtered (`render.samples`). Raises InputError for a folder that is
     no run or contains neither a scene nor a checkpoint, and for data that is gone.
@@ -78,9 +75,37 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
 
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
-    files = [run.path / name for name in renders]
     errors, budget = Decomposition(), ErrorBudget()
-    scores, shown = _measure(fitted, views, surface, samples, files, progress, errors, budget)
+    render, maps_of = fitted.renderer(samples=samples), material_maps(fitted, samples)
+    around = fitted.surroundings is not None
+    object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
+    in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
+    scores: list[dict[str, Any]] = []
+    shown: list[tuple[RenderedView, View, dict[str, np.ndarray]]] = []  # in the sheet, with more images
+    for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
+        # Scores.
+        view = view.load()
+        frame = render(view.camera())
+        rendered = RenderedView.of(frame, views, view)
+        scores.append(_scores(rendered, view, views, scores[0] if scores else {}))
+        gain, gained = with_gain(frame, view, views)
+        scores[-1] |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
+
+        # Errors of materials, of concave pixels and per class of pixels.
+        concave = None if surface is None else surface.concave(view)
+        rendered = replace(rendered, maps=maps_of(view.camera(), rendered))
+        errors.add(rendered, view, concave)
+        budget.add(rendered, view, classify(view, surface))
+
+        # Images.
+        write_png(run.path / renders[index], rendered.image)
+        if index in in_sheet:
+            more: dict[str, np.ndarray] = {}
+            if concave is not None:
+                more["concave"] = over_colour(concave[..., None] * ORANGE, view.covered())
+            if object_only is not None:
+                more["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
+            shown.append((rendered, view, more))
     if corrected := bool(run.cameras()):
         _register(scores, fitted, views, samples, progress)
 
@@ -115,54 +140,6 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     write_png(run.path / SHEET, contact_sheet(rows, footer))
     run.write_json(METRICS, result)
     return result
-
-
-def _measure(
-    fitted: TrainedScene,
-    views: Dataset,
-    surface: TrueSurface | None,
-    samples: int,
-    images: Sequence[Path],  # one per view
-    progress: bool,
-    errors: Decomposition,
-    budget: ErrorBudget,
-) -> tuple[list[dict[str, Any]], list[tuple[RenderedView, View, dict[str, np.ndarray]]]]:
-    """Render and measure the test views one by one, and write their images.
-
-    Returns their scores; and what the sheet shows of some: the render, the view, and more images by title.
-    """
-    render, maps_of = fitted.renderer(samples=samples), material_maps(fitted, samples)
-    around = fitted.surroundings is not None
-    object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
-    in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
-    per_view: list[dict[str, Any]] = []
-    shown = []
-    for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
-        # Scores.
-        view = view.load()
-        frame = render(view.camera())
-        rendered = RenderedView.of(frame, views, view)
-        scores = _scores(rendered, view, views, per_view[0] if per_view else {})
-        gain, gained = with_gain(frame, view, views)
-        scores |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
-        per_view.append(scores)
-
-        # Errors of materials, of concave pixels and per class of pixels.
-        concave = None if surface is None else surface.concave(view)
-        rendered = replace(rendered, maps=maps_of(view.camera(), rendered))
-        errors.add(rendered, view, concave)
-        budget.add(rendered, view, classify(view, surface))
-
-        # Images.
-        write_png(images[index], rendered.image)
-        if index in in_sheet:
-            more: dict[str, np.ndarray] = {}
-            if concave is not None:
-                more["concave"] = over_colour(concave[..., None] * ORANGE, view.covered())
-            if object_only is not None:
-                more["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
-            shown.append((rendered, view, more))
-    return per_view, shown
 
 
 def _register(

@@ -29,7 +29,7 @@ CELL_MIN = 128  # pixels: smaller images are enlarged by a whole factor
 MARGIN = 4  # pixels between images
 TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 14
 """Heights of titles in pixels, and widths of images per height: the longest title then fits."""
-BESIDE_GREYS = np.array([0.80, 0.87, 0.95])  # pale blue: on white, a metal (metallic 1) would not be visible
+BESIDE_GREYS = np.array([0.80, 0.87, 0.95])  # pale blue: on white, a metallic of 1 would not be visible
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
 
@@ -123,15 +123,12 @@ def over_colour(image: np.ndarray, alpha: np.ndarray, colour: np.ndarray | float
 def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Tone-map a fitted environment map (h, w, 3), linear, and the ground truth at one exposure, by title.
 
-    The fitted one is first scaled per channel to the ground truth by least squares. Both are turned upright.
+    The fitted one is first scaled per channel to the ground truth by least squares.
     """
     if truth is None:
         return {"fitted environment": light_image(light)}
-    fitted = light * np.array(environment(light, truth)["env_scale"])
-    return {
-        "fitted environment": light_image(fitted, truth),
-        "ground-truth environment": light_image(truth),
-    }
+    fitted = light_image(light * np.array(environment(light, truth)["env_scale"]), truth)
+    return {"fitted environment": fitted, "ground-truth environment": light_image(truth)}
 
 
 def light_image(radiance: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
@@ -193,5 +190,4 @@ def _line(cells: dict[str, np.ndarray], size: int) -> np.ndarray:
 
 
 def _padded(image: np.ndarray, below: int, right: int) -> np.ndarray:
-    """Pad an image with white."""
     return np.pad(image, ((0, below), (0, right), (0, 0)), constant_values=1)

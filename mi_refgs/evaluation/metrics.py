@@ -33,10 +33,7 @@ TIMED_FRAMES = 20  # frames whose median is reported; the views repeat if there 
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | EllipsisType = ...) -> float:
-    """Compute the peak signal-to-noise ratio in dB over all pixels and channels, at most 100.
-
-    `where` (H, W) selects pixels, at least one; by default the background counts too.
-    """
+    """Compute the PSNR in dB over all pixels, or those of `where` (H, W), and channels, at most 100."""
     image, truth = _pair(image, truth)
     return psnr_of(float(np.mean((image - truth)[where] ** 2)))
 
@@ -73,8 +70,7 @@ def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
 def _lpips_network() -> Any:
     import lpips as package
 
-    # The authors recommend "alex" for comparing images ("forward" scores).
-    return package.LPIPS(net="alex", verbose=False).eval()
+    return package.LPIPS(net="alex", verbose=False).eval()  # as the authors recommend for comparing images
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
@@ -124,10 +120,9 @@ def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     """Compare a fitted environment map with the ground truth after a least-squares scale per channel.
 
-    Pixels are weighted by solid angle. Light and albedo share an unknown per-channel scale. The true map is
-    resampled to the fitted one's grid (`shade.lobe_matrices`: first and last row on the poles) by
-    averaging. Keys: `env_scale` (three numbers), `env_mae` (linear, after the scale), `env_psnr` (dB, after
-    sRGB encoding and clamping to [0, 1]) and `env_correlation` (Pearson, of the same encoded values).
+    Pixels are weighted by solid angle. The true map is averaged to the fitted one's grid
+    (`shade.lobe_matrices`: first and last row on the poles). Keys: `env_scale` (three numbers), `env_mae`
+    (linear), `env_psnr` (dB, of sRGB-encoded values in [0, 1]) and `env_correlation` (Pearson, of the same).
     """
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
     if not np.all(np.isfinite(truth)):

@@ -93,19 +93,19 @@ def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> E
             remedy = "give them to NewLight"
             raise InputError("it has its own world, rotate and exposure", "light", "NewLight", remedy)
         return light.read()
+    if isinstance(light, str | Path):
+        return NewLight(Path(light), world, rotate, exposure).read()
     if isinstance(light, EnvironmentLight):
         return world_light(light.radiance().numpy(), True, rotate, exposure)
-    if isinstance(light, np.ndarray):
-        return world_light(light, world, rotate, exposure)
-    return NewLight(Path(light), world, rotate, exposure).read()
+    return world_light(light, world, rotate, exposure)
 
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
     """Find the data set with test views under this light; return it and the light of its renders, or None.
 
     The light must be the map that `refgs dataset --relight` was given, by the content of the file, or an
-    environment.exr of the data set itself, unless its images show an object in a room; a rotated light has no
-    ground truth. Raises InputError for such an environment.exr without `world`.
+    environment.exr of the data set itself, which requires `world`, unless its images show an object in a
+    room; a rotated light has no ground truth.
     """
     content = light.path.read_bytes()
     digest = hashlib.sha256(content).hexdigest()

@@ -15,7 +15,6 @@ from mi_refgs.formats import Shot
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
-from mi_refgs.runs.export import save
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import read_views, with_poses, with_region
@@ -43,11 +42,6 @@ class Provenance:
         records = {CAMERAS: cameras} if (cameras := run.cameras()) else {}
         records |= {EXPOSURE_FILE: read_json(exposure)} if exposure.is_file() else {}
         return Provenance(method, run.dataset(), run.region(), tuple(made), records)
-
-    def save(self, trained: TrainedScene, folder: Path, camera: Camera) -> None:
-        """Write a scene as a run folder (`runs.export.save`)."""
-        records = self.records | ({EDITS: {"edits": self.edits}} if self.edits else {})
-        save(trained, folder, self.method, camera, data=self.data, region=self.region, records=records)
 
     def with_data(self, folder: Path | None) -> Provenance:
         """Replace the data set, unless `folder` is None; raises InputError for a path that is no folder."""

@@ -28,11 +28,11 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.reconstruction.new_light import AnyLight, any_light
-from mi_refgs.reconstruction.provenance import Provenance
+from mi_refgs.reconstruction.provenance import EDITS, Provenance
 from mi_refgs.render.display import composited
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.runs.export import export, newest, write_if_stale
+from mi_refgs.runs.export import export, newest, save, write_if_stale
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
@@ -84,18 +84,16 @@ class Reconstruction:
         """Return cameras on a circle around the object, at the distance and height of the test views."""
         return self.provenance.turntable(self.trained, count)
 
-    def camera(
-        self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None, split: str = "test"
-    ) -> Camera:
-        """Convert a camera, a view, a Mitsuba sensor or an index of `cameras(split)` to a `Camera`.
+    def camera(self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None) -> Camera:
+        """Convert a camera, a view, a Mitsuba sensor or an index of `cameras()` to a `Camera`.
 
         size: resize it (`Camera.resized`). Raises InputError for an index out of range and any other object.
         """
         if isinstance(camera, int | np.integer):
-            known = self.cameras(split)
+            known = self.cameras()
             if not -len(known) <= camera < len(known):
                 remedy = f"give 0 to {len(known) - 1}"
-                raise InputError(f"{split} has {len(known)}", "camera", f"{camera}", remedy)
+                raise InputError(f"test has {len(known)}", "camera", f"{camera}", remedy)
             found = known[camera]
         elif isinstance(camera, View):
             found = camera.camera()
@@ -142,7 +140,7 @@ class Reconstruction:
         albedo, roughness, metallic (0 … 1) and unit normals (world, towards the camera) are those of the
         visible surface; depth is the distance along the ray from the near plane, scene units; diffuse,
         specular and indirect are premultiplied and sum to the image of the object over black. Raises
-        InputError for an unknown name, or an attribute that the surfels do not have.
+        InputError for a name that is unknown or that the surfels do not have.
         """
         kinds = suffixes()
         for name in names:
@@ -174,12 +172,12 @@ class Reconstruction:
         aovs: Sequence[str] = (),
         object_only: bool = False,
     ) -> Any:
-        """Make a `mi.Scene` whose integrator has this reconstruction, and one sensor per camera.
+        """Make the `mi.Scene` of a run's scene.xml, with one sensor per camera.
 
         `mi.traverse` of it lists the raw attributes (N, D) of the surfels, such as "refgs.roughness", and the
-        raw environment map, "refgs.light": `mi.render(scene, params)` differentiates all of them. The scene
-        is the one that `mi.load_file` reads from the scene.xml of a run. aovs: types, or name:type, appended
-        to the image. Raises InputError for a camera that no Mitsuba sensor represents, and unknown AOVs.
+        raw environment map, "refgs.light": `mi.render(scene, params)` differentiates all of them. aovs:
+        types, or name:type, appended to the image. Raises InputError for a camera that no Mitsuba sensor
+        represents, and unknown AOVs.
         """
         several = cameras if isinstance(cameras, list | tuple) else [cameras]
         first, *more = map(self.camera, several)
@@ -192,7 +190,10 @@ class Reconstruction:
 
         It renders the same images, bit for bit. Raises InputError for a folder that has other files.
         """
-        self.provenance.save(self.trained, Path(folder), self.cameras()[0])
+        source, camera = self.provenance, self.cameras()[0]
+        records = source.records | ({EDITS: {"edits": source.edits}} if source.edits else {})
+        options: dict[str, Any] = {"data": source.data, "region": source.region, "records": records}
+        save(self.trained, Path(folder), source.method, camera, **options)
         return load(folder)
 
     def export(self, form: str, path: str | Path, **options: Any) -> list[Path]:

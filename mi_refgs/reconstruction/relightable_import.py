@@ -76,7 +76,12 @@ def import_relightable(
         with run.alone():
             own_folder(run.path, RUN)
             own_folder(views, owner)
-            _write_views(made, shots, views, progress is not False)
+            try:
+                for shot in with_bar(shots, "views", unit="view", disable=progress is False):
+                    write_png(views / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))
+            except KeyboardInterrupt as error:
+                raise type(error)("interrupted while views were rendered; repeat the command") from None
+            write_json(views / TRANSFORMS, transforms(shots))
     elif owner_of(views) != owner or not (views / TRANSFORMS).is_file():
         raise InputError(f"{views} has no views of this file", path, "--resume", "choose another -o")
     return fit(views, method, preset=preset, output=output, resume=resume, progress=progress)
@@ -92,12 +97,3 @@ def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> 
     if np.mean(border) > OPAQUE_BORDER:
         what = "views are opaque up to the border, so this is a scene, not a free object"
         raise InputError(what, path, "surfels", "crop the object with --box")
-
-
-def _write_views(made: Reconstruction, shots: Sequence[Shot], folder: Path, bar: bool) -> None:
-    try:
-        for shot in with_bar(shots, "views", unit="view", disable=not bar):
-            write_png(folder / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))
-    except KeyboardInterrupt as error:
-        raise type(error)("interrupted while views were rendered; give the same command again") from None
-    write_json(folder / TRANSFORMS, transforms(shots))
