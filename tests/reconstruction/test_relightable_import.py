@@ -25,6 +25,7 @@ from mi_refgs.io.images import read_png, straight_srgb
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.reconstruction import relightable_import
 from tests.helpers import refused
+from tests.scenes.layouts import ply_bytes
 from tests.scenes.splat_file import (
     PRESET,
     RADIUS,
@@ -190,7 +191,8 @@ def test_scene_all_around_is_refused(ball: Path, tmp_path: Path) -> None:
     sky = write_ball(tmp_path / "room.ply", **{f"scale_{i}": 4.0 for i in range(3)})
     argv = ["import", sky, "-o", tmp_path / "run", "--relightable", "--preset", PRESET]
     refused(argv, f"{sky}: surfels: views are opaque up to the border", "--box")
-    hidden = write_ball(tmp_path / "hidden.ply", opacity=-9.0)
+    columns, hidden = ball_columns(), tmp_path / "hidden.ply"
+    hidden.write_bytes(ply_bytes(columns | {"opacity": columns["opacity"] - 13}))
     refused(["import", hidden, *argv[2:]], hidden, "views of the surfels show nothing")
     assert not (tmp_path / "run").exists()
 
