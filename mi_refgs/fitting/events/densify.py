@@ -46,7 +46,7 @@ class Densify(Event[Trainer]):
 
     name: ClassVar[str] = "densify"
 
-    when: Window
+    when: Window  # iterations at which it happens
     grow: float = field(default=0.25, metadata=at_least(0))  # fraction of the surfels split at most
     prune_opacity: float = field(default=0.05, metadata=between(0, 1))  # surfels of less are removed
     prune_extent: float = field(default=0.1, metadata=at_least(0))  # scene extents; larger ones are removed

@@ -32,7 +32,7 @@ class ExtractMesh(Event[Trainer]):
 
     name: ClassVar[str] = "mesh"
 
-    when: Window = RELEASED
+    when: Window = RELEASED  # iterations at which it happens
     resolution: int = field(default=128, metadata=at_least(2))  # voxels along the longest side
 
     def due(self, trainer: Trainer) -> bool:

@@ -35,7 +35,7 @@ class MoreSurfels(Decision):
 
     name: ClassVar[str] = "more_surfels"
 
-    doubling: tuple[Doubling, ...]
+    doubling: tuple[Doubling, ...]  # trials, in their order
 
     def components(self) -> Sequence[str]:
         return [f"surfels_{2 ** (i + 1)}x" for i in range(len(self.doubling))]

@@ -18,7 +18,7 @@ class PhotographLight(Event[Trainer]):
 
     name: ClassVar[str] = "photograph_light"
 
-    when: Window
+    when: Window  # iterations at which it happens
 
     def due(self, trainer: Trainer) -> bool:
         open_ = trainer.surroundings is not None and trainer.region is not None

@@ -33,7 +33,7 @@ class Propagate(Event[Trainer]):
 
     name: ClassVar[str] = "propagate"
 
-    when: Window
+    when: Window  # iterations at which it happens
     opacity: float = field(default=0.9, metadata=inside(0, 1))  # all surfels become at least this opaque
     scale: float = field(default=1.5, metadata=at_least(0))  # factor of the scales of reflective surfels
     metallic: float = field(default=0.02, metadata=between(0, 1))  # reflective: at least this metallic …

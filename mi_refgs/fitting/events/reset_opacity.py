@@ -31,7 +31,7 @@ class ResetOpacity(Event[Trainer]):
 
     name: ClassVar[str] = "reset_opacity"
 
-    when: Window
+    when: Window  # iterations at which it happens
     raise_to_start: tuple[str, ...] = ()  # bounded attributes
 
     def require(self, attributes: Collection[str]) -> None:
