@@ -37,7 +37,7 @@ class Profile:
         from mi_refgs.fitting.runner import load_method
         from mi_refgs.fitting.train import Trainer
         from mi_refgs.runs.run import Run
-        from mi_refgs.runs.views import read_views, sized, views_of_run
+        from mi_refgs.runs.views import sized, views_of_run
 
         if self.steps < 1:
             raise InputError(f"{self.steps} is out of range", "--steps", remedy="give a number from 1")
@@ -46,8 +46,8 @@ class Profile:
             method = folder.method()
             trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)
         else:
-            method = sized(load_method(self.method, self.preset, joined(self.set)), self.path, say)
-            trainer = Trainer(method, read_views(method, self.path, "train", truth=False))
+            wanted = load_method(self.method, self.preset, joined(self.set))
+            trainer = Trainer(*sized(wanted, self.path, say))
         stage = trainer.method.stage_at(max(trainer.iteration, 1))[0]
         rows = phases_of(stepper(trainer, stage), self.steps)
         lines = [f"{'phase':<20}{'ms':>10}{'launches':>10}{'share':>8}"]

@@ -21,7 +21,6 @@ from mi_refgs.cli.command import (
     optional,
 )
 from mi_refgs.cli.view import HOST, PORT, Port
-from mi_refgs.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,24 +49,18 @@ class Train:
 
     def run(self) -> Result:
         """Fit, from the start or from the newest checkpoint."""
-        from mi_refgs.fitting.decide import table
-        from mi_refgs.fitting.runner import method_for
         from mi_refgs.reconstruction.fit import ProgressBar, fit
 
-        if self.purpose is not None and self.method is not None:
-            what = f"{self.purpose}: --method {self.method} is given"
-            raise InputError(what, "--for", remedy="give one of the two")
         progress = ProgressBar()
         if self.watch:
             from mi_refgs.viewer.training import TrainingViewer
 
             progress = TrainingViewer(HOST, self.port)
 
-        begin, method, settings = time.monotonic(), self.method, joined(self.set)
-        if self.purpose is not None:
-            method = method_for(self.data, self.purpose, self.preset, settings, progress.say)
+        begin = time.monotonic()
         given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
-        fit(self.data, method, settings=settings, progress=progress, **given)
+        given |= {"settings": joined(self.set), "purpose": self.purpose}
+        fit(self.data, self.method, progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None
 
@@ -81,7 +74,7 @@ class Train:
             "surfels": trainer.surfels.count,
             "loss": trainer.statistics()["loss"],
         }
-        around = trainer.surroundings
+        around = trainer.fit.surroundings
         beside = "" if around is None else f" and {around.surfels.count} of the background"
         text = (
             f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s "
@@ -89,6 +82,4 @@ class Train:
         )
         if trainer.fit.decisions:
             data["decisions"] = trainer.fit.decisions
-            if any(row["psnr_with"] for row in trainer.fit.decisions):  # a trial that measured a gain
-                text = f"{table(trainer.fit.decisions)}\n{text}"
         return Result(data, text)

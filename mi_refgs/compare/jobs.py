@@ -58,7 +58,8 @@ class Job:
 
     def method(self) -> Method:
         """Load the method; raises InputError as `load` and `sized` do."""
-        return sized(load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"]), Path(self.data))
+        method = load(self.variant, self.preset, [*self.settings, f"seed={self.seed}"])
+        return sized(method, Path(self.data))[0]
 
     def write(self) -> None:
         """Write the job into its run folder; raises InputError where that is impossible."""

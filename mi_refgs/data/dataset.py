@@ -7,6 +7,7 @@ A·rgb + (1 − A)·background. EXR targets are linear and premultiplied: radian
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,7 +17,6 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.data.exposure import log_exposure
 from mi_refgs.data.images import ImageCache, ImageFile, ImageSource
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.region import Region, read_region, region_of
@@ -163,8 +163,7 @@ def make_view(
         image = replace(image, undistortion=straight)
     source = ImageSource(image, options.background, options.cache, image.has_alpha())
     view = View(name, *image.size, fx, fy, cx, cy, to_world, source, file=file)
-    linear, exposure = options.images == "exr", log_exposure(image.path)
-    return replace(view, is_linear_radiance=linear, exposure=exposure), straight
+    return replace(view, is_linear_radiance=options.images == "exr"), straight
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +181,7 @@ class Dataset:
     notes: tuple[str, ...] = ()  # as in `Recording`
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # subtracted from all positions of the files
     unknown: PixelRays | None = None  # pixels whose depth stereo has not found; None: it has not been tried
+    downscale: int = 1  # side of the blocks of pixels that are averaged
 
     @property
     def has_alpha(self) -> bool:
@@ -203,14 +203,16 @@ def read_dataset(
     path: str | Path,
     split: str,
     *,
-    downscale: int = 1,
+    downscale: int | None = None,
+    pixels: int = sys.maxsize,
     background: str = "white",
     images: str = "png",
     truth: bool = True,
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
-    `downscale`: side of the blocks of pixels that are averaged; incomplete blocks are left out.
+    `downscale`: side of the blocks of pixels that are averaged, by default the smallest for which the first
+        image has at most `pixels`; incomplete blocks are left out.
     `background`: "white" or "black", behind images with alpha.
     `images`: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
     `truth`: read ground-truth normals, depth and materials where there are any.
@@ -224,11 +226,14 @@ def read_dataset(
         raise InputError(f"unknown value '{background}'", path, "background", "give white or black")
     if images not in ("png", "exr"):
         raise InputError(f"unknown value '{images}'", path, "images", "give png or exr")
-    if downscale < 1:
+    options = ReadOptions(1 if downscale is None else downscale, BACKGROUNDS[background], images, truth)
+    if options.downscale < 1:
         raise InputError(f"{downscale} is out of range", path, "downscale", "give a whole number from 1")
-    options = ReadOptions(downscale, BACKGROUNDS[background], images, truth)
     reader = reader_of(path)
     found = reader.read(path, split, options)
+    if downscale is None and (factor := _fitting(found.views[0], pixels)) > 1:
+        options = replace(options, downscale=factor)
+        found = reader.read(path, split, options)
     views, notes, points = found.views, found.notes, found.points
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
@@ -265,21 +270,26 @@ def read_dataset(
         points = None if points is None else replace(points, position=points.position - offset)
         position = f"({x:.12g}, {y:.12g}, {z:.12g})"
         notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
-    colour, light = np.full(3, BACKGROUNDS[background], dtype=np.float32), found.environment
-    return Dataset(path, split, views, colour, images == "exr", light, points, region, notes, (x, y, z))
+    return Dataset(
+        path,
+        split,
+        views,
+        np.full(3, BACKGROUNDS[background], dtype=np.float32),
+        images == "exr",
+        found.environment,
+        points,
+        region,
+        notes,
+        (x, y, z),
+        downscale=options.downscale,
+    )
 
 
-def fitting_downscale(path: str | Path, images: str, pixels: int) -> tuple[int, int, int]:
-    """The smallest `downscale` for which the first training image has at most `pixels` pixels.
-
-    Also returns the width and height of that image's file. Raises InputError as `read_dataset` does.
-    """
-    options = ReadOptions(images=images, truth=False)
-    first = reader_of(Path(path)).read(Path(path), "train", options).views[0]
-    width, height = ((first.file or first).width, (first.file or first).height)
-    factors = range(1, min(width, height))
-    factor = next((k for k in factors if (width // k) * (height // k) <= pixels), min(width, height))
-    return factor, width, height
+def _fitting(view: View, pixels: int) -> int:
+    """The smallest `downscale` for which the file of a view has at most so many pixels."""
+    size = view.file or view
+    most = min(size.width, size.height)
+    return next((k for k in range(1, most) if (size.width // k) * (size.height // k) <= pixels), most)
 
 
 def _own_alpha(view: View) -> bool:

@@ -1,33 +1,14 @@
-"""Exposure and white balance: EXIF data, and the gains that fit a render to an image."""
+"""Exposure and white balance: the gains that fit a render to an image."""
 
 from __future__ import annotations
-
-import math
-from pathlib import Path
 
 import numpy as np
 
 from mi_refgs.data.view import View
-from mi_refgs.io.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_image
+from mi_refgs.io.images import SRGB_LINEAR_LIMIT, linear_from_srgb
 
-EXPOSURE_TIME, F_NUMBER, ISO = 33434, 33437, 34855  # EXIF 2.3 tags: seconds, f-number, sensitivity
 CLIPPED = float(linear_from_srgb(np.array(254.5 / 255)))  # linear value from which an 8-bit image is clipped
 MAX_GAIN = 16.0  # gains are limited to this and its inverse, ± 4 stops: larger ones mean a failed render
-
-
-def log_exposure(path: Path) -> float | None:
-    """log(time · ISO / f-number²) from the EXIF data of an image; None unless it contains all three."""
-    if path.suffix.lower() == ".exr":
-        return None
-    with open_image(path) as image:
-        _, settings = exif_tags(image)
-    try:
-        sensitivity = settings[ISO]
-        iso = sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity
-        exposure = float(settings[EXPOSURE_TIME]) * float(iso) / float(settings[F_NUMBER]) ** 2
-    except (KeyError, IndexError, TypeError, ValueError, ArithmeticError):  # missing, or nonsense
-        return None
-    return math.log(exposure) if 0 < exposure < math.inf else None
 
 
 def fitted_gain(

@@ -7,22 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset, reader_of
+from mi_refgs.data.dataset import Dataset, read_dataset, reader_of
 from mi_refgs.errors import InputError, counted
 
-SMALL_SIDE = 48  # pixels of the shorter side at which images are read
+SMALL = 64 * 64  # pixels of the first image as it is read
 FEW_VIEWS = 20  # number of training views below which surfels overfit; published scenes have 100 and more
 ONE_PLACE = 1e-4  # distance of cameras in one place from their mean, over that from the origin or the points
 
 
 def survey(folder: Path) -> dict[str, Any]:
     """Survey a data set, reading small images."""
-    _, width, height = fitting_downscale(folder, "png", 1)
-    factor = max(min(width, height) // SMALL_SIDE, 1)
-    train = read_dataset(folder, "train", downscale=factor, truth=False)
+    train = read_dataset(folder, "train", pixels=SMALL, truth=False)
+    first = train.views[0].file or train.views[0]
     notes, views = [*train.notes], [*train.views]
     try:
-        views += read_dataset(folder, "test", downscale=factor, truth=False).views
+        views += read_dataset(folder, "test", downscale=train.downscale, truth=False).views
     except InputError as error:
         notes.append(f"no test views ({error})")
     for view in views:
@@ -47,7 +46,7 @@ def survey(folder: Path) -> dict[str, Any]:
         "layout": reader_of(folder).name,
         "training views": len(train.views),
         "test views": len(views) - len(train.views),
-        "size": [width, height],  # of the first training image in its file
+        "size": [first.width, first.height],  # of the first training image in its file
         "sizes": len({(view.width, view.height) for view in views}),
         "with alpha": with_alpha,
         "points": len(train.points.position) if train.points else 0,  # to start from

@@ -53,7 +53,6 @@ class View:
     materials: dict[str, np.ndarray] = field(default_factory=dict)
     """Known ones of albedo, roughness, metallic: (H, W, C + 1) float32, the last the fraction of the pixel
     that the others describe."""
-    exposure: float | None = None  # log(time · ISO / f-number²) from EXIF data
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
     file: FileCamera | None = None  # from which the image was read
 

@@ -1,7 +1,6 @@
 """Decisions during a fit: it is continued both ways for some steps, and validation views choose.
 
-The better one continues, so a decision costs the steps of the other. Only errors and counts decide, never a
-clock: the same command makes the same decisions on every machine.
+Only errors and counts decide, never a clock: the same command decides the same on every machine.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.image_error import displayed_of, image_of, psnr
 from mi_refgs.fitting.initial import converted, with_columns
-from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import Event
@@ -111,8 +109,7 @@ def differences(run: Run, now: Method) -> dict[str, tuple[Any, Any]]:
 def fork(trainer: Trainer, method: Method) -> Trainer:
     """Copy a fit to a trainer of another method, at the same iteration, without a run folder.
 
-    Attributes, the light and the mesh that the other method lacks are dropped, SH of another degree are cut
-    or filled with zeros, new attributes start as the method says. What is kept has its history.
+    What the other method lacks is dropped, SH are cut or filled with zeros, new attributes start as it says.
     """
     state = trainer.state()
     old, rng = part(state, PARAMS), trainer.setup.rng(trainer.iteration, "branch")
@@ -125,24 +122,14 @@ def fork(trainer: Trainer, method: Method) -> Trainer:
     new = {name: value for name, value in state.items() if not name.startswith(dropped)}
     for name, values in wanted.items():
         new[f"{PARAMS}{name}"] = np.asarray(values, np.float32)
-        new |= {f"{OPTIMISER}{key}": value for key, value in _history(state, old, name, values).items()}
+        for key, kept in part(state, f"{OPTIMISER}{name}/").items():
+            if kept.ndim and values.ndim == 2:
+                kept = with_columns(kept.reshape(old[name].shape), values.shape[1]).ravel()
+            if not kept.ndim or kept.size == values.size:
+                new[f"{OPTIMISER}{name}/{key}"] = kept
     made = Trainer(method, trainer.data, state=new, targets=trainer.targets)
     made.whole, made.validation = trainer.whole, trainer.validation
     return made
-
-
-def _history(
-    state: Mapping[str, np.ndarray], old: Mapping[str, np.ndarray], name: str, values: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Adam's moments of one tensor, with the names of `Adam.state_dict`."""
-    found = Adam.fresh_state(name, values.size)
-    for key, fresh in found.items():
-        kept = state.get(f"{OPTIMISER}{key}", fresh)
-        if kept.ndim and name in old and values.ndim == 2:
-            kept = with_columns(kept.reshape(old[name].shape), values.shape[1]).ravel()
-        if kept.size == fresh.size:
-            found[key] = kept
-    return found
 
 
 def run(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
@@ -154,10 +141,7 @@ def run(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
 
 
 def tried(trainer: Trainer, component: str, rival: Trainer, steps: int, gain: float) -> Row:
-    """Continue a fit for some steps, and a rival too, which stays if its validation PSNR is `gain` dB higher.
-
-    Both are copies, so that an interrupt leaves the fit as it was.
-    """
+    """Continue copies of a fit and of a rival, which stays if its validation PSNR is `gain` dB higher."""
     begin, plain = trainer.iteration, fork(trainer, trainer.method)
     try:
         better = validation_psnr(run(rival, steps, trainer))
@@ -190,14 +174,3 @@ def conclude(trainer: Trainer, row: Row, began: float, verdict: str = "") -> Non
     trainer.save()
     if trainer.run is not None:
         trainer.run.write_method(trainer.method)
-
-
-def table(decisions: Sequence[Mapping[str, Any]]) -> str:
-    """The decisions of a fit as a text table."""
-    rows = [("component", "iteration", "verdict", "reason")]
-    for row in decisions:
-        verdict = "stays" if row["stays"] else "left out"
-        rows.append((row["component"], str(row["iteration"]), verdict, row["reason"]))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
-    return "\n".join("  ".join(row).rstrip() for row in padded)

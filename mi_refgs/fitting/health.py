@@ -16,12 +16,9 @@ from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import BACKGROUND, LIGHT
 from mi_refgs.runs.checkpoint import channels_of
-from mi_refgs.shade.light.kind import FittedLight
 from mi_refgs.surfels.table import Surfels
 
-CULL_SHARE = 0.1
-"""Fraction of the surfels from which on they are not the cause: a pixel has tens of surfels, a scene
-thousands."""
+CULL_SHARE = 0.1  # fraction of the surfels from which on they are not the cause: a pixel has tens
 PATIENCE = 3  # log intervals in which every step fails before the fit ends: removing surfels may help first
 NAMED = 5  # surfels that a message names
 
@@ -38,14 +35,18 @@ class Health:
         """Remove the surfels that made steps fail since the last check; returns a sentence about it, if any.
 
         Raises InputError if the light is not finite, if no surfel is left, or if nothing helps. Waits for the
-        device, and so is called on intervals only.
+        device.
         """
         skipped, steps = state.optimiser.report(), state.iteration - self.checked
         self.checked, self.skipped = state.iteration, self.skipped + skipped.count
         self.failed = self.failed + steps if skipped.count >= steps else 0
-        require_finite_light(state.light)
-        if state.surroundings is not None:
-            require_finite_light(state.surroundings.background, BACKGROUND)
+        background = None if state.surroundings is None else state.surroundings.background
+        for name, light in ((LIGHT, state.light), (BACKGROUND, background)):
+            if light is not None and light.unusable():  # its texel renders black, and no longer learns
+                raise InputError(
+                    f"{name}: a texel is not finite or too large; go on from a checkpoint with a lower "
+                    "rates.light"
+                )
         found = [(table, culprits(table.surfels, skipped, table.prefix)) for table in state.tables]
         rows = {table.prefix + name: at for table, names in found for name, at in names.items()}
         if not rows and not skipped.count:
@@ -65,9 +66,7 @@ class Health:
 
 
 def culprits(surfels: Surfels, skipped: Skipped, prefix: str = "") -> dict[str, np.ndarray]:
-    """Rows that cause failed steps, by attribute: those with unusable values, else with a gradient that is
-    not finite. Empty if the surfels are not the cause. `prefix` is that of the table's parameters.
-    """
+    """Rows that cause failed steps, by attribute: with unusable values, or else such gradients."""
     if unusable := surfels.unusable():
         return unusable
     found = channels_of(skipped.rows, prefix)
@@ -88,12 +87,3 @@ def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str
         return f"{where}{channels} not finite; {skipped.count} steps were left out"
     named = ", ".join(map(str, indices[:NAMED])) + (" …" if len(indices) > NAMED else "")
     return f"{where}{channels} not finite at surfels {named}: {len(indices)} were removed"
-
-
-def require_finite_light(light: FittedLight | None, name: str = LIGHT) -> None:
-    """Raise InputError if a map has a texel that renders black and no longer learns."""
-    if light is not None and light.unusable():
-        rate = "rates.light" if name == LIGHT else "surroundings.rate"
-        raise InputError(
-            f"{name}: a texel is not finite or too large; go on from a checkpoint with a lower {rate}"
-        )

@@ -22,7 +22,7 @@ def image_of(planes: list[Float], view: View) -> np.ndarray:
 
 
 def displayed_of(frame: Frame, data: Dataset, gain: np.ndarray | None = None) -> list[Float]:
-    """`displayed` with an opaque gain, which is not compiled into the kernel."""
+    """`displayed` with an opaque gain."""
     factors = None if gain is None else [dr.opaque(mi.Float, float(g)) for g in gain]
     return displayed(frame, data.background, data.is_linear_radiance, factors)
 

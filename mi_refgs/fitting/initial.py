@@ -71,10 +71,7 @@ def converted(
 
 
 def seen_around(data: Dataset, height: int) -> EnvironmentLight:
-    """The background of the images as a map: colours at the distance of sparse points, else far away.
-
-    The object reflects it, so it is a better initial light than constant radiance.
-    """
+    """The background of the images as a map: colours at the distance of sparse points, else far away."""
     assert data.region is not None
     directions, centre = map_directions(height), np.array(data.region.centre)
     distance = FAR * data.scene_extent
@@ -91,8 +88,8 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
     """The parameters of the background by name: surfels, and a map of the median of their colours."""
     options, region = method.surroundings, data.region
     assert options is not None and region is not None
-    asked = Wanted(options.count, data, rng, options.scattered, region, inside=False)
-    start = started(BACKGROUND_START, asked)
+    wanted = Wanted(options.count, data, rng, options.scattered, region, inside=False)
+    start = started(BACKGROUND_START, wanted)
     order = morton_order(start.position)
     points, colours = start.position[order], start.colour
     distance = np.linalg.norm(points - np.array(region.centre), axis=1)
@@ -116,10 +113,8 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
 def initial_surfels(
     method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool = False
 ) -> Surfels:
-    """`method.surfels.count` surfels with the method's attributes, where the first initialiser in
-    `surfels.start` that fits the data says; in an `open_scene` inside the region.
-
-    Raises InputError as initialisers do.
+    """Surfels where the first initialiser in `surfels.start` that fits the data says; in an `open_scene`
+    inside the region. Raises InputError as initialisers do.
     """
     options = method.surfels
     start: dict[str, Any] = dict(options.initial)

@@ -1,8 +1,8 @@
 """Losses on images given as planes: lists of mi.Float (H*W,) in raster order, or a mi.Color3f.
 
 Letters: I rendered image, T target, A accumulated alpha, L linear radiance, N blended normal Σ w n (not
-unit). Every loss is a mi.Float of width 1, is zero for a perfect image, and has finite gradients for finite
-input. Targets, weights and masks have no derivative. SSIM is in `fitting.ssim`.
+unit). Every loss is of width 1, is zero for a perfect image, and has finite gradients for finite input.
+Targets, weights and masks have no derivative.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def saturated(
 
 
 def clip_highlights(render: Iterable[Float], target: Iterable[Float], clipped: Iterable[Bool]) -> list[Float]:
-    """Replace rendered values above a clipped target value by the latter, which has no gradient."""
+    """Replace rendered values above a clipped target value by the latter, without gradient."""
     return [
         dr.select(mask & (plane > goal), dr.detach(goal), plane)
         for plane, goal, mask in zip(render, target, clipped, strict=True)
@@ -76,9 +76,8 @@ def normal_consistency(
     """Mean over all pixels of A (a - N · n_d), with A detached and only where n_d is valid.
 
     This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A. normal: N, premultiplied; depth_normal: n_d,
-    unit (render.depth_normals); gradients flow to both. `share` is a, the opacity of the surfels that have
-    normals, with gradients: a background in their place is as good. By default all have normals, a is A
-    detached, and the gradient is that of 1 - N · (n_d stopgrad(A)), as in the code of 2DGS.
+    unit; gradients flow to both. `share` is a, the opacity of the surfels that have normals, with gradients;
+    by default it is A detached, as in the code of 2DGS.
     """
     weight = dr.select(valid, dr.detach(alpha), 0.0)
     covered = weight if share is None else share
@@ -124,12 +123,9 @@ def half_metal(metallic: Float, alpha: Float) -> Float:
 
 
 def light_colour(light: Light) -> Float:
-    """Colour of the irradiance: mean of |E - grey E| over the mean of E.
+    """Colour of the irradiance: mean of |E - grey E| over the mean of E, in DIRECTIONS all around.
 
-    E is the irradiance in DIRECTIONS all around. Light and albedo share an unknown per-channel scale: images
-    determine their product only. This prior makes the irradiance grey, and leaves the colour to the albedo;
-    what reflections show of single lamps is finer than E. Highlights of a dielectric determine the scale of
-    the light; otherwise it stays near that of the start.
+    Images determine only the product of light and albedo per channel: this prior leaves colour to the albedo.
     """
     index = dr.arange(mi.Float, DIRECTIONS)
     height = 1 - (index + 0.5) * (2 / DIRECTIONS)
@@ -144,10 +140,9 @@ def light_colour(light: Light) -> Float:
 def light_difference(radiance: Color3f, photographed: Color3f, seen: Float, area: Float) -> Float:
     """Mean |d| over channels and N directions, d = log((1 + L) / (1 + P)), for radiance L and P (width 1).
 
-    The logarithm compares lamps and dark corners alike. Where P is above CLIPPED, a brighter L costs nothing.
-    A direction counts by its `area` (they sum to 1) times `seen`, 0 … 1; the rest counts HUE times by its
-    deviation from the mean d of the channels: what no photograph shows is as bright as reflections say, in
-    the colour of P.
+    Where P is above CLIPPED, a brighter L costs nothing. A direction counts by its `area` (they sum to 1)
+    times `seen`, 0 … 1; the rest counts HUE times by its deviation from the mean d of the channels: what no
+    photograph shows is as bright as reflections say, in the colour of P.
     """
     off = [dr.log(1 + own) - dr.log(1 + other) for own, other in zip(radiance, photographed, strict=True)]
     grey = (off[0] + off[1] + off[2]) / 3

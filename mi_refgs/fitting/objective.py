@@ -23,11 +23,8 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.types import Float
 
 MATERIALS = ("roughness", "metallic")  # maps that neighbouring pixels of similar colour share
-MATERIAL_EDGE = 10.0
-"""Steepness of edges that are kept: a step of 0.1 in the image from a pixel to the next counts a third."""
-GAIN_PRIOR = 1e-3
-"""Weight of the squared log gains: two stops cost as much as 0.6 % of brightness, so it decides only where an
-image does not, such as a channel without light."""
+MATERIAL_EDGE = 10.0  # steepness of edges that are kept: a step of 0.1 between pixels counts a third
+GAIN_PRIOR = 1e-3  # weight of the squared log gains: two stops cost as much as 0.6 % of brightness
 
 
 @dataclass(frozen=True)
@@ -71,9 +68,8 @@ class Loss:
 
 
 def _check_name(loss: Loss) -> None:
-    """Raise InputError for a name that a method file cannot weigh, or that means something else there."""
-    bare = re.fullmatch("[A-Za-z0-9_-]+", loss.name)
-    if not bare or loss.name == "ssim":
+    """Raise InputError for a name that a method file cannot weigh."""
+    if not re.fullmatch("[A-Za-z0-9_-]+", loss.name) or loss.name == "ssim":
         raise InputError(
             f"'{loss.name}' is in use in [loss], or has characters besides letters, digits, _ and -",
             "loss",
@@ -81,9 +77,8 @@ def _check_name(loss: Loss) -> None:
         )
 
 
-LOSSES = Registry[Loss]("loss", _check_name)  # the registered losses, in the order in which they are summed
+LOSSES = Registry[Loss]("loss", _check_name)  # in the order in which they are summed
 register = LOSSES.register
-"""Add a loss, which method files can weigh from then on."""
 
 
 def _normal(inputs: LossInputs) -> Float:
@@ -115,15 +110,15 @@ def _light_colour(inputs: LossInputs) -> Float | None:
     return None if inputs.light is None else losses.light_colour(inputs.light)
 
 
+def _alpha(inputs: LossInputs) -> Float | None:
+    mask = inputs.target.alpha
+    return None if mask is None else losses.alpha_loss(inputs.frame.alpha, mask)
+
+
 def _photographed(inputs: LossInputs) -> Float | None:
     if inputs.light is None or inputs.photographed is None:
         return None
     return inputs.photographed.difference(inputs.light)
-
-
-def _alpha(inputs: LossInputs) -> Float | None:
-    mask = inputs.target.alpha
-    return None if mask is None else losses.alpha_loss(inputs.frame.alpha, mask)
 
 
 register(Loss("normal", _normal, normals=True))
@@ -156,10 +151,7 @@ def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss]:
 
 
 def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: int) -> tuple[Float, Float]:
-    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached.
-
-    Raises InputError for a loss that is not of width 1.
-    """
+    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached."""
     image, target = inputs.image, inputs.target
     # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
     factors = {

@@ -7,10 +7,9 @@ Letters: θ parameter, g gradient, m v first and second moment, t step count of 
 Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, and
 the host reads later (`Adam.report`) how many there were and which rows had such gradients. And |g| is cut to
 OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is more, and
-to RAW_LIMIT, whose square float32 can represent. A step is at most (1 - β₁) / √(1 - β₂) = 3.2 η long however
-large g is, so the cut shortens the present step by less than 5 %. It bounds the memory of v: after one
-gradient of 10¹⁰, an entry of usual gradients 10⁻⁷ would not move for 2 ln(10¹⁷ √(1 - β₂)) / (1 - β₂) = 71,000
-steps; cut, it moves 3.3 times slower, or ten times if it happens in the first hundred steps.
+to RAW_LIMIT, whose square float32 can represent. The cut bounds the memory of v: after a gradient of 10¹⁰, an
+entry of usual gradients 10⁻⁷ would not move for 71,000 steps; cut, it moves 3 to 10 times slower. It shortens
+the present step by less than 5 %.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import RAW_LIMIT
-from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import phase
 from mi_refgs.surfels.table import gather_rows
@@ -78,26 +76,21 @@ class Skips:
     def __init__(self, params: Mapping[str, TensorXf], groups: Mapping[str, Group]) -> None:
         self._params, self._groups = params, groups
         # By number of rows and word w, (rows,): bit b where a gradient of group WORD w + b was not finite.
-        self._marks: dict[tuple[int, int], UInt32] = {}
+        self.marks: dict[tuple[int, int], UInt32] = {}
         self._calls, self._iteration = 0, 0  # number and iteration of the last step
         self._reported = 0  # number of the last step that was reported
         # At the number of a step modulo MEMORY: that number, if the step was skipped.
         self._skipped = dr.opaque(mi.UInt32, 0, MEMORY)
 
-    def good(
-        self,
-        gradients: Mapping[str, Float],  # (N * D,) each
-        iteration: int,
-        loss: Float = None,  # width 1
-    ) -> Bool:  # width 1
-        """Whether the step may be applied."""
+    def good(self, gradients: Mapping[str, Float], iteration: int, loss: Float) -> Bool:
+        """Whether the step may be applied (width 1), by its gradients (N * D,) and its loss (width 1)."""
         self._calls, self._iteration = self._calls + 1, iteration
         number, place = dr.opaque(mi.UInt32, self._calls), dr.opaque(mi.UInt32, self._calls % MEMORY)
         for skip in self._not_finite(gradients):
             if loss is not None:
                 skip |= ~dr.isfinite(loss)
             dr.scatter(self._skipped, number, place, skip)  # almost never active, so it costs nothing
-        dr.eval(self._skipped, self._marks)
+        dr.eval(self._skipped, self.marks)
         return dr.gather(mi.UInt32, self._skipped, place) != number
 
     def report(self) -> Skipped:
@@ -106,17 +99,13 @@ class Skips:
         skipped = skipped[skipped > self._reported]
         rows = {}
         for i, name in enumerate(self._groups if len(skipped) else ()):
-            if (marks := self._marks.get((self._marked(name), i // WORD))) is not None:
+            if (marks := self.marks.get((self._marked(name), i // WORD))) is not None:
                 rows[name] = np.flatnonzero(marks.numpy() >> np.uint32(i % WORD) & 1)
         last = self._iteration - (self._calls - int(skipped.max(initial=0)))
         self._reported = self._calls
         if len(skipped):
-            self._marks.clear()
+            self.marks.clear()
         return Skipped(len(skipped), last, {name: at for name, at in rows.items() if len(at)})
-
-    def forget_rows(self) -> None:
-        """Clear the marks: rows have moved."""
-        self._marks.clear()
 
     def _marked(self, name: str) -> int:
         """Rows of the marks that a tensor shares with others; 1 if its rows are wide."""
@@ -126,8 +115,7 @@ class Skips:
     def _not_finite(self, gradients: Mapping[str, Float]) -> list[Bool]:
         """Masks of what is not finite, by rows or by entries; rows are marked with the bit of each group.
 
-        Tensors of equal length share one scan. Only head columns are tested: the gradient of the other SH
-        columns is that of a head column times a bounded function.
+        Only head columns are tested: the gradient of the other SH columns is theirs times a bounded function.
         """
         by_entry: list[Bool] = []
         by_row: dict[tuple[int, int], UInt32] = {}
@@ -136,10 +124,10 @@ class Skips:
                 continue
             g, rows, bit = gradients[name], self._marked(name), mi.UInt32(1 << i % WORD)
             key = rows, i // WORD
-            self._marks.setdefault(key, dr.opaque(mi.UInt32, 0, rows))
+            self.marks.setdefault(key, dr.opaque(mi.UInt32, 0, rows))
             if rows == 1:
                 bad = ~dr.isfinite(g)
-                dr.scatter_reduce(dr.ReduceOp.Or, self._marks[key], bit, 0, bad, dr.ReduceMode.Direct)
+                dr.scatter_reduce(dr.ReduceOp.Or, self.marks[key], bit, 0, bad, dr.ReduceMode.Direct)
                 by_entry.append(bad)
                 continue
             width = dr.width(g) // rows
@@ -148,28 +136,22 @@ class Skips:
             found = dr.select(reduce(operator.and_, map(dr.isfinite, columns)), mi.UInt32(0), bit)
             by_row[key] = by_row.get(key, mi.UInt32(0)) | found
         for key, found in by_row.items():
-            self._marks[key] |= found
+            self.marks[key] |= found
         return by_entry + [found != 0 for found in by_row.values()]
 
 
 class Adam:
     """Adam over the tensors in `params` that have a group; others are left alone.
 
-    Each step reads `dr.grad` of the tensors and replaces them by new leaves. Everything that changes from
-    step to step is opaque, so a second step of the same kind compiles nothing; one kernel is launched per
-    distinct tensor size.
+    Each step reads `dr.grad` of the tensors and replaces them by new leaves. What changes from step to step
+    is opaque, so a second step of the same kind compiles nothing.
     """
 
     def __init__(self, params: MutableMapping[str, TensorXf], groups: Mapping[str, Group]) -> None:
-        """Create moments for every name in groups; raises InputError for a group without a parameter."""
-        for name in groups:
-            if name not in params:
-                raise InputError(
-                    f"optimiser: {name}: a learning rate without a parameter; use one of {', '.join(params)}"
-                )
+        """Create moments for every name in groups."""
         self.params = params
         self.groups = dict(groups)
-        self.factors: dict[str, float] = {}
+        self.factors: dict[str, float] = {}  # of learning rates, by tensor; 0 freezes it
         self.stage: Mapping[str, float] = {}  # factors of the present stage of a fit
         self._first: dict[str, Float] = {}
         self._second: dict[str, Float] = {}
@@ -186,16 +168,12 @@ class Adam:
         self._set_usual(name, 0.0)
         self.reset(name)
 
-    def set_factor(self, name: str, factor: float) -> None:
-        """Set the factor of one tensor's learning rate; 0 freezes it."""
-        self.factors[name] = factor
-
     def rate(self, name: str, iteration: int) -> float:
         """Learning rate of a tensor's head columns at this iteration."""
         return self.groups[name].at(iteration) * self.factors.get(name, 1.0) * self.stage.get(name, 1.0)
 
     def report(self) -> Skipped:
-        """The steps that were skipped since the last call; waits for the device, so not for every step."""
+        """The steps that were skipped since the last call; waits for the device."""
         return self._skips.report()
 
     @phase("optimiser")
@@ -213,8 +191,7 @@ class Adam:
                 gradients[name] = g
         good = self._skips.good(gradients, iteration, loss)
 
-        # One update per tensor; those of equal step count share a bias correction, since each upload takes
-        # time.
+        # One update per tensor; those of equal step count share an upload.
         updated: dict[str, tuple[Float, tuple[int, ...]]] = {}
         inverse: dict[int, Float] = {}
         for name, g in gradients.items():
@@ -246,14 +223,11 @@ class Adam:
             self.params[name] = mi.TensorXf(θ, shape=shape)
             self._make_leaf(name)
 
-    def _cut(
-        self,
-        name: str,
-        g: Float,  # (N * D,)
-        t: int,
-        inverse: Float,  # 1 / (1 - β₂ᵗ⁻¹), width 1
-    ) -> Float:
-        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite."""
+    def _cut(self, name: str, g: Float, t: int, inverse: Float) -> Float:
+        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite.
+
+        `inverse` is 1 / (1 - β₂ᵗ⁻¹), width 1.
+        """
         if self.groups[name].unit != 1:
             g = g * dr.opaque(mi.Float, self.groups[name].unit)
         if t & (t - 1) == 0:  # at steps 1, 2, 4, …, since it waits for the device
@@ -271,12 +245,9 @@ class Adam:
         self,
         parent: UInt32,  # (M,) rows of the present tensors
         names: list[str],
-        fresh: Bool | None = None,  # (M,) rows that start with zero moments: clones and children
+        fresh: Bool,  # (M,) rows that start with zero moments: clones and children
     ) -> None:
-        """Let the moments of (N, D) tensors follow their rows. Step counts stay.
-
-        Call it after replacing params[name] by the gathered tensor (`Surfels.gather`).
-        """
+        """Let the moments of (N, D) tensors follow their rows, after params[name] was gathered."""
         for name in names:
             if name not in self.groups:
                 continue
@@ -284,13 +255,13 @@ class Adam:
             for moments in (self._first, self._second):
                 old = mi.TensorXf(moments[name], shape=(dr.width(moments[name]) // width, width))
                 rows = gather_rows(old, parent).array
-                if fresh is not None and len(parent):
+                if len(parent):
                     row = dr.arange(mi.UInt32, len(parent) * width) // width
                     rows = dr.select(dr.gather(mi.Bool, mi.Bool(fresh), row), 0.0, rows)
                 moments[name] = rows
             dr.eval(self._first[name], self._second[name])
             self._make_leaf(name)
-        self._skips.forget_rows()
+        self._skips.marks.clear()
 
     def reset(self, name: str) -> None:
         """Zero the moments of one tensor, after params[name] was replaced.
@@ -314,28 +285,15 @@ class Adam:
             state[f"{name}/usual"] = np.array(self._usual[name])
         return state
 
-    @staticmethod
-    def fresh_state(name: str, size: int) -> dict[str, np.ndarray]:
-        """Entries of `state_dict` for a tensor of so many numbers before its first step."""
-        zeros = np.zeros(size, np.float32)
-        parts = {"first": zeros, "second": zeros, "steps": 0, "factor": 1.0, "usual": 0.0}
-        return {f"{name}/{part}": np.array(value) for part, value in parts.items()}
-
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore `state_dict`, bit for bit; raises InputError when it does not fit the tensors."""
+        """Restore `state_dict`, bit for bit; a tensor that it lacks has no history."""
         for name in self.groups:
-            size = math.prod(self.params[name].shape)
             for part, moments in (("first", self._first), ("second", self._second)):
-                values = state.get(f"{name}/{part}")
-                if values is None or values.size != size:
-                    found = "nothing" if values is None else f"{values.size} values"
-                    raise InputError(
-                        f"checkpoint: {name}/{part}: found {found}, expected {size}; resume its own run"
-                    )
-                moments[name] = upload(values)
-            self._steps[name] = int(state[f"{name}/steps"])
-            self._set_usual(name, float(state[f"{name}/usual"]))
-            self.factors[name] = float(state[f"{name}/factor"])
+                if (values := state.get(f"{name}/{part}")) is not None:
+                    moments[name] = upload(values)
+            self._steps[name] = int(state.get(f"{name}/steps", 0))
+            self._set_usual(name, float(state.get(f"{name}/usual", 0.0)))
+            self.factors[name] = float(state.get(f"{name}/factor", 1.0))
 
     def _make_leaf(self, name: str) -> None:
         tensor = dr.detach(self.params[name])
@@ -344,7 +302,7 @@ class Adam:
 
 
 def _distance(positions: Float, centre: tuple[float, float, float]) -> Float:
-    """For each entry (3 N,), the distance of its row from a point."""
+    """The distance of each entry's row from a point, (3 N,)."""
     first = dr.arange(mi.UInt32, dr.width(positions)) // 3 * 3
     offset = (dr.gather(mi.Float, positions, first + k) - dr.opaque(mi.Float, centre[k]) for k in range(3))
     return dr.norm(mi.Vector3f(*offset))

@@ -44,10 +44,7 @@ def gains_of(params: Mapping[str, TensorXf]) -> np.ndarray | None:
 
 
 def corrected(setup: FitSetup, params: Mapping[str, TensorXf], view: int, camera: Camera) -> Camera:
-    """The camera of a training view, at any resolution, with its correction, under AD.
-
-    Itself if the fit has no corrections.
-    """
+    """The camera of a training view, at any resolution, with its correction if it has one, under AD."""
     table = params.get(POSE)
     if table is None:
         return camera

@@ -1,8 +1,7 @@
 """The light that photographs show: a panorama of the fitted background, near which the environment map stays.
 
-Images of an object alone determine only products of light and material. In photographs without alpha the
-background is what lights the object, so the environment map is compared with it, texel by texel. What no
-photograph shows, such as a ceiling, is left to the reflections.
+In photographs without alpha the background is what lights the object, so the environment map is compared with
+it, texel by texel. What no photograph shows, such as a ceiling, is left to the reflections.
 """
 
 from __future__ import annotations
@@ -32,6 +31,7 @@ from mi_refgs.types import Float
 NEAR = 0.05  # radii of the region: what is nearer to its centre is not background
 FARTHEST = 1e4  # radii of the region: distance of the background map
 SEEN_SHARE = 0.05  # fraction of the views from which a texel counts fully: fewer views may show a floater
+PANORAMA = ("centre", "radiance", "nearness")  # arrays of a panorama in a checkpoint
 BEHIND = 1.1  # factor of the rendered depth up to which a point is on the surface that a view shows
 
 
@@ -44,11 +44,7 @@ class PhotographedLight:
 
     @staticmethod
     def of(
-        surfels: Surfels,
-        surroundings: Surroundings,
-        region: Region,
-        views: Sequence[View],
-        height: int,
+        surfels: Surfels, surroundings: Surroundings, region: Region, views: Sequence[View], height: int
     ) -> PhotographedLight:
         """Render the background from the region's centre, with `height` rows.
 
@@ -72,10 +68,7 @@ class PhotographedLight:
 
     @cached_property
     def _texels(self) -> tuple[Any, ...]:
-        """Unit directions and radiance of the texels, how far they are seen, and their areas.
-
-        What is not seen has the mean radiance of the rest.
-        """
+        """Directions and radiance of the texels, the mean where it is unseen; how far seen; areas."""
         height, seen = len(self.weight), self.weight[..., None]
         area = np.broadcast_to(row_areas(height)[:, None] / (4 * height), self.weight.shape)
         shown = seen * area[..., None]
@@ -94,19 +87,12 @@ class PhotographedLight:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Its part of a checkpoint."""
-        seen = self.panorama
-        return {
-            "centre": seen.centre,
-            "radiance": seen.radiance,
-            "nearness": seen.nearness,
-            "weight": self.weight,
-        }
+        return {name: getattr(self.panorama, name) for name in PANORAMA} | {"weight": self.weight}
 
     @staticmethod
     def restored(arrays: Mapping[str, np.ndarray]) -> PhotographedLight:
         """Restore `arrays`, bit for bit."""
-        seen = Panorama(*(arrays[name] for name in ("centre", "radiance", "nearness")))
-        return PhotographedLight(seen, arrays["weight"])
+        return PhotographedLight(Panorama(*(arrays[name] for name in PANORAMA)), arrays["weight"])
 
 
 def _shown(points: np.ndarray, view: View, depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:

@@ -1,5 +1,4 @@
-"""A fit from data to artefacts: chooses the method and the size of images, begins or resumes a run, finishes
-it."""
+"""A fit from data to artefacts: chooses method and image size, begins or resumes a run, finishes it."""
 
 from __future__ import annotations
 
@@ -54,10 +53,19 @@ class Choice:
     alpha the method that fits their background too. A `Method` is fitted as it is."""
     preset: str | None = None  # "standard" by default
     settings: Settings = ()
+    purpose: str | None = None  # `about.purpose` of the method, in place of a name
 
     def __post_init__(self) -> None:
         if isinstance(self.method, Method) and (self.preset or self.settings):
             raise InputError("method: preset, settings: a Method has its own; change it, or name one")
+        if self.purpose is not None and self.method is not None:
+            what = f"{self.purpose}: --method {self.method} is given"
+            raise InputError(what, "--for", remedy="give one of the two")
+
+    def named(self) -> str | None:
+        """The name or path of the method, whatever the images; None: DEFAULT_METHOD."""
+        assert not isinstance(self.method, Method)
+        return self.method if self.purpose is None else methods.for_purpose(self.purpose)
 
 
 class Progress:
@@ -85,46 +93,53 @@ class Progress:
 def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Progress) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
 
-    resume: continue if the folder contains a run; its method, preset, settings and size of images stay, and
-    those of the choice have to be the same.
+    resume: continue if the folder contains a run; the choice has to be the run's own.
 
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
     TerminatedError with a message that says how to continue.
     """
     run = Run(output)
-    resumed = resume and run.exists()
-    if not resumed:
+    if resume and run.exists():
+        method = run.method()
+        views = read_views(method, data, "train", truth=False)
+        _require_same(run, method, choice, views)
+    else:
         run.require_none()
-    method = _resumed_method(run, choice) if resumed else _new_method(data, choice, progress)
-    views = read_views(method, data, "train", truth=False)
+        method, views = chosen(data, choice, progress.say)
+        require_losses(method)
     if note := few_views(len(views.views)):
-        progress.warn(f"{views.path}: {note}")
+        progress.warn(f"{data}: {note}")
     if not views.has_alpha and (method.surroundings is None or views.region is None):
-        progress.warn(
-            f"{views.path}: images without alpha: surfels start at random, and model the background too"
-        )
+        progress.warn(f"{data}: images without alpha: surfels start at random, and model the background too")
     with run.alone():
-        if not resumed:  # asked again: another process may have begun a run while the data was read
+        if not resume:  # asked again: another process may have begun a run while the data was read
             run.require_none()
         return _fit(method, views, run, progress)
 
 
-def _new_method(data: Path, choice: Choice, progress: Progress) -> Method:
-    """The method of a new fit, with the size of images decided."""
+def chosen(data: Path, choice: Choice, say: Tell = lambda _: None) -> tuple[Method, Dataset]:
+    """The method of a new fit, with the size of images decided, and the training views.
+
+    Without a name, images without alpha have `about.without_alpha` of the method. Raises InputError for an
+    unknown name or setting, and for bad data.
+    """
     if isinstance(choice.method, Method):
-        wanted = choice.method
-    else:
-        name = choice.method or method_for(data, None, choice.preset, choice.settings, progress.say)
-        wanted = load_method(name, choice.preset, choice.settings)
-    require_losses(wanted)
-    return sized(wanted, data, progress.say)
+        return sized(choice.method, data, say)
+    if choice.method is not None:
+        return sized(load_method(choice.method, choice.preset, choice.settings), data, say)
+    # Settings of anything but images may be those of the other method.
+    of_images = [text for text in methods.assignments(choice.settings) if text.startswith("data.")]
+    reads, views = sized(load_method(choice.named(), choice.preset, of_images), data, say)
+    name = _for_images(choice.named(), reads, views)
+    if name != choice.named():
+        say(f"{data}: images without alpha: fitted with their background, by --method {name}")
+    method = load_method(name, choice.preset, choice.settings)
+    return method.downscaled(views.downscale), views
 
 
-def _resumed_method(run: Run, choice: Choice) -> Method:
-    """The method of a run; raises InputError if the choice would have made another one."""
-    method = run.method()
-    _require_same(run, method, choice)
-    return method
+def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:
+    """The name of the method for a purpose: for images without alpha, `about.without_alpha`."""
+    return name if views.has_alpha or views.region is None else method.about.without_alpha or name
 
 
 def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Trainer:
@@ -165,13 +180,11 @@ def begin(
     tell: Tell = lambda _: None,
     warn: Tell = lambda _: None,
 ) -> Trainer:
-    """Create a trainer that writes into `run`: from its newest checkpoint if the folder contains a run, else
-    anew.
+    """Create a trainer that writes into `run`, from its newest checkpoint if the folder contains a run.
 
     A new fit of photographs starts from the points of the data set and those of stereo. `tell` is called with
-    what is found and decided, `warn` with steps that failed. A resumed run keeps its region of interest.
-    Raises InputError for cameras that are all in one place, checkpoints that are all damaged, a scene without
-    a checkpoint, and a folder that cannot be written.
+    what is found and decided, `warn` with steps that failed. Raises InputError for cameras that are all in
+    one place, for damaged or missing checkpoints, and for a folder that cannot be written.
     """
     resumed = run.exists()
     views = with_region(views, run.region(), tell)
@@ -202,26 +215,21 @@ def begin(
 
 
 def _with_stereo(views: Dataset, tell: Tell) -> tuple[Dataset, np.ndarray | None]:
-    """The data set with what stereo finds, and points (N, 3) spaced evenly on surfaces; images with alpha
-    have a visual hull instead."""
+    """The data set with what stereo finds, and points (N, 3) spaced evenly on surfaces; not with alpha."""
     if views.has_alpha or views.region is None:
         return views, None
     began = time.perf_counter()
-    found = stereo(views.views, views.region)
-    if found is None:
+    if (found := stereo(views.views, views.region)) is None:
         tell(f"{views.path}: stereo: no points; the images have too little texture in common")
         return views, None
-    points, seconds = found.points, time.perf_counter() - began
-    tell(f"{len(points.position)} points on surfaces, found by stereo in {seconds:.0f} s")
+    points = found.points
+    tell(f"{len(points.position)} points on surfaces, found by stereo in {time.perf_counter() - began:.0f} s")
     joined = points if views.points is None else views.points.followed_by(points)
     return replace(views, points=joined, unknown=found.unknown), found.spaced
 
 
 def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn: Tell) -> Dataset:
-    """Adapt an estimated region of interest to points: those of stereo, `surfaces`, or else of the data.
-
-    Raises InputError for a region that no view shows.
-    """
+    """Adapt an estimated region of interest to points: those of stereo, `surfaces`, or else of the data."""
     region, points = views.region, views.points
     if region is None or views.has_alpha:
         return views
@@ -245,11 +253,9 @@ def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn
 
 
 def finish(trainer: Trainer, run: Run) -> str | None:
-    """Save the state if no checkpoint contains it, and write the artefacts; returns a warning if there is
-    one.
+    """Save the state if no checkpoint contains it, and write the artefacts; returns a warning, if any.
 
-    config.toml is updated with what was decided. The camera of scene.xml is that of the first
-    test view, or of the first training view if there are no test views.
+    The camera of scene.xml is that of the first test view, or else of the first training view.
     """
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
         run.save_checkpoint(trainer.iteration, trainer.state())
@@ -280,39 +286,17 @@ def load_method(method: str | None, preset: str | None, settings: Settings = ())
     return methods.load(path, preset or DEFAULT_PRESET, methods.assignments(settings))
 
 
-def method_for(
-    data: Path,
-    purpose: str | None,
-    preset: str | None = None,
-    settings: Settings = (),
-    say: Tell = lambda _: None,
-) -> str | None:
-    """The method for a purpose and a data set: for images without alpha, `about.without_alpha` of the method.
-
-    No purpose is that of DEFAULT_METHOD, for which None is returned. Raises InputError for an unknown purpose
-    and for bad data.
-    """
-    name = None if purpose is None else methods.for_purpose(purpose)
-    # Settings of anything else may be those of the other method.
-    of_data = [text for text in methods.assignments(settings) if text.startswith("data.")]
-    method = load_method(name, preset, of_data)
-    if not (other := method.about.without_alpha):
-        return name
-    views = read_views(method, data, "train", truth=False)
-    if views.has_alpha or views.region is None:
-        return name
-    say(f"{data}: images without alpha: fitted with their background, by --method {other}")
-    return other
-
-
-def _require_same(run: Run, made: Method, choice: Choice) -> None:
+def _require_same(run: Run, made: Method, choice: Choice, views: Dataset) -> None:
     """Raise InputError if what is given for a resumed run would have made another method of it."""
     now = choice.method
     if not isinstance(now, Method):
-        if not (now or choice.preset or choice.settings):
+        name = choice.named()
+        if not (name or choice.preset or choice.settings):
             return
+        if choice.purpose is not None:
+            name = _for_images(name, load_method(name, None), views)
         settings = methods.assignments(choice.settings) or made.assignments
-        now = methods.load(now or made.file, choice.preset or made.preset or DEFAULT_PRESET, settings)
+        now = methods.load(name or made.file, choice.preset or made.preset or DEFAULT_PRESET, settings)
     for key, (before, after) in sorted(
         differences(run, now).items(), key=lambda item: item[0] not in ("name", "preset")
     ):

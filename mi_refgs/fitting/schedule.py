@@ -1,5 +1,4 @@
-"""What follows from the method, the data and the iteration number alone: random draws, learning rates, shapes
-of parameters, lights that steps share."""
+"""What follows from the method, the data and the iteration number alone, and lights that steps share."""
 
 from __future__ import annotations
 
@@ -31,9 +30,9 @@ from mi_refgs.types import Float, TensorXf
 
 GAIN_RATES, POSE_RATES = (1e-3, 1e-4), (2e-3, 6e-5)
 """Learning rates of log gains and of corrections, radians or half widths, at the start and at the end."""
-POSITION_STEPS = 0.6
-"""Fraction of the iterations after which positions learn at their final rate: 30,000 of 50,000 in the
-released Ref-Gaussian code."""
+POSITION_STEPS, POSITION_FINAL = 0.6, 1.6e-6
+"""Fraction of the iterations after which positions learn at their final rate, scene extents per step: after
+30,000 of 50,000 in the released Ref-Gaussian code."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +78,7 @@ class FitSetup:
         return upload(np.concatenate([view.to_world[:3, :3].ravel() for view in self.data.views]))
 
     def rng(self, iteration: int, operation: str) -> np.random.Generator:
-        """Generator for one operation, such as "densify", of an iteration; 0 is the initialisation."""
+        """Generator for one operation of an iteration; 0 is the initialisation."""
         return np.random.default_rng([self.method.seed, iteration, *operation.encode()])
 
     def view(self, iteration: int) -> int:
@@ -91,8 +90,7 @@ class FitSetup:
     def crop(self, iteration: int, width: int, height: int) -> tuple[int, int, int, int] | None:
         """Column, row, width and height of the part of an image that an iteration renders; None: all of it.
 
-        A rectangle drawn uniformly among those that overlap the image, then moved into it: pixels at a border
-        are seen half as often as others where a crop is half as wide as the image.
+        A rectangle drawn uniformly among those that overlap the image, then moved into it.
         """
         size = self.method.data.crop_of(width, height)
         if size == (width, height):
@@ -121,7 +119,9 @@ class FitSetup:
         around = self.method.surroundings
         if self.open_scene and around is not None:
             table = self._of_table(around.names, extent)
-            table["position"] = self._far(table["position"])
+            # The farther a surface, the less is known of its place.
+            assert self.data.region is not None
+            table["position"] = replace(table["position"], centre=self.data.region.centre)
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = Group(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None:
@@ -139,52 +139,35 @@ class FitSetup:
         for name in names:
             rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
             groups[name] = Group(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
-        start, final = rates.of("position") * extent, rates.position_final * extent
+        start, final = rates.of("position") * extent, POSITION_FINAL * extent
         groups["position"] = Group(start, final, int(POSITION_STEPS * iterations), unit=extent)
         return groups
 
-    def _far(self, group: Group) -> Group:
-        """The rates of the background's positions: the farther a surface, the less is known of its place."""
-        assert self.data.region is not None
-        return replace(group, centre=self.data.region.centre)
+    def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
+        """Raise InputError for a parameter of a state, written to `run`, of another shape than this fit's.
 
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of every parameter but those per view, without the first axis."""
-        surfels, around = self.method.surfels, self.method.surroundings
-        found: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
+        Rows are compared where they are views, and not where they are surfels or pixels.
+        """
+        surfels, around, light = self.method.surfels, self.method.surroundings, self.method.light
+        wanted: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
         if self.open_scene and around is not None:
             background = replace(surfels, primitive=around.primitive, degree={"radiance_sh": around.degree})
-            found |= {AROUND + name: (background.columns(name),) for name in around.names}
-            found[BACKGROUND] = (2 * around.height, 3)
-        light = self.method.light
-        return found if light is None else found | {LIGHT: tuple(light.start().shape[1:])}
-
-    def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
-        """Raise InputError if the method or the kind of images has changed since the state was written.
-
-        `run` is the folder that the state was written to, for the message.
-        """
-        expected, views = self.shapes(), len(self.data.views)
-        config = "config.toml" if run is None else str(run / "config.toml")
-        found = {name: value.shape[1:] for name, value in part(state, PARAMS).items() if name not in PER_VIEW}
-        if self.method.surroundings is not None and self.open_scene != (BACKGROUND in found):
-            before, now = ("without", "with") if BACKGROUND in found else ("with", "without")
-            raise InputError(
-                f"{self.data.path}: images {now} alpha, but {run or 'the run'} was fitted to images {before} "
-                "alpha; resume with the data set that the run began with, or choose another -o"
-            )
-        for name in expected.keys() | found.keys():
-            if found.get(name) != expected.get(name):
+            wanted |= {AROUND + name: (background.columns(name),) for name in around.names}
+            wanted[BACKGROUND] = (2 * around.height, 3)
+        if light is not None:
+            wanted[LIGHT] = tuple(light.start().shape[1:])
+        found = {
+            name: values.shape if name in PER_VIEW else values.shape[1:]
+            for name, values in part(state, PARAMS).items()
+        }
+        per_view = {GAIN: (len(self.data.views), 3), POSE: (len(self.data.views), 6)}
+        wanted |= {name: shape for name, shape in per_view.items() if name in found}
+        for name in wanted | found:
+            if found.get(name) != wanted.get(name):
                 raise InputError(
-                    f"{config}: {name}: the checkpoint has {found.get(name, 'none')}, the method "
-                    f"{expected.get(name, 'none')}; undo the change, or start another run"
-                )
-        for name, what in ((GAIN, "gains"), (POSE, "camera corrections")):
-            rows = state.get(f"{PARAMS}{name}")
-            if rows is not None and len(rows) != views:
-                raise InputError(
-                    f"{self.data.path}: frames: {views} training views, but the checkpoint has {what} of "
-                    f"{len(rows)}; resume with the data set that the run began with"
+                    f"{run or 'checkpoint'}: {name}: it has {found.get(name, 'none')}, a fit of this method "
+                    f"to {self.data.path} {wanted.get(name, 'none')}; resume with the method and the data "
+                    "set that the run began with, or choose another -o"
                 )
 
 
@@ -194,9 +177,7 @@ GATHERED = "light_gradient"  # name of the gradient of the levels in a checkpoin
 class SharedPrefilter:
     """The light of a fit, filtered once for several steps, whose gradients it learns from together.
 
-    Filtering a light and its adjoint cost the same for one view as for a hundred: with 128 rows a quarter of
-    a step of 200² pixels on one core. `close` ends the steps that share a light, and passes on their
-    gradient.
+    Filtering with its adjoint costs a quarter of a step of 200² pixels. `close` ends the steps that share it.
     """
 
     def __init__(self) -> None:
@@ -220,10 +201,6 @@ class SharedPrefilter:
             dr.set_grad(self._light.levels, dr.grad(self._leaf))
             dr.enqueue(dr.ADMode.Backward, self._light.levels)
             dr.traverse(dr.ADMode.Backward)
-        self.clear()
-
-    def clear(self) -> None:
-        """Discard the accumulated gradient."""
         self._light = self._leaf = None
 
     def state(self) -> dict[str, np.ndarray]:
@@ -234,7 +211,6 @@ class SharedPrefilter:
         self, environment: FittedLight | None, shading: Shading, state: Mapping[str, np.ndarray]
     ) -> None:
         """Continue from a checkpoint; a gradient of other levels, as in a trial, is left out."""
-        self.clear()
         if (gathered := state.get(GATHERED)) is None or environment is None:
             return
         self.light(environment, shading)

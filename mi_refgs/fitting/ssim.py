@@ -35,9 +35,8 @@ def window() -> list[float]:
 
 @phase("ssim forward")
 def ssim(x: Sequence[Float], y: Sequence[Float], width: int, height: int) -> Float:
-    """Mean SSIM (mi.Float, width 1) of two images given as planes (mi.Float, raster order) in [0, 1].
+    """Mean SSIM (width 1) of two images given as planes in [0, 1], with zero padding, as 3DGS trains with.
 
-    Window 11×11, σ = 1.5, zero padding, mean over pixels and planes: the definition that 3DGS trains with.
     The reference image y has no derivative.
     """
     return dr.custom(_Ssim, list(x), [dr.detach(plane) for plane in y], width, height)

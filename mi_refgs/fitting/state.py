@@ -80,11 +80,8 @@ class ParameterTable:
         """Set the errors to zero."""
         self.error_sum = dr.opaque(mi.Float, 0, self.surfels.count)
 
-    def observe(
-        self,
-        error: Float,  # (N,) squared error of a step that each surfel is responsible for: Σ w e²
-    ) -> None:
-        """Add to the statistics."""
+    def observe(self, error: Float) -> None:
+        """Add the squared error (N,) of a step, Σ w e² by responsible surfel, to the statistics."""
         self.error_sum += dr.select(dr.isfinite(error), error, 0.0)
         dr.schedule(self.error_sum)
 
@@ -163,11 +160,8 @@ class FitState:
         self.params[name] = tensor
         self.optimiser.add(name, setup.groups(self.params)[name])
 
-    def observe(
-        self,
-        error: Float,  # squared error of a step by responsible surfel, the object's first
-    ) -> None:
-        """Add to the statistics of all tables."""
+    def observe(self, error: Float) -> None:
+        """Add the squared error of a step, by responsible surfel, the object's first, to the statistics."""
         if len(self.tables) == 1:
             self.tables[0].observe(error)
             return
@@ -181,10 +175,6 @@ class FitState:
     def surfels(self) -> Surfels:
         """The object, attached to the leaves that the optimiser owns."""
         return self.tables[0].surfels
-
-    def detached(self) -> list[Surfels]:
-        """The surfels of all tables, detached: the object's, then the background's."""
-        return [table.surfels.detach() for table in self.tables]
 
     @property
     def surroundings(self) -> Surroundings | None:
@@ -206,9 +196,7 @@ class FitState:
         return Shading.resolve(stage.shading, not self.occluder.empty)
 
     def update_missing_caches(self, shading: Shading) -> None:
-        """Compute the caches that the shading requires and the occluder lacks: all for a new mesh, and the
-        surfels at its vertices also after surfels were added or removed.
-        """
+        """Compute the caches that the shading requires and the occluder lacks."""
         occluder = self.occluder
         if shading.ambient_rays and occluder.ambient is None:
             update_occluder_caches(occluder, self.surfels, shading.light_of(self.light), shading)

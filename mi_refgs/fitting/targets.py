@@ -1,4 +1,4 @@
-"""The images of a fit: read as the method says, and kept on the device as far as memory allows."""
+"""The images of a fit, kept on the device as far as memory allows."""
 
 from __future__ import annotations
 
@@ -22,25 +22,20 @@ from mi_refgs.splat import Camera
 from mi_refgs.types import Array, Bool, Float
 
 BUDGET = 2**30  # bytes of targets that stay on the device: a thousand images of 200², or ten of 2000²
-PIXEL_BYTES = 4 * 4 + 3
-"""Bytes per pixel of a target: three colours and alpha as float32, and a mask per colour."""
-
-
-def bytes_of(method: Method, views: int, size: tuple[int, int]) -> float:
-    """Memory, in bytes, of a fit to so many images of this width and height."""
-    pixels, rendered = math.prod(size), math.prod(method.data.crop_of(*size))
-    surfels = method.surfels.most
-    surfels += method.surroundings.max_count if method.surroundings is not None else 0
-    images = min(views * pixels * 12, CACHE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
-    return of_fit(rendered, surfels, images)
+PIXEL_BYTES = 4 * 4 + 3  # three colours and alpha as float32, and a mask per colour
 
 
 def require_memory(method: Method, data: Dataset) -> None:
     """Raise InputError if the fit requires more memory than there is."""
     size = max(((view.width, view.height) for view in data.views), key=math.prod, default=(0, 0))
-    what = f"fit: images of {math.prod(size):,} pixels, {method.surfels.most:,} surfels at most"
-    remedy = "read them smaller with --set data.downscale=N, or lower surfels.max_count"
-    require(bytes_of(method, len(data.views), size), what, remedy)
+    pixels, views, surfels = math.prod(size), len(data.views), method.surfels.most
+    around = 0 if method.surroundings is None else method.surroundings.max_count
+    images = min(views * pixels * 12, CACHE_BYTES) + min(views * pixels * PIXEL_BYTES, BUDGET)
+    require(
+        of_fit(math.prod(method.data.crop_of(*size)), surfels + around, images),
+        f"fit: images of {pixels:,} pixels, {surfels:,} surfels at most",
+        "read them smaller with --set data.downscale=N, or lower surfels.max_count",
+    )
 
 
 @dataclass(frozen=True)
@@ -92,13 +87,6 @@ class Targets:
             for index, block in wanted:
                 self._target(index, block)
 
-    def are_of(self, data: Dataset, options: DataOptions) -> bool:
-        """Whether these are the targets of this very data set, read with these options."""
-        return self.data is data and self.options == options
-
-    def __len__(self) -> int:
-        return len(self.data.views)
-
     def __getitem__(self, index: int) -> Target:
         return self._target(index, 1)
 
@@ -114,11 +102,7 @@ class Targets:
         view = self.data.views[index]
         target = Target.of(view if block == 1 else view.averaged(block), self.data.background)
         self._kept[key] = target
-        self._bytes += _size(target)
+        self._bytes += PIXEL_BYTES * len(target.image[0])
         while self._bytes > self.budget and len(self._kept) > 1:
-            self._bytes -= _size(self._kept.popitem(last=False)[1])
+            self._bytes -= PIXEL_BYTES * len(self._kept.popitem(last=False)[1].image[0])
         return target
-
-
-def _size(target: Target) -> int:
-    return PIXEL_BYTES * target.camera.width * target.camera.height

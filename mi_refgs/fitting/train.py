@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -29,11 +28,8 @@ from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.timing import phase
 from mi_refgs.methods.method import Method
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.render.samples import supersampled
-from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
-from mi_refgs.shade.light.kind import FittedLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
@@ -43,10 +39,7 @@ FEW_VIEWS = 24  # training views that events render which need only some of them
 
 
 class Trainer:
-    """A fit and the loop that advances it.
-
-    `setup` contains the method and the data, `fit` all that steps and events change.
-    """
+    """A fit and the loop: `setup` has the method and the data, `fit` all that steps and events change."""
 
     def __init__(
         self,
@@ -61,8 +54,7 @@ class Trainer:
     ) -> None:
         """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start.
 
-        `targets` of another fit are shared if they are of the same data. `tell` is called with decisions,
-        `warn` with steps that failed.
+        `targets` of another fit are shared if they are of the same data. `warn` tells of failed steps.
         """
         require_losses(method)
         require_memory(method, data)
@@ -72,8 +64,8 @@ class Trainer:
         self.loss: Float = None  # of the last step, width 1
         self.error: Float = None  # mean squared error of the last step, width 1
         self.setup = FitSetup(method, data)
-        own = targets is None or not targets.are_of(data, method.data)
-        self.targets = Targets(data, method.data) if own or targets is None else targets
+        shared = targets is not None and targets.data is data and targets.options == method.data
+        self.targets = targets if shared and targets is not None else Targets(data, method.data)
         self.whole = data
         self.validation: Dataset | None = None  # views that are held out as long as decisions need them
         if state is None and run is not None:
@@ -83,7 +75,6 @@ class Trainer:
             self.happen()
         else:
             self.restore(state)
-        self.saved = self.iteration  # iteration of the newest checkpoint
 
     def use(self, data: Dataset) -> None:
         """Continue with other views."""
@@ -133,31 +124,20 @@ class Trainer:
         """The object, attached to the leaves that the optimiser owns."""
         return self.fit.surfels
 
-    @property
-    def surroundings(self) -> Surroundings | None:
-        """The background in images without alpha, also attached."""
-        return self.fit.surroundings
-
-    @property
-    def light(self) -> FittedLight | None:
-        """The light, also attached."""
-        return self.fit.light
-
-    def shading(self, iteration: int | None = None) -> Shading:
-        """Shading options of the present (or another) iteration."""
-        return self.fit.shading(self.method.stage_at(iteration or max(self.iteration, 1))[1])
+    def shading(self) -> Shading:
+        """Shading options of the present iteration."""
+        return self.fit.shading(self.method.stage_at(max(self.iteration, 1))[1])
 
     def camera(self, index: int) -> Camera:
         """The camera of a training view, with the correction that was fitted."""
         return per_view.camera_of(self.setup, self.fit.params, index)
 
     def view(self, camera: Camera, aovs: bool = True, object_only: bool = False) -> Frame:
-        """Render the present state as its export does, without derivatives; `object_only`: without the
-        background."""
+        """Render the present state as its export does, without derivatives."""
         with dr.suspend_grad():
             shading = self.shading().antialiased()
             self.fit.update_missing_caches(shading)
-            light, around = shading.light_of(self.light), None if object_only else self.surroundings
+            light, around = shading.light_of(self.fit.light), None if object_only else self.fit.surroundings
             scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around, self.fit.near)
             degree = self.setup.sh_degree(self.iteration)
             return render(scene, camera, Request(scene.all_aovs if aovs else (), not aovs, sh_degree=degree))
@@ -179,8 +159,7 @@ class Trainer:
     def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
         """Run to the last iteration; an interrupt ends it after the current step, saved, and is passed on.
 
-        `progress` is called after each step. Raises InputError when the run folder cannot be written: a
-        checkpoint interval is lost at most.
+        `progress` is called after each step. Raises InputError when the run folder cannot be written.
         """
         with held_interrupts() as release:
             self.release = release
@@ -201,6 +180,8 @@ class Trainer:
                     if progress is not None:
                         progress(self)
                     release()
+                    if self.iteration % self.method.checkpoint_every == 0:
+                        self.save()
                     self.happen(outside=True)
             self.check()
 
@@ -218,7 +199,6 @@ class Trainer:
         self.check()
         if self.run is not None:
             self.run.save_checkpoint(self.iteration, self.state())
-            self.saved = self.iteration
 
     def check(self) -> None:
         """Remove the surfels that made steps fail since the last check, and warn; see `Health.check`."""
@@ -238,8 +218,7 @@ class Trainer:
                 event.apply(self)
 
     def gradient_step(self, iteration: int) -> None:
-        """Render the view of a (1-based) iteration, and let all parameters learn from its loss; nothing else
-        happens, so that a step can be measured again and again."""
+        """Render the view of a (1-based) iteration, and let all parameters learn from its loss."""
         fit, setup, weights = self.fit, self.setup, self.method.loss
         _, stage = self.method.stage_at(iteration)
         index = setup.view(iteration)
@@ -260,11 +239,9 @@ class Trainer:
         fit.update_missing_caches(shading)
         light = fit.prefilter.light(fit.light, shading)
         scene = SurfelScene(fit.surfels, shading, light, fit.occluder, fit.surroundings, fit.near)
-        asked = losses_in_use(weights)
-        aovs = ("normal",) if any(loss.normals for loss in asked) else ()
+        aovs = ("normal",) if any(loss.normals for loss in losses_in_use(weights)) else ()
         request = Request(aovs, sh_degree=setup.sh_degree(iteration), attribution=attribution)
-        view = partial(render, scene, request=request)
-        frame = supersampled(view, camera, stage.samples, details=any(loss.maps for loss in asked))
+        frame = render(scene, camera, request)
         gain = per_view.log_gain(fit.params, index)
         inputs = LossInputs.of(frame, target, self.data, light, gain, fit.photographed)
         loss, error = objective(inputs, weights, iteration)

@@ -107,7 +107,6 @@ class SurroundingsOptions:
     scattered: ClassVar = 0.5  # fraction of the initial surfels anywhere; the others at sparse points
     opacity: ClassVar = 0.1  # initial, of both: a cloud of 0.3 closes before the object forms
     size: ClassVar = 0.1  # largest initial size, in distances from the region's centre
-    prune_extent: ClassVar = 0.5  # distances from the region's centre; larger surfels are removed
     height: ClassVar = 32  # texels of the environment; width is twice that
     rate: ClassVar = 0.01  # Adam learning rate of the environment's texels
 
@@ -128,7 +127,6 @@ class Stage:
 
     until: int = field(metadata=ITERATIONS)  # last iteration of the stage
     shading: ShadingOptions = field(default_factory=ShadingOptions, metadata=FLAT)
-    samples: int = field(default=1, metadata=at_least(1))  # per pixel, k × k, in the steps of a fit
     restart: tuple[str, ...] = ()  # attributes, and `light`, reset to initial values when the stage begins
     # Factors of rates, by attribute or `light`.
     rates: dict[str, float] = field(default_factory=dict, metadata=at_least(0))
@@ -143,8 +141,6 @@ class Rates:
     light: float = 0.01  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
     decay: float = 1.0  # log-linear factor of all other rates at the last iteration
-
-    position_final: ClassVar = 1.6e-6  # of positions, at 0.6 of the iterations
 
     def of(self, name: str) -> float:
         return self.attribute.get(name, attribute(name).rate)

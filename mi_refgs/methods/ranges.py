@@ -27,11 +27,6 @@ def between(low: float, high: float) -> Metadata:
     return {"allowed": (lambda value: low <= value <= high, f"a number from {low:g} to {high:g}")}
 
 
-def inside(low: float, high: float) -> Metadata:
-    """Metadata of a number between `low` and `high`, both excluded."""
-    return {"allowed": (lambda value: low < value < high, f"a number between {low:g} and {high:g}")}
-
-
 def require_allowed(value: Any, metadata: Mapping[str, Any], key: str) -> None:
     """Raise InputError for a value that its field does not allow; those of dicts and tuples one by one."""
     if "allowed" not in metadata or value is None:

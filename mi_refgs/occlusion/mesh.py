@@ -58,9 +58,8 @@ class Mesh:
 def extract_mesh(tsdf: TSDF) -> Mesh:
     """Zero level set of the field by marching cubes (Lewiner et al. 2003), without floaters.
 
-    The surface has no degenerate triangles and is closed by a cap at the border of the volume, but not where
-    contracted space ends. Components of less than COMPONENT_KEEP of the largest one's area are dropped; in
-    contracted space, unless their part in the region is as large. No derivative."""
+    The surface has no degenerate triangles and is closed by a cap at the border of the volume. Components of
+    less than COMPONENT_KEEP of the largest one's area are dropped. No derivative."""
     # One layer of free space all around closes surfaces that the box cuts.
     volume = np.pad(np.asarray(tsdf.volume, dtype=np.float32), 1, constant_values=1.0)
     volume = np.where(np.abs(volume) < ZERO_NUDGE, np.copysign(np.float32(ZERO_NUDGE), volume), volume)
@@ -69,20 +68,13 @@ def extract_mesh(tsdf: TSDF) -> Mesh:
     # "descent": the field falls towards the object, and faces then wind outward.
     grid, faces, _, _ = measure.marching_cubes(volume, 0.0, gradient_direction="descent")
     vertices = np.asarray(tsdf.origin) + (grid.astype(np.float64) - 1) * tsdf.voxel
-    if tsdf.region is None:
-        return clean(vertices, faces, tsdf.voxel)
-    ends = [tsdf.origin + (corner(grid) - 1) * tsdf.voxel for corner in (np.floor, np.ceil)]
-    outside = np.max([np.linalg.norm(end, axis=1) for end in ends], axis=0) > tsdf.end
-    mesh = clean(vertices, faces[~outside[faces].any(axis=1)], tsdf.voxel, open_=True)
-    there = tsdf.region.expand(mesh.vertices).astype(np.float32)
-    return Mesh(there, mesh.faces, tsdf.voxel * tsdf.region.radius)
+    return clean(vertices, faces, tsdf.voxel)
 
 
-def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = False) -> Mesh:
+def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> Mesh:
     """Keep the large closed components, without degenerate triangles and unused vertices.
 
-    Walls of inner cavities are removed: no ray that starts outside meets them. `open_`: vertices are in
-    contracted space, where a room is a cavity; cavities stay, and what is large in the region.
+    Walls of inner cavities are removed: no ray that starts outside meets them.
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.update_faces(mesh.area_faces > 0)
@@ -93,9 +85,6 @@ def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = F
     corners = mesh.triangles - mesh.vertices.mean(axis=0)
     volume = np.bincount(label, weights=np.linalg.det(corners))
     keep = (area >= COMPONENT_KEEP * area[volume > 0].max(initial=0)) & (volume > 0)
-    if open_:
-        near = np.bincount(label, mesh.area_faces * (np.linalg.norm(mesh.triangles_center, axis=1) < 1))
-        keep = (area >= COMPONENT_KEEP * area.max()) | (near > COMPONENT_KEEP * near.max())
     mesh.update_faces(keep[label])
     mesh.remove_unreferenced_vertices()
     return Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), voxel)

@@ -1,33 +1,28 @@
-"""Fuse depth maps of many views into one truncated signed distance field, over a box or contracted space.
+"""Fuse depth maps of many views into one truncated signed distance field, over a box.
 
 The sign is positive in free space. The state of a voxel follows from the views:
 
 =======================================  ===================================================================
 in front of, or just behind, a surface   running mean of (depth - z), truncated
-in front of the background               +1 if `carve` is set (else no vote in the mean); never "inside"
+in front of the background               +1; never "inside"
 only further behind surfaces             -1: the inside that no view reaches; no wall behind the surface
 in no view's image                       +1: nothing is known to be there
 =======================================  ===================================================================
-
-Contracted space is the ball of radius 2 that a region's contraction maps all of space to; grid, truncation
-and distances are in that space. A distance along the view's ray is that in contracted space times the cosine
-between ray and viewing axis: (depth - z) / radius inside the region, as without contraction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.splat.camera import Camera
-from mi_refgs.types import Bool, Float, Int32, Point3f, TensorXf, UInt32, Vector3f
+from mi_refgs.types import Bool, Float, Int32, TensorXf
 
 ALPHA_SOLID = 0.5
 """Opacity from which a pixel has a surface: half coverage, where a box filter has its silhouette."""
@@ -43,7 +38,6 @@ BOX_QUANTILE = 0.02  # fraction of the points per side and axis that may be floa
 BOX_REACH = 0.25  # part of the quantiles' distance by which the box may grow beyond them: thin ends
 BOX_FLOOR = 1e-6  # least margin, as part of the points' distance from the origin: float32
 BOX_MARGIN = 0.05  # free space around the points, as part of the longest side: room for the truncation
-END_VOXELS = 2.0  # contracted voxels from the border of contracted space to the last values
 
 
 @dataclass(frozen=True)
@@ -53,12 +47,6 @@ class TSDF:
     volume: np.ndarray  # (nx, ny, nz) float32 in [-1, 1]
     origin: np.ndarray  # (3,) float64, world position of volume[0, 0, 0]
     voxel: float  # grid spacing, scene units
-    region: Region | None = None  # `origin` and `voxel` are in its contracted space; None: in the world
-
-    @property
-    def end(self) -> float:
-        """Largest distance from the centre of contracted space with values."""
-        return 2 - END_VOXELS * self.voxel
 
 
 def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -85,35 +73,30 @@ def fuse(
     cameras: Iterable[Camera],
     bounds: tuple[np.ndarray, np.ndarray],
     resolution: int,
-    *,
-    carve: bool = True,
-    region: Region | None = None,
 ) -> TSDF:
     """Fuse depth maps into a signed distance field over `bounds`. [Curless and Levoy 1996; weights behind the
     surface: Bylow et al. 2013]
 
     `resolution`: voxels along the longest side. Depths (expected camera z, scene units; not premultiplied)
-    and alphas are `mi.Float` or `mi.TensorXf` in raster order, read once. Pixels with alpha < ALPHA_SOLID
-    have no depth; with `carve`, they are free space. With a `region`, `bounds` are in its contracted space,
-    and `resolution` voxels are as long as the region is wide. Detached. Raises InputError for an empty box or
-    a resolution that does not fit.
+    and alphas are `mi.Float` or `mi.TensorXf` in raster order, read once: with generators only one view is in
+    memory. Pixels of alpha < ALPHA_SOLID are free space. Detached. Raises InputError for an empty box or a
+    resolution that does not fit.
     """
     lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
     extent = hi - lo
     if not (np.all(np.isfinite(extent)) and np.all(extent > 0)):
         what = f"box from {lo} to {hi} has no volume"
         raise InputError(what, "tsdf", "bounds", "give lo < hi on every axis")
-    most = RESOLUTION_MAX if region is None else RESOLUTION_MAX // 2  # all of space is twice as wide
-    if not 2 <= resolution <= most:
-        raise InputError(f"{resolution} is outside 2..{most}", "tsdf", "resolution", "choose 64 to 256")
-    voxel = (float(extent.max()) if region is None else 2.0) / resolution
+    if not 2 <= resolution <= RESOLUTION_MAX:
+        what = f"{resolution} is outside 2..{RESOLUTION_MAX}"
+        raise InputError(what, "tsdf", "resolution", "choose 64 to 256")
+    voxel = float(extent.max()) / resolution
     shape = np.ceil(extent / voxel - 1e-6).astype(int) + 1
-    empty = TSDF(np.ones(0, np.float32), lo, voxel, region)
     with dr.suspend_grad():
-        grid = _Grid(shape, empty)
+        grid = _Grid(shape, lo, voxel)
         for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
-            grid.integrate(_flat(depth, camera), _flat(alpha, camera), camera, carve)
-        return replace(empty, volume=grid.volume().reshape(shape))
+            grid.integrate(_flat(depth, camera), _flat(alpha, camera), camera)
+        return TSDF(grid.volume().reshape(shape), lo, voxel)
 
 
 def _flat(image: Float | TensorXf, camera: Camera) -> Float:
@@ -126,34 +109,27 @@ def _flat(image: Float | TensorXf, camera: Camera) -> Float:
 class _Grid:
     """Accumulators of one fusion."""
 
-    def __init__(self, shape: np.ndarray, of: TSDF) -> None:
-        count = self.count = int(np.prod(shape))
+    def __init__(self, shape: np.ndarray, origin: np.ndarray, voxel: float) -> None:
+        count = int(np.prod(shape))
         flat = dr.arange(mi.UInt32, count)
         nz, nyz = dr.opaque(mi.UInt32, int(shape[2])), dr.opaque(mi.UInt32, int(shape[1] * shape[2]))
         yz = flat % nyz
         # Integer division is slow and would run for every view: keep the three coordinates, 10 bits each.
         self.corner = (flat // nyz) | ((yz // nz) << 10) | ((yz % nz) << 20)
-        self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in of.origin))
-        self.voxel = dr.opaque(mi.Float, of.voxel)
-        self.space: _Contracted | None = None
-        self.index: UInt32 = None
-        if of.region is not None:
-            self.space = _Contracted.of(of.region)
-            length = dr.norm(mi.Vector3f(self._place()))
-            self.index = dr.compress(length <= dr.opaque(mi.Float, of.end))  # space has no corners
-            self.corner, count = dr.gather(mi.UInt32, self.corner, self.index), dr.width(self.index)
+        self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in origin))
+        self.voxel = dr.opaque(mi.Float, voxel)
         self.total, self.weight, self.seen, self.behind = (dr.zeros(mi.Float, count) for _ in range(4))
         dr.eval(self.corner, self.total, self.weight, self.seen, self.behind)
 
-    def integrate(self, depth: Float, alpha: Float, camera: Camera, carve: bool) -> None:
+    def integrate(self, depth: Float, alpha: Float, camera: Camera) -> None:
         """Add one view."""
         width, height = dr.opaque(mi.Int32, camera.width), dr.opaque(mi.Int32, camera.height)
         # Surface depth, or 0 for background; NaN and infinite depths are background too.
         surface = dr.select((alpha >= ALPHA_SOLID) & (depth > camera.near) & dr.isfinite(depth), depth, 0)
         dr.eval(surface)
-        place = self._place()
-        world = place if self.space is None else self.space.expand(place)
-        point = camera.to_camera(world)
+
+        corner = mi.Point3f(self.corner & 1023, (self.corner >> 10) & 1023, self.corner >> 20)
+        point = camera.to_camera(corner * self.voxel + self.lo)
         in_front = point.z > camera.near
         inv_z = dr.rcp(dr.select(in_front, point.z, 1))
         # Relative to the centre of pixel (0, 0), where its texel sits.
@@ -162,13 +138,9 @@ class _Grid:
         in_image = in_front & (px >= -0.5) & (py >= -0.5)
         in_image &= (px < mi.Float(width) - 0.5) & (py < mi.Float(height) - 0.5)
         trunc = TRUNCATION_VOXELS * self.voxel
-        ray = (world - camera.origin) * inv_z
-        apart = trunc if self.space is None else trunc * self.space.stretch(place, ray)
-        near, same_surface, background = _sample(surface, px, py, width, height, apart, in_image)
+        near, same_surface, background = _sample(surface, px, py, width, height, trunc, in_image)
+
         distance = near - point.z
-        if self.space is not None:
-            met = self.space.contract(camera.origin + near * ray)
-            distance = dr.copysign(dr.norm(met - place) * dr.rcp(dr.norm(ray)), distance)
         hit = in_image & same_surface
         banded = hit & (distance > -trunc)
         # Full weight down to one voxel behind the surface, then falling to 0 at the truncation.
@@ -177,9 +149,8 @@ class _Grid:
         empty = dr.select(in_image & background, mi.Float(1), 0)
         self.seen += weight + empty
         self.behind += dr.select(hit & ~banded, mi.Float(1), 0)
-        if carve:
-            weight += empty
-            distance = dr.select(background, trunc, distance)
+        weight += empty
+        distance = dr.select(background, trunc, distance)
         self.weight += weight
         self.total += dr.select(weight > 0, weight * dr.minimum(distance / trunc, 1), 0)
         dr.eval(self.total, self.weight, self.seen, self.behind)
@@ -189,50 +160,7 @@ class _Grid:
         observed = self.weight > 0
         mean = self.total / dr.select(observed, self.weight, 1)
         value = dr.select(inside, -1, dr.select(observed, mean, 1))
-        if self.index is None:
-            return np.array(value, dtype=np.float32)
-        everywhere = np.ones(self.count, np.float32)
-        everywhere[self.index.numpy()] = value.numpy()
-        return everywhere
-
-    def _place(self) -> Any:
-        corner = mi.Point3f(self.corner & 1023, (self.corner >> 10) & 1023, self.corner >> 20)
-        return corner * self.voxel + self.lo
-
-
-@dataclass(frozen=True)
-class _Contracted:
-    """A region's contraction for Dr.Jit; see `data.region.Region`."""
-
-    centre: Point3f
-    radius: Float
-
-    @staticmethod
-    def of(region: Region) -> _Contracted:
-        centre = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in region.centre))
-        return _Contracted(centre, dr.opaque(mi.Float, region.radius))
-
-    def contract(self, world: Point3f) -> Point3f:
-        offset = (world - self.centre) / self.radius
-        inverse = dr.rcp(dr.maximum(dr.norm(offset), 1))
-        return mi.Point3f(offset * ((2 - inverse) * inverse))
-
-    def expand(self, place: Point3f) -> Point3f:
-        length = dr.maximum(dr.norm(mi.Vector3f(place)), 1)
-        return self.centre + self.radius * mi.Vector3f(place) * dr.rcp(length * (2 - length))
-
-    def stretch(self, place: Point3f, ray: Vector3f) -> Float:
-        """Depth per unit of contracted distance at contracted positions, along `ray` per depth.
-
-        The contraction shrinks by 1/r² along the offset of length r, and by (2 - 1/r)/r across it.
-        """
-        offset = mi.Vector3f(place)
-        length = dr.norm(offset)
-        inverse = 2 - dr.maximum(length, 1)  # 1/r
-        along = dr.dot(ray, offset) * dr.rcp(dr.maximum(length, 1e-6))
-        across = dr.maximum(dr.squared_norm(ray) - dr.square(along), 0)
-        shrunk = dr.square(dr.square(inverse) * along) + dr.square((2 - inverse) * inverse) * across
-        return self.radius * dr.norm(ray) * dr.rsqrt(shrunk)
+        return np.array(value, dtype=np.float32)
 
 
 def _sample(

@@ -30,6 +30,7 @@ def fit(
     *,
     preset: str | None = None,
     settings: runner.Settings = (),
+    purpose: str | None = None,
     output: str | Path | None = None,
     resume: bool = False,
     progress: bool | Progress = True,
@@ -39,7 +40,8 @@ def fit(
     method: a method of the package (`variants/`), the path of a .toml, or a `Method`; None fits what the
     scene needs of the full method (`auto`), and to images without alpha background Gaussians too. preset: how
     long, "quick", "standard" (the default), "paper", or iterations and largest number of surfels,
-    "1000:20000". settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"].
+    "1000:20000". settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"]. purpose:
+    "photographs" or "relighting", in place of a method.
 
     output: the run folder. Without one a temporary folder is used, which is removed with the last
     `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`, if there is one;
@@ -58,7 +60,8 @@ def fit(
         output = temporary.path
         listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")
     try:
-        choice = runner.Choice(str(method) if isinstance(method, Path) else method, preset, settings)
+        named = str(method) if isinstance(method, Path) else method
+        choice = runner.Choice(named, preset, settings, purpose)
         runner.fit(Path(data), Path(output), choice, resume=resume, progress=listener)
     except KeyboardInterrupt:
         if temporary is not None:
@@ -89,7 +92,7 @@ class Previews(Progress):
             return
         view = trainer.data.views[0].load()
         rendered = RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
-        map_ = None if trainer.light is None else trainer.light.environment()
+        map_ = None if trainer.fit.light is None else trainer.fit.light.environment()
         light = None if map_ is None else light_panels(map_.radiance().numpy())
         image = contact_sheet([panels(rendered, view)], light)
         write_png(trainer.run.path / f"previews/{iteration:07d}.png", image)

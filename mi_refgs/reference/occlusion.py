@@ -72,26 +72,17 @@ def visible(shape: Shape, points: Array, direction: Array, clearance: float) -> 
     return ~np.isfinite(trace(shape, points + clearance * normal(shape, points), direction))
 
 
-def contracted(point: Array, centre: Array, radius: float) -> Array:
-    """A world point (3,) in the ball of radius 2. [Barron et al. 2022, eq. 10]"""
-    offset = (point - centre) / radius
-    length = float(np.linalg.norm(offset))
-    return offset if length <= 1 else (2 - 1 / length) * offset / length
-
-
 def fuse_point(
     point: Array,
     depths: list[Array],
     views: list[tuple[Array, float, int]],
     voxel: float,
     *,
-    carve: bool,
     truncation_voxels: float,
     unseen_vote: float,
-    region: tuple[Array, float] | None = None,
 ) -> float:
     """Fused signed distance of one point, in truncations: the table at the top of `occlusion.tsdf`, word by
-    word. With a region (centre, radius), `voxel` is of its contracted space."""
+    word."""
     truncation = truncation_voxels * voxel
     total = weight = sightings = covered = 0.0
     for depth, (to_world, focal, size) in zip(depths, views, strict=True):
@@ -107,26 +98,15 @@ def fuse_point(
         tap = depth[np.ix_(rows, columns)]
         if (tap == 0).all():  # background for certain
             sightings += 1
-            if carve:
-                weight += 1
-                total += 1
+            weight += 1
+            total += 1
             continue
         surface = tap[int(dv >= 0.5), int(du >= 0.5)]
         if surface == 0:  # half-covered pixel
             continue
-        eye = to_world[:3, 3]
-        ray = (point - eye) / z
-        scale = 1.0
-        if region is not None:
-            step = 1e-6 * z
-            moved = contracted(point + step * ray, *region) - contracted(point - step * ray, *region)
-            scale = float(np.linalg.norm(moved)) / (2 * step * float(np.linalg.norm(ray)))
-        if tap.min() > 0 and np.ptp(tap) * scale < truncation:
+        if tap.min() > 0 and np.ptp(tap) < truncation:
             surface = np.array([1 - dv, dv]) @ tap @ np.array([1 - du, du])
         distance = surface - z
-        if region is not None:
-            apart = contracted(eye + surface * ray, *region) - contracted(point, *region)
-            distance = np.sign(distance) * float(np.linalg.norm(apart)) / float(np.linalg.norm(ray))
         if distance <= -truncation:
             covered += 1
             continue

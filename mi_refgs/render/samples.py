@@ -74,7 +74,6 @@ def supersampled(
         background=None if fine.background is None else behind(fine.background),
         object_alpha=object_alpha,
         distance=distance,
-        attribution=None if fine.attribution is None else mean(fine.attribution),
     )
 
 

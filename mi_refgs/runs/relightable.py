@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 from mi_refgs.errors import SceneError
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.tsdf import bounds_from_points
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import ambient
@@ -59,9 +58,6 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     shading = scene.shading.relit(scene.mesh is not None)
     assert scene.light is not None and shading is not None  # by `lacking`
     surfels, mesh = scene.surfels.detach(), scene.mesh
-    if mesh is not None and scene.surroundings is not None:  # which must not shadow another light
-        low, high = bounds_from_points(surfels.to_numpy()["position"])
-        mesh = mesh.of_vertices(np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1))
     if scene.shading.required_attributes != shading.required_attributes:
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in LIT}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, fitting_downscale, read_dataset
+from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.methods.method import Method
@@ -19,29 +19,38 @@ from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.run import DATASET, Run
 
 
-def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> Method:
-    """The method with its own `data.downscale`, or the smallest that brings images to its preset's pixels.
+def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> tuple[Method, Dataset]:
+    """The method with the size of images decided, and the training views in it, without ground truth.
 
-    `tell` is called if images are downscaled. Raises InputError as `read_dataset` does.
+    The size is its own `data.downscale`, or the smallest that brings the first image to the pixels of its
+    preset: `tell` is called then. Raises InputError as `read_dataset` does.
     """
-    if method.data.downscale is not None:
-        return method
     pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
-    factor, width, height = fitting_downscale(path, method.data.images, pixels)
-    if factor > 1:
+    views = read_views(method, path, "train", truth=False, pixels=pixels)
+    if method.data.downscale is None and views.downscale > 1:
+        first = views.views[0]
+        file = first.file or first
         tell(
-            f"{path}: images of {width} × {height} pixels are read as {width // factor} × "
-            f"{height // factor}; preset {method.preset} takes {pixels:,} pixels at most, --set "
+            f"{path}: images of {file.width} × {file.height} pixels are read as {first.width} × "
+            f"{first.height}; preset {method.preset} takes {pixels:,} pixels at most, --set "
             f"data.downscale=1 reads them whole"
         )
-    return method.downscaled(factor)
+    return method.downscaled(views.downscale), views
 
 
-def read_views(method: Method, path: Path, split: str, truth: bool = True) -> Dataset:
+def read_views(
+    method: Method, path: Path, split: str, truth: bool = True, pixels: int = sys.maxsize
+) -> Dataset:
     """A split of a data set, read as a method says; raises InputError as `read_dataset` does."""
-    data, downscale = method.data, method.data.downscale or 1
+    options = method.data
     return read_dataset(
-        path, split, downscale=downscale, background=data.background, images=data.images, truth=truth
+        path,
+        split,
+        downscale=options.downscale,
+        pixels=pixels,
+        background=options.background,
+        images=options.images,
+        truth=truth,
     )
 
 

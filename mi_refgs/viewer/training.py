@@ -41,7 +41,7 @@ class Training(ViewerScene):
         self.centre, self.radius = bounds_of(trainer.surfels, trainer.region)
         names = variables_of(trainer.surfels, trainer.shading())
         self.variables = tuple(name for name in names if name != "visibility")  # in all stages
-        self.backdrops = backdrops_of(trainer.surroundings is not None, light=False)
+        self.backdrops = backdrops_of(trainer.fit.surroundings is not None, light=False)
 
     def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
         """See `ViewerScene`."""

@@ -113,12 +113,12 @@ def test_large_images_are_downscaled_unless_set(
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "quick", replace(PRESETS["quick"], pixels=150))
         assert main([*train_command(data, run, method), "iterations=2"]) == 0
-        assert sized(load_method(str(method), "quick", ["data.downscale=1"]), data).data.downscale == 1
+        assert sized(load_method(str(method), "quick", ["data.downscale=1"]), data)[0].data.downscale == 1
     assert capsys.readouterr().err.count("20 × 20 pixels are read as 10 × 10") == 1
     assert load_resolved(run / "config.toml").data.downscale == 2
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["image_size"] == [SIZE // 2, SIZE // 2]
-    assert sized(load_method(str(method), "quick", []), data).data.downscale == 1
+    assert sized(load_method(str(method), "quick", []), data)[0].data.downscale == 1
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

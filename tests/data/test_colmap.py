@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.data.colmap_model import read_cameras, read_images, read_points
-from mi_refgs.data.dataset import fitting_downscale, read_dataset
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.region import region_of
 from mi_refgs.io.images import linear_from_srgb
@@ -85,9 +85,9 @@ def test_copies_are_used_without_images(tmp_path: Path) -> None:
         across, down = 49 / 97, 37 / 73
         small = replace(shot, width=49, height=37, focal=(110 * across, 104 * down))
         replace(small, centre=(50.3 * across, 34.6 * down)).write(data / "images_2")
-    assert fitting_downscale(data, "png", 48 * 36) == (2, 97, 73)
+    assert read_dataset(data, "train", pixels=48 * 36).downscale == 2
     shutil.rmtree(data / "images")
-    assert fitting_downscale(data, "png", 10_000) == (1, 49, 37)
+    assert read_dataset(data, "train", pixels=10_000).downscale == 1
     view = read_dataset(data, "train").views[0]
     assert (view.width, view.height) == (49, 37)
     assert (view.fx, view.cy) == pytest.approx((110 * 49 / 97, 34.6 * 37 / 73))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.data.dataset import fitting_downscale
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, write_png
 from tests.helpers import read_loaded, refused
@@ -82,15 +82,15 @@ def test_downscale_averages_composited_pixels(folder: Path) -> None:
         assert half.fx == full.fx / 2 and half.cy == full.cy / 2
 
 
-def test_fitting_downscale_meets_pixel_budget(folder: Path) -> None:
+def test_images_meet_pixel_budget(folder: Path) -> None:
     """Photographs of 1080 × 1920 and their like, read no larger than asked for."""
     Image.new("RGB", (1080, 1920)).save(folder / "large.jpg")
     write_exr(folder / "large.exr", np.zeros((30, 21, 3)))
     frame = {"file_path": "large.jpg", "transform_matrix": pose(0).tolist()}
     change_transforms(folder, lambda content: content.update(frames=[frame]), "train")
     for pixels, factor in ((65536, 6), (1080 * 1920, 1), (1080 * 1920 - 1, 2), (1, 961)):
-        assert fitting_downscale(folder, "png", pixels) == (factor, 1080, 1920)
-    assert fitting_downscale(folder, "exr", 70) == (3, 21, 30)
+        assert read_dataset(folder, "train", pixels=pixels).downscale == factor
+    assert read_dataset(folder, "train", pixels=70, images="exr").downscale == 3
     view = read_loaded(folder, "train", downscale=7).views[0]
     assert (view.width, view.height) == (1080 // 7, 1920 // 7)
     assert view.cx == pytest.approx(1080 / 2 / 7) and view.cy == pytest.approx(1920 / 2 / 7)

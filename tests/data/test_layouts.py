@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.data.dataset import fitting_downscale, read_dataset
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.io.images import linear_from_srgb, write_png
 from tests.helpers import read_loaded, refused
@@ -173,7 +173,7 @@ def test_llff_cameras_project_points_onto_images(factor: int, tmp_path: Path) ->
         check(view, replace(shot, focal=(107.0, 107.0), centre=(48.0, 36.0)))
     view = read_dataset(data, "train", downscale=4).views[0].load()
     assert view.width == 24 and view.fx == pytest.approx(107 / 4)
-    assert fitting_downscale(data, "png", 2000) == (2, 96, 72)
+    assert read_dataset(data, "train", pixels=2000).downscale == 2
 
 
 def test_broken_llff_poses_are_refused(tmp_path: Path) -> None:

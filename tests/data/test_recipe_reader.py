@@ -18,7 +18,6 @@ from mi_refgs.data.dataset import (
     PointCloud,
     ReadOptions,
     Recording,
-    fitting_downscale,
     held_out,
     read_dataset,
     register_reader,
@@ -75,7 +74,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 def test_registered_layout_is_read_and_fitted(folder: Path, tmp_path: Path) -> None:
     train, test = read_dataset(folder, "train"), read_dataset(folder, "test", downscale=2)
     assert (len(train.views), len(test.views)) == (9, 2) and test.views[0].width == train.views[0].width // 2
-    assert fitting_downscale(folder, "png", 100) == (2, 20, 20)
+    assert read_dataset(folder, "train", pixels=100).downscale == 2
     run = tmp_path / "run"
     assert main(train_command(folder, run, write_method(tmp_path))) == 0
     position = read_ply(run / "surfels.ply").to_numpy()["position"]

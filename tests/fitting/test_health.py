@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
-from mi_refgs.fitting import health
-from mi_refgs.fitting.optim import Skipped
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives.surfel import Surfel
@@ -85,14 +83,6 @@ def test_surfels_that_are_not_finite_are_removed_and_fit_goes_on(
     assert trainer.iteration == 12 and np.isfinite(trainer.statistics()["loss"])
     for found in trainer.state().values():
         assert np.all(np.isfinite(found))
-
-
-def test_values_too_large_to_render_are_named_beside_those_that_are_not_finite(method: Method) -> None:
-    """The larger ones would stay, and be named by another channel, if the look were for NaN alone."""
-    raw = Trainer(method, ball()).surfels.to_numpy()
-    raw["indirect_sh"][4, 0], raw["roughness"][9, 0] = 1e30, np.nan
-    rows = health.culprits(Surfels.from_numpy(raw), Skipped(0, 0, {}))
-    assert {name: at.tolist() for name, at in rows.items()} == {"roughness": [9], "indirect_sh": [4]}
 
 
 def test_fit_in_which_every_step_fails_ends_with_one_sentence(method: Method, tmp_path: Path) -> None:

@@ -10,10 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.data.dataset import View
-from mi_refgs.data.images import Pixels
 from mi_refgs.fitting import losses
-from mi_refgs.fitting.targets import Target
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
@@ -79,11 +76,6 @@ def test_l1_of_clipped_highlights(images: tuple[np.ndarray, np.ndarray]) -> None
     )
 
 
-def test_saturated_is_last_8_bit_value() -> None:
-    (mask,) = losses.saturated([mi.Float(254 / 255, 254.4 / 255, 1.0, 1.7)])
-    assert list(np.array(mask)) == [False, False, True, True]
-
-
 def test_only_objects_own_colour_is_highlight() -> None:
     """Composites of 8-bit colours: white behind empty pixels and edges is none, a white edge on black is."""
     alpha = np.array([0, 1 / 255, 0.2, 0.5, 1, 0, 1 / 255, 0.2, 0.5, 1], np.float32)
@@ -92,31 +84,6 @@ def test_only_objects_own_colour_is_highlight() -> None:
         image = own * alpha + (1 - alpha) * np.float32(background)
         (mask,) = losses.saturated([mi.Float(image)], mi.Float(alpha), [background])
         assert np.array(mask).tolist() == [False] * 6 + [True] * 4
-
-
-@pytest.mark.parametrize("covered", [0.0, 1.0])
-def test_floater_brighter_than_white_background_costs(covered: float) -> None:
-    """Over the background it does, over a highlight of the object it does not."""
-    image, alpha = np.ones((4, 4, 3), np.float32), np.full((4, 4), covered, np.float32)
-    view = View("a", 4, 4, 4, 4, 2, 2, np.eye(4), Pixels(image, alpha))
-    target = Target.of(view, np.ones(3))
-    radiance = [mi.Float(np.full(16, 3.0)) for _ in range(3)]
-    dr.enable_grad(radiance)
-    shown = display.display_image(radiance, mi.Float(np.full(16, 0.5)), [1.0, 1.0, 1.0])
-    assert target.clipped is not None
-    loss = losses.l1(losses.clip_highlights(shown, target.image, target.clipped), target.image)
-    dr.backward(loss)
-    slope = np.abs(dr.grad(radiance[0]).numpy())
-    assert (float(loss[0]) > 0.1 and slope.min() > 0) if not covered else (float(loss[0]) == slope.max() == 0)
-
-
-def test_alpha_loss(rng: np.random.Generator) -> None:
-    alpha, target = rng.random((HEIGHT, WIDTH, 1)), (rng.random((HEIGHT, WIDTH, 1)) > 0.5).astype(np.float64)
-    check(
-        lambda x: losses.alpha_loss(x[0], planes(target)[0]),
-        lambda x: reference.l1(x, target),
-        0.05 + 0.9 * alpha,
-    )
 
 
 def test_srgb_matches_file_reader_and_has_slope_at_zero() -> None:
@@ -236,23 +203,3 @@ def test_difference_of_lights(rng: np.random.Generator) -> None:
         mi.Color3f(brighter.T), mi.Color3f(photographed.T), mi.Float(np.zeros(40)), mi.Float(area)
     )
     assert float(unseen[0]) < 1e-6
-
-
-def test_second_call_compiles_nothing(images: tuple[np.ndarray, np.ndarray]) -> None:
-    image, target = images
-
-    def once(scale: float) -> int:
-        leaves = planes(image * scale)
-        dr.enable_grad(leaves)
-        goal = planes(target)
-        dr.eval(leaves, goal)
-        misses = sum(dr.detail.launch_stats()[1:])
-        value = 0.8 * losses.l1(leaves, goal) + 0.2 * d_ssim(leaves, goal)
-        dr.backward(value)
-        dr.eval(value, [dr.grad(leaf) for leaf in leaves])
-        dr.sync_thread()
-        return sum(dr.detail.launch_stats()[1:]) - misses
-
-    once(1.0)
-    once(0.9)
-    assert once(0.8) == 0

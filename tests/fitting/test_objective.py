@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.objective import LossInputs, objective, require_losses
 from mi_refgs.fitting.targets import Target
-from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import LossWeight
@@ -100,22 +99,6 @@ def test_priors_are_weighed_as_method_says(
     assert loss(materials=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3)
     expected = 0.4 * float(losses.light_colour(light)[0])
     assert loss(light_colour=LossWeight(0.4)) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
-
-
-def test_weight_of_normals_rises_linearly(data: Path, method: Path) -> None:
-    views = read_dataset(data, "train", truth=False)
-    trainer = Trainer(methods.load(str(method), "quick", ["surfels.count=200", "loss.alpha=0"]), views)
-    target = trainer.targets[0]
-    frame = trainer.view(target.camera)
-
-    def loss(iteration: int, **weights: LossWeight) -> float:
-        return float(objective(LossInputs.of(frame, target, views), weights, iteration)[0][0])
-
-    rest, full = loss(1), loss(1, normal=LossWeight(0.2))
-    assert full - rest > 1e-3
-    for iteration, share in ((1, 0.01), (50, 0.5), (100, 1), (1000, 1)):
-        rising = loss(iteration, normal=LossWeight(0.2, rise=100))
-        assert rising - rest == pytest.approx(share * (full - rest), rel=1e-3)
 
 
 @pytest.mark.parametrize("prior", ["half_metal", "materials", "light_colour"])

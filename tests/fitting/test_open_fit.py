@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mi_refgs import methods
-from mi_refgs.data.dataset import Dataset, PointCloud, read_dataset
+from mi_refgs.data.dataset import READERS, Dataset, PointCloud, read_dataset
 from mi_refgs.data.images import ImageFile
 from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.region import REGION_FILE, Region
@@ -25,7 +25,7 @@ from mi_refgs.fitting.events.reset_opacity import ResetOpacity
 from mi_refgs.fitting.exchange import depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
-from mi_refgs.fitting.runner import begin, method_for
+from mi_refgs.fitting.runner import Choice, begin, chosen
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
@@ -358,16 +358,13 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
 def test_resume_with_images_of_the_other_kind_changes_nothing(
     data: Dataset, method: Method, tmp_path: Path
 ) -> None:
-    """Images with alpha for an open run, and the reverse: the message names both folders and the cause."""
+    """Images with alpha for an open run, and the reverse: the message names both folders."""
     closed = read_dataset(write_data(tmp_path / "alpha", truth=False), "train")
-    for name, own, other, words in (
-        ("open", data, closed, "images with alpha, but {} was fitted to images without"),
-        ("closed", closed, data, "images without alpha, but {} was fitted to images with"),
-    ):
+    for name, own, other in (("open", data, closed), ("closed", closed, data)):
         run = Run(tmp_path / name)
         run.save_checkpoint(0, begin(method, own, run).state())
         before = (run.path / "dataset.json").read_bytes()
-        refused(["train", other.path, "-o", run.path, "--resume"], f"{other.path}: ", words.format(run.path))
+        refused(["train", other.path, "-o", run.path, "--resume"], str(other.path), f"{run.path}: ")
         assert (run.path / "dataset.json").read_bytes() == before
 
 
@@ -402,11 +399,11 @@ def test_light_follows_photographs(data: Dataset, method: Method, monkeypatch: p
     step_to(trainer, 4)
     known = trainer.fit.photographed
     assert known is not None and rendered == [4]
-    light = trainer.light
+    light = trainer.fit.light
     assert light is not None
     before = float(known.difference(light.prefilter())[0])
     step_to(trainer, 8)
-    light = trainer.light
+    light = trainer.fit.light
     assert light is not None
     after = float(known.difference(light.prefilter())[0])
     assert rendered == [4, 8] and after < 0.8 * before
@@ -451,7 +448,7 @@ def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> N
 @pytest.mark.parametrize(
     ("purpose", "without", "alpha"),
     [
-        (None, "photographs", None),
+        (None, "photographs", "auto"),
         ("relighting", "photographs_relighting", "relighting"),
         ("photographs", "photographs", "photographs"),
     ],
@@ -462,15 +459,17 @@ def test_images_without_alpha_have_a_method_of_their_own(
     monkeypatch: pytest.MonkeyPatch,
     purpose: str | None,
     without: str,
-    alpha: str | None,
+    alpha: str,
 ) -> None:
-    """It is chosen without decoding one of them, and fits a background."""
+    """It is chosen from one reading, without decoding an image, and fits a background."""
     said: list[str] = []
     monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("an image was decoded"))
-    assert method_for(data.path, purpose, say=said.append) == without
-    assert bool(said) == (without != purpose)
+    reads, read = list[str](), READERS.values
+    monkeypatch.setattr(READERS, "values", lambda: reads.append("") or read())
+    method, views = chosen(data.path, Choice(purpose=purpose), said.append)
+    assert method.name == without and bool(said) == (without != purpose)
+    assert len(reads) == 1 and views.split == "train"
     monkeypatch.undo()
     objects = write_data(tmp_path, views=3, truth=False)
-    assert method_for(objects, purpose, say=pytest.fail) == alpha
-    chosen = methods.load(without)
-    assert chosen.surroundings is not None and isinstance(chosen.event["photograph_light"], PhotographLight)
+    assert chosen(objects, Choice(purpose=purpose), pytest.fail)[0].name == alpha
+    assert method.surroundings is not None and isinstance(method.event["photograph_light"], PhotographLight)

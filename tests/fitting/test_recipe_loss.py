@@ -62,12 +62,6 @@ def test_loss_per_pixel_is_refused(data: Path, method: Path) -> None:
         LOSSES.unregister("uneven")
 
 
-def test_loss_of_an_absent_attribute_is_refused(data: Path, registered: None) -> None:
-    colour = methods.load("base_2dgs", "quick", [*SETTINGS[:-1], "loss.rough=1.0"])
-    with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: needs the attribute roughness"):
-        Trainer(colour, read_dataset(data, "train", truth=False))
-
-
 def test_loss_that_is_not_registered_is_refused(data: Path, method: Path) -> None:
     with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: 'rough' is unknown; use normal or"):
         roughness_after(data, method, "loss.rough=1.0")

@@ -128,5 +128,5 @@ def test_method_that_changed_since_is_refused(finished: Path, data: Path, tmp_pa
         text = config.read_text()
         assert old in text
         config.write_text(text.replace(old, new))
-        refused(["train", data, "-o", run.path, "--resume"], "config.toml", name, "undo")
+        refused(["train", data, "-o", run.path, "--resume"], str(run.path), name, "resume with the method")
         config.write_text(text)

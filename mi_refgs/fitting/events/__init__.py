@@ -5,7 +5,7 @@ ORDER = (
     *("densify", "reset_opacity", "propagate", "exposure", "cameras", "follow_object", "photograph_light"),
     *("mesh", "restart"),
     # In `Trainer.train` only:
-    *("checkpoint", "hold_out", "metal", "colour_alone", "more_surfels"),
+    *("hold_out", "metal", "colour_alone", "more_surfels"),
 )
 """The order of the events of an iteration; those that users register come right before the mesh."""
 

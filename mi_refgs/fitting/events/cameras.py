@@ -19,12 +19,12 @@ from mi_refgs.methods.ranges import at_least
 from mi_refgs.methods.window import ITERATIONS
 
 
+@register
 @dataclass(frozen=True)
 class Cameras(Event[Trainer]):
     """Lets the camera of each training view learn."""
 
     name: ClassVar[str] = "cameras"
-
     after: int = field(default=1_200, metadata=ITERATIONS | at_least(0))  # iterations before cameras learn
 
     def due(self, trainer: Trainer) -> bool:
@@ -34,6 +34,3 @@ class Cameras(Event[Trainer]):
     def apply(self, trainer: Trainer) -> None:
         rows = np.zeros((len(trainer.data.views), 6), np.float32)
         trainer.fit.add(trainer.setup, POSE, upload_tensor(rows))
-
-
-register(Cameras)

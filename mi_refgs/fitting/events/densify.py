@@ -31,21 +31,20 @@ from mi_refgs.surfels.table import Surfels
 SPLIT_OFFSET, SPLIT_SCALE = 0.6, 0.72
 """Distance of a split surfel's two children from its centre, and their scale, both relative to its longest
 scale and along that axis. With `split_opacity` their composited profile is the parent's but for 0.4 to 1.8 %
-of its energy (opacity 0.3 to 0.99; least squares over scale and opacity at this distance). Smaller distances
-fit better, but the children then differ too little."""
+of its energy."""
 BACKGROUND_EXTENT = 0.5  # distances from the region's centre; larger surfels of the background are removed
 WEIGHED_VIEWS, WEIGHED_SIZE = 48, 128
-"""Training views in which faint surfels are looked for at most, and the longer side of their images there in
-pixels: an event then takes as long as 5 to 10 steps."""
+"""Training views in which faint surfels are looked for, and the longer side of their images, pixels: an event
+then takes as long as 5 to 10 steps."""
 NO_ROWS = np.empty(0, np.int64)
 
 
+@register
 @dataclass(frozen=True)
 class Densify(Event[Trainer]):
     """Splits and prunes the surfels of the object and of the background."""
 
     name: ClassVar[str] = "densify"
-
     when: Window  # iterations at which it happens
     grow: float = field(default=0.25, metadata=at_least(0))  # fraction of the surfels split at most
     prune_opacity: float = field(default=0.05, metadata=between(0, 1))  # surfels of less are removed
@@ -76,11 +75,9 @@ class Densify(Event[Trainer]):
                 assert region is not None
                 offset = table.surfels.raw["position"].numpy() - np.array(region.centre)
                 largest = BACKGROUND_EXTENT * np.maximum(np.linalg.norm(offset, axis=1), region.radius)
-            error = table.error_sum.numpy()
+            error, keep_one = table.error_sum.numpy(), bool(table.prefix)
             table.apply(
-                densify_and_prune(
-                    table.surfels, error, few, largest, options, table.max_count, keep_one=bool(table.prefix)
-                )
+                densify_and_prune(table.surfels, error, few, largest, options, table.max_count, keep_one)
             )
         exchange(trainer.setup, fit)
         fit.occluder.vertex_surfels = None
@@ -98,7 +95,8 @@ class Densify(Event[Trainer]):
 
     def _faint(self, trainer: Trainer) -> list[np.ndarray]:
         """The rows of each table with the least blending weight for the tiles they cost, these first."""
-        every, own, views = trainer.fit.detached(), trainer.surfels.count, trainer.data.views
+        every = [table.surfels.detach() for table in trainer.fit.tables]
+        own, views = trainer.surfels.count, trainer.data.views
         weight, cost = np.zeros(surfel_count(every)), np.zeros(surfel_count(every))
         for index in evenly_spread(len(views), WEIGHED_VIEWS):
             camera = views[index].camera()
@@ -135,9 +133,8 @@ def densify_and_prune(
 ) -> TableEdit:
     """Split the surfels with the largest error; remove transparent and oversized ones, and faint ones.
 
-    At most `most` surfels result; faint ones are removed as far as splits lack room. A surfel is split along
-    its longest axis into two that together look like it, so that the image hardly changes. `keep_one`: the
-    most opaque surfel stays in any case. Raises InputError if no surfel would be left.
+    At most `most` surfels result; faint ones are removed as far as splits lack room. `keep_one`: the most
+    opaque surfel stays in any case. Raises InputError if no surfel would be left.
     """
     raw = surfels.to_numpy()
     primitive = primitive_of(raw)
@@ -191,6 +188,3 @@ def least_weight(weight: np.ndarray, cost: np.ndarray, share: float) -> np.ndarr
     """
     order = np.argsort(weight / np.maximum(cost, 1), kind="stable")
     return order[np.cumsum(weight[order]) <= share * weight.sum()]
-
-
-register(Densify)

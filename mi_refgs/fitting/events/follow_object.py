@@ -26,6 +26,7 @@ LEVEL = 0.05  # difference of depth, in radii of the region, up to which two pix
 LEVEL_COUNT = 3  # of the eight neighbours of a pixel; fewer are where an outline mixes near and far
 
 
+@register
 @dataclass(frozen=True)
 class FollowObject(Event[Trainer]):
     """Adapts an estimated region of interest to the object, once; one that a user gave stays."""
@@ -41,7 +42,7 @@ class FollowObject(Event[Trainer]):
 
     def apply(self, trainer: Trainer) -> None:
         trainer.check()
-        region, around, views = trainer.region, trainer.surroundings, trainer.data.views
+        region, around, views = trainer.region, trainer.fit.surroundings, trainer.data.views
         assert region is not None and around is not None
         tables = trainer.surfels.detach(), around.surfels.detach()
         points = []
@@ -68,6 +69,3 @@ def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.
     level = np.count_nonzero(abs(beside - z) < LEVEL * radius, axis=0) >= LEVEL_COUNT
     row, column = np.nonzero((opaque > SURFACE) & level)
     return np.asarray(view.to_world[:3, 3] + view.rays(row, column) * z[row, column, None])
-
-
-register(FollowObject)

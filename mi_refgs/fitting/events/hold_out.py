@@ -10,6 +10,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import Event, register
 
 
+@register
 @dataclass(frozen=True)
 class HoldOut(Event[Trainer]):
     """Begins to hold them out, in a new or a resumed fit; the last decision ends it."""
@@ -23,6 +24,3 @@ class HoldOut(Event[Trainer]):
 
     def apply(self, trainer: Trainer) -> None:
         hold_out(trainer)
-
-
-register(HoldOut)

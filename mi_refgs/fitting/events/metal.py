@@ -1,10 +1,9 @@
 """Choice between metal and dielectric at the start of a fit, surfel by surfel, by a trial of both.
 
-Where metallic learns freely from the start, values in between explain the images under a light of another
-contrast, and a prior against them decides by the initial value. So the fit begins twice, once with every
-surfel metal and once with none, each with its own light and geometry. The one that explains the training
-images better continues, and each of its surfels starts as what explains the images around it better. From
-then on metallic learns per surfel.
+The fit begins twice, once with every surfel metal and once with none, each with its own light and geometry.
+The one that explains the training images better continues, and each of its surfels starts as what explains
+the images around it better. Were metallic to learn freely, a light of another contrast would explain the
+images with values in between.
 """
 
 from __future__ import annotations
@@ -36,30 +35,22 @@ DIELECTRIC, METAL = 0.1, 0.9
 """Metallic during the trials: 0 and 1 have no slope, so that no surfel could leave them afterwards."""
 
 METAL_GAIN = 1.5
-"""Gain in dB from which surfels start as metal. As metal, a fit finds the light sooner, also of a plastic: at
-the end of the trial of `quick`, metal gains 0.7 dB on `plastic_hollows`, 2.3 dB on `mixed` and 2.6 dB on
-`gold_cavities`."""
+"""Gain in dB from which surfels start as metal: `plastic_hollows` gains 0.7, `mixed` 2.3, `gold_cavities` 2.6
+dB."""
 
 JUDGED_VIEWS = 24  # training views whose errors decide
 
-NEIGHBOURHOOD = 0.05
-"""Fraction of the surfels that a surfel shares its choice with: errors of single surfels are noise. With 1.5
-dB, 92 % of the surface of `mixed` (metals and glazes) start as what they are; with a fraction of 0.01, 81 %.
-"""
+NEIGHBOURHOOD = 0.05  # fraction of the surfels that a surfel shares its choice with: single errors are noise
 CENTRES = 5_000  # surfels that the fraction is counted in: so many sums are computed
 
 
+@register
 @dataclass(frozen=True)
 class Metal(Decision):
-    """Begins a fit as dielectric and as metal, and continues one of them.
-
-    Metal has to be better by METAL_GAIN: in the whole images to be continued, around a surfel for the surfel
-    to start as metal. From then on metallic learns per surfel.
-    """
+    """Begins a fit as dielectric and as metal, and continues one of them: as metal if it gains METAL_GAIN."""
 
     name: ClassVar[str] = "metal"
     validates: ClassVar[bool] = False  # by training images
-
     trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations with every surfel metal, or none
 
     def require(self, attributes: Collection[str]) -> None:
@@ -84,7 +75,7 @@ class Metal(Decision):
         dielectric, metal = (psnr_of(float(np.mean([error.mean() for error in one]))) for one in errors)
         is_metal = metal >= dielectric + METAL_GAIN
         trainer.take(fits[is_metal], trainer.method)
-        trainer.fit.optimiser.set_factor("metallic", 1.0)
+        trainer.fit.optimiser.factors["metallic"] = 1.0
 
         # Each surfel starts as what has the smaller error around it.
         excess = [one - 10 ** (METAL_GAIN / 10) * other for one, other in zip(*errors, strict=True)]
@@ -105,7 +96,7 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
     surfels = trainer.method.surfels
     surfels = replace(surfels, initial={**surfels.initial, "metallic": metallic})
     copy = Trainer(replace(trainer.method, surfels=surfels), trainer.data, targets=trainer.targets)
-    copy.fit.optimiser.set_factor("metallic", 0.0)
+    copy.fit.optimiser.factors["metallic"] = 0.0
     return run(copy, steps, trainer)
 
 
@@ -132,6 +123,3 @@ def _sum_around(positions: np.ndarray, values: np.ndarray) -> np.ndarray:
     sums = np.bincount(own, values, len(centres))
     _, nearest = tree.query(centres, max(round(NEIGHBOURHOOD * len(centres)), 1))
     return np.asarray(sums[nearest.reshape(len(centres), -1)].sum(axis=1)[own])
-
-
-register(Metal)

@@ -12,21 +12,21 @@ from mi_refgs.methods.event import Event, register
 from mi_refgs.methods.window import Window
 
 
+@register
 @dataclass(frozen=True)
 class PhotographLight(Event[Trainer]):
     """Renders the background from the object; of open scenes with a light only."""
 
     name: ClassVar[str] = "photograph_light"
-
     when: Window  # iterations at which it happens
 
     def due(self, trainer: Trainer) -> bool:
-        open_ = trainer.surroundings is not None and trainer.region is not None
+        open_ = trainer.fit.surroundings is not None and trainer.region is not None
         return open_ and trainer.method.light is not None and self.when.due(trainer.iteration)
 
     def apply(self, trainer: Trainer) -> None:
         trainer.check()
-        light, around, region = trainer.light, trainer.surroundings, trainer.region
+        light, around, region = trainer.fit.light, trainer.fit.surroundings, trainer.region
         assert light is not None and around is not None and region is not None
         views = trainer.data.views
         posed = [
@@ -35,6 +35,3 @@ class PhotographLight(Event[Trainer]):
         trainer.fit.photographed = PhotographedLight.of(
             trainer.surfels.detach(), around, region, posed, light.environment().height
         )
-
-
-register(PhotographLight)

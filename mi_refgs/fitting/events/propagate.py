@@ -15,15 +15,18 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import Event, register
-from mi_refgs.methods.ranges import at_least, between, inside
+from mi_refgs.methods.ranges import at_least, between
 from mi_refgs.methods.window import ITERATIONS, Window
 from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 
+OPACITY = 0.9  # all surfels become at least this opaque
+SCALE = 1.5  # factor of the scales of reflective surfels
 DULL = 0.05  # metallic up to which a surfel's colour gets noise
 
 
+@register
 @dataclass(frozen=True)
 class Propagate(Event[Trainer]):
     """Enlarges the reflective surfels of the object; a rough metal has no sharp reflection.
@@ -32,10 +35,7 @@ class Propagate(Event[Trainer]):
     """
 
     name: ClassVar[str] = "propagate"
-
     when: Window  # iterations at which it happens
-    opacity: float = field(default=0.9, metadata=inside(0, 1))  # all surfels become at least this opaque
-    scale: float = field(default=1.5, metadata=at_least(0))  # factor of the scales of reflective surfels
     metallic: float = field(default=0.02, metadata=between(0, 1))  # reflective: at least this metallic …
     roughness: float | None = None  # … and at most this rough; absent: any roughness
     noise: float = field(default=0.0, metadata=at_least(0))  # half its width, in SH coefficients
@@ -55,10 +55,10 @@ class Propagate(Event[Trainer]):
             edited = self.propagated(trainer.surfels, trainer.setup.rng(fit.iteration, "propagate"))
             colour = ("radiance_sh",) if self.noise else ()
             fit.tables[0].replace(edited, cleared=("opacity", *edited.primitive.sizes, *colour))
-            fit.optimiser.set_factor("opacity", 0.0)
+            fit.optimiser.factors["opacity"] = 0.0
             fit.held_until = fit.iteration + self.hold
         if fit.iteration >= fit.held_until:
-            fit.optimiser.set_factor("opacity", 1.0)
+            fit.optimiser.factors["opacity"] = 1.0
 
     def _grows(self, trainer: Trainer) -> bool:
         reset = trainer.method.event.get("reset_opacity")
@@ -66,19 +66,16 @@ class Propagate(Event[Trainer]):
         return self.when.due(trainer.iteration) and not (reset is not None and reset.due(trainer))
 
     def propagated(self, surfels: Surfels, rng: np.random.Generator) -> Surfels:
-        """The surfels with these opacities, sizes and noise."""
+        """The enlarged surfels."""
         raw = surfels.to_numpy()
-        raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(self.opacity)))
+        raw["opacity"] = np.maximum(raw["opacity"], np.float32(logit(OPACITY)))
         metallic = sigmoid(raw["metallic"][:, 0])
         reflective = metallic >= self.metallic
         if self.roughness is not None and "roughness" in raw:
             reflective &= sigmoid(raw["roughness"][:, 0]) <= self.roughness
-        primitive_of(raw).resize(raw, reflective, self.scale)
+        primitive_of(raw).resize(raw, reflective, SCALE)
         if self.noise and "radiance_sh" in raw:
             dull = np.flatnonzero(metallic <= DULL)
             noise = rng.uniform(-self.noise, self.noise, (len(dull), 3))
             raw["radiance_sh"][dull, :3] += noise.astype(np.float32)
         return Surfels.from_numpy(raw)
-
-
-register(Propagate)

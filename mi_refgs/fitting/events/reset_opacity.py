@@ -18,10 +18,10 @@ from mi_refgs.surfels.table import Surfels
 
 OPACITY = 0.01  # of all surfels after a reset, at most
 PATIENCE = 4.5
-"""Factor of the fewest steps in which an opacity can grow back: 150 iterations as shipped. Factor 2 (67
-iterations) was too small on a diffuse scene, which lost every surfel."""
+"""Factor of the fewest steps in which an opacity can grow back; with 2, a diffuse scene lost every surfel."""
 
 
+@register
 @dataclass(frozen=True)
 class ResetOpacity(Event[Trainer]):
     """Lowers the opacities of the object; the background map would replace the background's surfels, blurred.
@@ -30,7 +30,6 @@ class ResetOpacity(Event[Trainer]):
     """
 
     name: ClassVar[str] = "reset_opacity"
-
     when: Window  # iterations at which it happens
     raise_to_start: tuple[str, ...] = ()  # bounded attributes
 
@@ -55,13 +54,9 @@ class ResetOpacity(Event[Trainer]):
     def grown(self, iteration: int, opacity: float, rate: float) -> bool:
         """Whether opacities had time since the last reset before an iteration to grow back to `opacity`.
 
-        Adam raises a logit by about its rate per step, so from OPACITY it takes at least their distance over
-        the rate: 33 steps of 0.05 to an opacity of 0.05. Presets do not scale the rate, and so not this time.
+        Adam raises a logit by about its rate per step.
         """
         if (since := self.when.since(iteration)) is None:
             return True
         lift = max(logit(opacity) - logit(OPACITY), 0.0)
         return since >= (PATIENCE * lift / rate if rate > 0 else math.inf)
-
-
-register(ResetOpacity)

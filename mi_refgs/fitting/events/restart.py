@@ -12,6 +12,7 @@ from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 
 
+@register
 @dataclass(frozen=True)
 class Restart(Event[Trainer]):
     """Gives what the next stage names (`stage.NAME.restart`) its initial values, without history."""
@@ -36,6 +37,3 @@ class Restart(Event[Trainer]):
         if LIGHT in stage.restart and method.light is not None:
             fit.params[LIGHT] = method.light.start()
             fit.optimiser.reset(LIGHT)
-
-
-register(Restart)

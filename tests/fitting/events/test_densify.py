@@ -98,6 +98,8 @@ def test_no_child_is_too_transparent_to_stay() -> None:
     surfels, error = table(opacity=0.06), np.ones(6)
     assert densify(surfels, error).parent.tolist() == [*range(6)]
     assert len(densify(surfels, error, options=dataclasses.replace(OPTIONS, prune_opacity=0.0)).parent) == 8
+    with pytest.raises(InputError, match="prune_opacity"):
+        densify(table(opacity=0.02), np.zeros(6))
 
 
 def test_faint_surfels_make_room_for_splits() -> None:
@@ -124,14 +126,6 @@ def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
     raw["scale"][1] = np.log(0.5)
     edited = densify(Surfels.from_numpy(raw), np.full(6, 1e-3))
     assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
-
-
-def test_opacities_get_time_to_grow_back_after_reset() -> None:
-    surfels = table(opacity=0.02)
-    waiting = dataclasses.replace(OPTIONS, prune_opacity=0.0)
-    assert len(densify(surfels, np.zeros(6), options=waiting).parent) == 6
-    with pytest.raises(InputError, match="prune_opacity"):
-        densify(surfels, np.zeros(6))
 
 
 def test_wait_follows_rate_that_lifts_opacities() -> None:

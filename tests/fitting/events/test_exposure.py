@@ -10,17 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from PIL import Image
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.exposure import EXPOSURE_TIME, F_NUMBER, ISO, MAX_GAIN, fitted_gain, log_exposure
+from mi_refgs.data.exposure import fitted_gain
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import image_error, per_view
-from mi_refgs.fitting.events.exposure import DEAD_ZONE, Exposure, exif_gains
+from mi_refgs.fitting.events.exposure import DEAD_ZONE, Exposure
 from mi_refgs.fitting.objective import GAIN_PRIOR, LossInputs, objective
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.io.images import EXIF_IFD, srgb_from_linear
+from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import GAIN, DataOptions, Method
 from mi_refgs.reference import losses as reference
@@ -184,19 +183,18 @@ def test_gains_begin_as_those_of_the_images(
 def test_fit_with_gains_resumes_bit_for_bit(
     stop: int, method: Method, rng: np.random.Generator, tmp_path: Path, one_thread: None
 ) -> None:
-    """Started by EXIF data; stopped before or after the gains begin to learn."""
+    """Stopped before or after the gains begin to learn."""
     method = dataclasses.replace(method, iterations=AFTER + 6)
     data = exposed(ball(), rng.uniform(-0.5, 0.3, (6, 3)))
-    views = tuple(dataclasses.replace(view, exposure=0.1 * i) for i, view in enumerate(data.views))
-    data = dataclasses.replace(data, views=views)
     straight = step_to(Trainer(method, data), method.iterations)
     step_to(Trainer(method, data, run_folder(tmp_path / "run", method)), stop).save()
     said: list[str] = []
     second = Trainer(method, data, Run(tmp_path / "run"), tell=said.append)
     step_to(second, method.iterations)
     assert len(said) == (stop < AFTER) and f"params/{GAIN}" in require_same_state(straight, second)
+    second.save()
     fewer = dataclasses.replace(data, views=data.views[1:])
-    with pytest.raises(InputError, match="5 training views, but the checkpoint has gains of 6"):
+    with pytest.raises(InputError, match=r"gain: it has \(6, 3\), a fit .* \(5, 3\)"):
         Trainer(method, fewer, Run(tmp_path / "run"))
 
 
@@ -214,44 +212,3 @@ def test_warm_step_with_gains_compiles_nothing(method: Method) -> None:
         index = trainer.setup.view(trainer.iteration)
         moved = np.flatnonzero(np.any(trainer.fit.params[GAIN].numpy() != before, axis=1))
         assert moved.tolist() == [index]
-
-
-def photograph(path: Path, settings: dict[int, Any] | None) -> Path:
-    picture, exif = Image.new("RGB", (8, 8)), Image.Exif()
-    if settings is not None:
-        exif.get_ifd(EXIF_IFD).update(settings)
-    picture.save(path, exif=exif)
-    return path
-
-
-def test_exif_data_tell_exposure(tmp_path: Path, method: Method) -> None:
-    """A stop is a factor of two; what lacks one of the three numbers, or has nonsense, tells nothing."""
-    usual: dict[int, Any] = {EXPOSURE_TIME: 0.01, F_NUMBER: 2.0, ISO: 100}
-    changes: list[dict[int, Any]] = [{}, {EXPOSURE_TIME: 0.02}, {ISO: 50}, {F_NUMBER: 4.0}]
-    log = [log_exposure(photograph(tmp_path / f"{i}.jpg", usual | x)) for i, x in enumerate(changes)]
-    assert log[0] == pytest.approx(np.log(0.01 * 100 / 4), rel=1e-6)
-    assert [value - log[0] for value in log if value is not None and log[0] is not None] == pytest.approx(
-        np.log([1, 2, 0.5, 0.25]), abs=1e-5
-    )
-    for settings in (None, {EXPOSURE_TIME: 0.01}, usual | {ISO: 0}, usual | {F_NUMBER: 0.0}):
-        assert log_exposure(photograph(tmp_path / "none.jpg", settings)) is None
-    assert log_exposure(tmp_path / "picture.exr") is None
-    for name in ("garbage.jpg", "garbage.png"):
-        Image.new("RGB", (8, 8)).save(tmp_path / name, exif=b"Exif\0\0garbage")
-        assert log_exposure(tmp_path / name) is None
-    data = ball(views=4)
-    known = [dataclasses.replace(view, exposure=x) for view, x in zip(data.views, log, strict=True)]
-    gains = exif_gains(dataclasses.replace(data, views=tuple(known)))
-    assert gains is not None
-    np.testing.assert_allclose(gains[:, 1], np.log([1, 2, 0.5, 0.25]) + np.log(2) / 2, atol=1e-5)
-    trainer = Trainer(method, dataclasses.replace(data, views=tuple(known)))
-    np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), gains)
-    trainer.step()  # gains do not learn yet
-    np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), gains)
-    alike = tuple(dataclasses.replace(view, exposure=log[0]) for view in known)
-    assert exif_gains(dataclasses.replace(data, views=alike)) is None
-    assert exif_gains(dataclasses.replace(data, views=(*known[:-1], data.views[-1]))) is None
-    wild = [dataclasses.replace(v, exposure=x) for v, x in zip(data.views, (-600, 0, 0.1, 600), strict=True)]
-    gains = exif_gains(dataclasses.replace(data, views=tuple(wild)))
-    assert gains is not None
-    np.testing.assert_allclose(np.exp(gains[[0, 3], 0]), [1 / MAX_GAIN, MAX_GAIN], rtol=1e-6)

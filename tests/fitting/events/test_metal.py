@@ -145,15 +145,6 @@ def test_images_of_a_fit_decide(
         np.testing.assert_array_equal(raw.numpy(), again.surfels.raw[name].numpy(), name)
 
 
-def test_a_resumed_fit_is_not_tried_again(views: Dataset, tmp_path: Path) -> None:
-    trainer, _ = fitted(views, tmp_path, TRIAL)
-    said: list[str] = []
-    again = begin(trainer.method, views, Run(tmp_path / "run"), said.append)
-    again.train()
-    assert again.iteration == 6 and not any("metallic" in one for one in said)
-    np.testing.assert_array_equal(metallic(again), metallic(trainer))
-
-
 def test_what_cannot_be_tried_is_refused() -> None:
     with pytest.raises(InputError, match=r"event\.metal\.trial: 0 is out of range; give 1 or more"):
         methods.load("relighting", "quick", ["event.metal.trial=0"])
