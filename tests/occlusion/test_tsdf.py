@@ -215,4 +215,4 @@ def test_mesh_file_round_trip(tmp_path: Path) -> None:
     refused(lambda: meshes.read_mesh(tmp_path / "none.ply"), "no such file")
     (tmp_path / "bad.ply").write_text("hello")
     refused(lambda: meshes.read_mesh(tmp_path / "bad.ply"), "not a PLY file")
-    refused(lambda: meshes.write_mesh(tmp_path / "no" / "mesh.ply", mesh), "cannot be written")
+    refused(lambda: meshes.write_mesh(tmp_path / "bad.ply" / "mesh.ply", mesh), "cannot be created")

@@ -110,8 +110,9 @@ def test_what_no_scene_can_say_is_refused(tmp_path: Path) -> None:
     camera = Camera.from_pose(8, 8, 10, -10, 4, 4, np.eye(4))
     with pytest.raises(InputError, match="fx, fy: 10 and -10 pixels mirror"):
         write_scene_xml(tmp_path / "scene.xml", SceneFiles("a.ply"), Shading(), [camera])
-    with pytest.raises(InputError, match="cannot be written"):
-        write_scene_xml(tmp_path / "no" / "scene.xml", SceneFiles("a.ply"), Shading(), [view()])
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be created"):
+        write_scene_xml(tmp_path / "file" / "scene.xml", SceneFiles("a.ply"), Shading(), [view()])
     with pytest.raises(InputError, match="mesh: there is none"):
         write_scene_xml(tmp_path / "s.xml", SceneFiles("a.ply"), Shading(occlusion=True), [view()])
 
