@@ -93,7 +93,7 @@ def test_failed_job_is_a_row_with_its_reason(compared: tuple[Path, int]) -> None
     [scene] = table["scenes"]
     tiny, other = scene["rows"]
     assert tiny["variant"] == "tiny" and tiny["seeds"] == [0] and list(tiny["failed"]) == ["1"]
-    assert "seed1/previews: output: cannot be created" in tiny["failed"]["1"]
+    assert "seed1/checkpoints: output: cannot be created" in tiny["failed"]["1"]
     assert other["seeds"] == [0, 1] and not other["failed"]
     assert f"tiny, seed 1: failed: {tiny['failed']['1']}" in (compared[0] / "table.md").read_text()
 

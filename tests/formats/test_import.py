@@ -242,7 +242,7 @@ def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path
     command = ["render", str(scene), "-o", str(out)]
     refused(command, "sensor: the scene has none; add one, or give a file with --camera")
     refused(
-        [*command, "--camera", file, "--sensor", "2"], f"{file}: --sensor: 2: the file has 1 frames; give"
+        [*command, "--camera", file, "--sensor", "2"], f"{file}: --sensor: 2: the file has 1 frame; give"
     )
     assert main([*command, "--camera", str(file)]) == 0
     seen = read_exr(out)["R"]
