@@ -241,9 +241,7 @@ def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path
     file.write_text(json.dumps({"w": 16, "h": 12, "camera_angle_x": 0.8, "frames": [frame]}))
     command = ["render", str(scene), "-o", str(out)]
     refused(command, "sensor: the scene has none; add one, or give a file with --camera")
-    refused(
-        [*command, "--camera", file, "--sensor", "2"], f"{file}: --sensor: 2: the file has 1 frame; give"
-    )
+    refused([*command, "--camera", file, "--sensor", "2"], f"{file}: --sensor: 2: the file has 1 frame; give")
     assert main([*command, "--camera", str(file)]) == 0
     seen = read_exr(out)["R"]
     assert seen.shape == (12, 16) and seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)
