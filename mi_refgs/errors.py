@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Self
 
 
@@ -32,10 +31,8 @@ class InputError(ValueError):
 
     def at(self, file: object = None, field: str | None = None) -> Self:
         """A copy whose place is inside `file` and `field`, which precede the place that it had."""
-        inside = copy.copy(self)
-        inside.file = file
-        inside.field = ": ".join(_given(field, self.file, self.field)) or None
-        return inside
+        within = ": ".join(_given(field, self.file, self.field))
+        return type(self)(self.what, file, within or None, self.remedy)
 
 
 def _given(*parts: object) -> list[str]:
