@@ -33,7 +33,6 @@ def exchange(setup: FitSetup, fit: FitState) -> None:
     edits = exchanged(inner, outer, setup.method, region, setup.rng(fit.iteration, "densify"))
     for table, edit in zip(fit.tables, edits, strict=True):
         table.apply(edit)
-    fit.occluder.vertex_surfels = None
 
 
 def exchanged(

@@ -61,7 +61,6 @@ class Health:
         for table, names in found:
             if names:
                 table.remove(together(names))
-                state.occluder.vertex_surfels = None
         return said
 
 

@@ -69,12 +69,18 @@ class ParameterTable:
     optimiser: Adam
     prefix: str  # "" of the object, AROUND of the background
     max_count: int  # most surfels that the method allows
+    occluder: Occluder  # whose vertices have surfels of the object by their rows
     error_sum: Float = None  # (N,) squared error that each is responsible for, since the last densification
 
     @property
     def surfels(self) -> Surfels:
         """The surfels, attached to the leaves that the optimiser owns."""
         return Surfels(channels_of(self.params, self.prefix))
+
+    @property
+    def count(self) -> int:
+        """Number of surfels."""
+        return int(self.params[f"{self.prefix}position"].shape[0])
 
     def clear(self) -> None:
         """Set the errors to zero."""
@@ -86,7 +92,14 @@ class ParameterTable:
         dr.schedule(self.error_sum)
 
     def apply(self, edit: TableEdit) -> None:
-        """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows."""
+        """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows.
+
+        Raises InputError for an edit whose arrays have other lengths than its surfels, or unknown parents.
+        """
+        count, parents = edit.surfels.count, edit.parent
+        if not len(parents) == len(edit.fresh) == count or not np.isin(parents, np.arange(self.count)).all():
+            what = f"an edit to {count} surfels with {len(parents)} parents among {self.count} rows"
+            raise InputError(what, "event", remedy="give each new row its old one in `parent` and `fresh`")
         order = morton_order(edit.surfels.raw["position"].numpy())
         parent, fresh = upload(edit.parent[order], mi.UInt32), upload(edit.fresh[order], mi.Bool)
         self._move(edit.surfels.gather(upload(order, mi.UInt32)), parent, fresh)
@@ -106,6 +119,7 @@ class ParameterTable:
         self.optimiser.gather(parent, self._names(surfels), fresh)
         self.error_sum = dr.select(fresh, 0, dr.gather(mi.Float, self.error_sum, parent))
         dr.eval(self.error_sum)
+        self.occluder.vertex_surfels = None
 
     def replace(self, surfels: Surfels, cleared: tuple[str, ...] = ()) -> None:
         """Replace the surfels; the attributes in `cleared` lose their moments."""
@@ -126,7 +140,7 @@ class FitState:
     params: dict[str, TensorXf]  # raw, by name: surfels, AROUND + surfels, LIGHT, BACKGROUND, GAIN, POSE
     optimiser: Adam
     tables: list[ParameterTable]  # object, and background if there is one
-    occluder: Occluder = field(default_factory=Occluder)
+    occluder: Occluder
     prefilter: SharedPrefilter = field(default_factory=SharedPrefilter)
     iteration: int = 0  # steps done
     seconds: float = 0.0  # spent in steps
@@ -141,19 +155,21 @@ class FitState:
         """The state before the first step."""
         draws = setup.rng(0, "start")
         params = initial_parameters(setup.method, setup.data, draws, setup.open_scene)
-        made = FitState._assembled(setup, params)
+        made = FitState._assembled(setup, params, Occluder())
         for table in made.tables:
             table.clear()
         return made
 
     @staticmethod
-    def _assembled(setup: FitSetup, params: dict[str, TensorXf]) -> FitState:
+    def _assembled(setup: FitSetup, params: dict[str, TensorXf], occluder: Occluder) -> FitState:
         optimiser, method = Adam(params, setup.groups(params)), setup.method
         limits = {"": method.surfels.most}
         if setup.open_scene and method.surroundings is not None:
             limits[""], limits[AROUND] = method.surroundings.limits(limits[""])
-        tables = [ParameterTable(params, optimiser, prefix, most) for prefix, most in limits.items()]
-        return FitState(params, optimiser, tables, light_kind=method.light)
+        tables = [
+            ParameterTable(params, optimiser, prefix, most, occluder) for prefix, most in limits.items()
+        ]
+        return FitState(params, optimiser, tables, occluder, light_kind=method.light)
 
     def add(self, setup: FitSetup, name: str, tensor: TensorXf) -> None:
         """Add a parameter without history, or replace the one of this name."""
@@ -229,7 +245,7 @@ class FitState:
     @staticmethod
     def from_arrays(setup: FitSetup, state: Mapping[str, np.ndarray]) -> FitState:
         """Restore the content of a checkpoint of this setup, bit for bit."""
-        made = FitState._assembled(setup, tensors(state, PARAMS))
+        made = FitState._assembled(setup, tensors(state, PARAMS), _occluder_of(state))
         made.optimiser.load_state_dict(part(state, OPTIMISER))
         for table in made.tables:
             table.error_sum = upload(state[f"{table.prefix}error_sum"])
@@ -240,7 +256,6 @@ class FitState:
             made.region = Region.of(json.loads(state["region"].tobytes()), "checkpoint")
         if f"{PHOTOGRAPHED}weight" in state:
             made.photographed = PhotographedLight.restored(part(state, PHOTOGRAPHED))
-        made.occluder = _occluder_of(state)
         _, stage = setup.method.stage_at(max(made.iteration, 1))
         made.prefilter.restore(made.light, made.shading(stage), state)
         return made

@@ -76,6 +76,15 @@ def test_a_registered_event_happens(file: str, tmp_path: Path, one_thread: None)
     require_same_state(step_to(trainer, 6), step_to(again, 6))
     assert again.surfels.count == 115
 
+    # Rows that move take the mesh's nearest surfels with them; parents that do not exist are refused.
+    again.fit.occluder.vertex_surfels = object()  # type: ignore[assignment]
+    table, rows = again.fit.tables[0], np.arange(115, dtype=np.uint32)
+    table.apply(TableEdit(again.surfels, rows[::-1].copy(), np.zeros(115, bool)))
+    assert again.fit.occluder.vertex_surfels is None
+    for parent in (rows + 1, rows[:-1]):
+        wrong = TableEdit(again.surfels, parent, np.zeros(115, bool))
+        refused(lambda edit=wrong: table.apply(edit), "115 surfels", "parent")
+
 
 def test_other_tables_are_refused(file: str) -> None:
     refused(lambda: methods.load(file, "quick", ["event.clone.share=-1"]), "event.clone.share", "0 or more")

@@ -80,7 +80,6 @@ class Densify(Event[Trainer]):
                 densify_and_prune(table.surfels, error, few, largest, options, table.max_count, keep_one)
             )
         exchange(trainer.setup, fit)
-        fit.occluder.vertex_surfels = None
         for table in fit.tables:
             table.clear()
 
@@ -113,7 +112,6 @@ def fill(trainer: Trainer) -> None:
     options = Densify(Window(0, 0, 1), grow=1.0, prune_opacity=0.0)
     error = table.error_sum.numpy()
     table.apply(densify_and_prune(table.surfels, error, NO_ROWS, np.inf, options, table.max_count))
-    trainer.fit.occluder.vertex_surfels = None
     table.clear()
 
 
