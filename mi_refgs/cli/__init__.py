@@ -84,7 +84,6 @@ def parse(argv: Sequence[str]) -> Any:
     """
     import tyro
     from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
-
     name, *options = argv
     kind, summary = command_class(name)
     description = f"{summary[0].upper()}{summary[1:]}.\n\n{inspect.cleandoc(kind.__doc__ or '')}"

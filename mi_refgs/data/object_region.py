@@ -123,7 +123,6 @@ def object_region(
     group = object_points(region, points, seen, scatter)
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) >= WITHIN_SHARE:
         return region
-
     # The ball around the group and the part of the sphere above the planes, with the cameras outside.
     offset = np.random.default_rng(0).normal(size=(SPHERE_SAMPLES, 3))
     offset *= region.radius / np.linalg.norm(offset, axis=1, keepdims=True)

@@ -135,7 +135,6 @@ def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     and the texture coordinates (V, 2) in 0 … 1, v upwards.
     """
     import xatlas
-
     atlas = xatlas.Atlas()
     atlas.add_mesh(mesh.vertices, mesh.faces)
     packing = xatlas.PackOptions()

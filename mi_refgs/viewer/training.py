@@ -115,7 +115,6 @@ class TrainingPage(Page):
 
     def _add_curves(self) -> dict[str, Any]:
         from viser import uplot
-
         gui, empty, iteration = self.server.gui, np.zeros(1), uplot.Series(label="iteration")
         scales = {"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)}
         curves = {}
