@@ -1,7 +1,5 @@
 """World frame of a capture: +z against gravity, the region of interest is the unit ball around the origin.
-
-Rotation, position and scale are estimated from how cameras are held and where they look.
-"""
+Rotation, position and scale are estimated from how cameras are held and where they look."""
 
 from __future__ import annotations
 
@@ -42,11 +40,9 @@ class Similarity:
 
 def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
     """The direction (3,) against gravity; `up` (V, 2): (right, down) of the upward direction in each image.
-
     Cameras are mostly held level: it is orthogonal to the right-hand directions of all images, by least
     absolute values, which is robust to rolled ones. If all cameras look the same way, it is the mean upward
-    direction, orthogonal to the mean right.
-    """
+    direction, orthogonal to the mean right."""
     right = np.stack([-up[:, 1], up[:, 0]], axis=1)
     to_world = solved.rotation.transpose(0, 2, 1)[:, :, :2]
     rights, ups = np.einsum("vij,vj->vi", to_world, right), np.einsum("vij,vj->vi", to_world, up)
@@ -87,11 +83,9 @@ def seen_share(solved: Solved, points: np.ndarray) -> np.ndarray:
 
 
 def region_of_interest(solved: Solved) -> Region:
-    """A sphere around the point at which most cameras look, above what supports the object.
-
-    Its radius is that of `region_radius`, or smaller if the points that half of the cameras see are closer,
-    or larger if the object is (`object_region`).
-    """
+    """A sphere around the point at which most cameras look, above what supports the object. Its radius is
+    that of `region_radius`, or smaller if the points that half of the cameras see are closer, or larger if
+    the object is (`object_region`)."""
     focus = focus_of(solved)
     distance = np.linalg.norm(solved.origin - focus, axis=1)
     radius = region_radius(distance, solved.half_angle)
@@ -109,10 +103,8 @@ def region_of_interest(solved: Solved) -> Region:
 
 
 def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
-    """The similarity to a world with +z up in which the region of interest is the unit ball around 0.
-
-    The first camera looks along +y when seen from above. `up` as in `up_direction`.
-    """
+    """The similarity to a world with +z up in which the region of interest is the unit ball around 0. The
+    first camera looks along +y when seen from above. `up` as in `up_direction`."""
     z = up_direction(solved, up)
     forward = solved.axis[0] - (solved.axis[0] @ z) * z
     if np.linalg.norm(forward) < 1e-3:  # it looks straight down

@@ -1,8 +1,6 @@
 """The capture pipeline: from photographs to a COLMAP data set with cameras, points and a region of interest.
-
 The folder `.work` contains the results of steps, and the hash of their inputs: an interrupted run goes on,
-and other photographs or options begin anew.
-"""
+and other photographs or options begin anew."""
 
 from __future__ import annotations
 
@@ -50,12 +48,10 @@ def capture(
     region: Region | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`.
-
-    `masks`: a folder as in `find_masks`. `camera`: COLMAP's name of the lens model, or None for the
-    simplest of three that fits. `region`: of interest, in the data set's world, instead of the estimated one.
-    Returns the content of capture.json. Raises InputError for unusable input, and without pycolmap.
-    """
+    """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`. `masks`:
+    a folder as in `find_masks`. `camera`: COLMAP's name of the lens model, or None for the simplest of three
+    that fits. `region`: of interest, in the data set's world, instead of the estimated one. Returns the
+    content of capture.json. Raises InputError for unusable input, and without pycolmap."""
     # Photographs and options.
     pycolmap = colmap.load()
     if camera not in (None, *MODELS):

@@ -1,7 +1,5 @@
-"""`refgs …`: the table of commands, the parser, and errors as sentences with exit codes.
-
-A new command is a module with a dataclass (see command.py) and a line of COMMANDS.
-"""
+"""`refgs …`: the table of commands, the parser, and errors as sentences with exit codes. A new command is a
+module with a dataclass (see command.py) and a line of COMMANDS."""
 
 from __future__ import annotations
 
@@ -78,10 +76,8 @@ def command_class(name: str) -> tuple[type[Any], str]:
 
 
 def parse(argv: Sequence[str]) -> Any:
-    """Parse a command line without `refgs`; returns an object of its class (command.py).
-
-    Raises InputError for an unknown command, SystemExit after `--help` and for bad options, as tyro does.
-    """
+    """Parse a command line without `refgs`; returns an object of its class (command.py). Raises InputError
+    for an unknown command, SystemExit after `--help` and for bad options, as tyro does."""
     import tyro
     from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
     name, *options = argv

@@ -1,8 +1,6 @@
-"""What commands share: options, results, and the set-up of Mitsuba.
-
-A command is a frozen dataclass whose fields are its options (tyro reads names, types, defaults and the
-strings below them; one is `common`, a `Common`), with a method `run` that returns a `Result`.
-"""
+"""What commands share: options, results, and the set-up of Mitsuba. A command is a frozen dataclass whose
+fields are its options (tyro reads names, types, defaults and the strings below them; one is `common`, a
+`Common`), with a method `run` that returns a `Result`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""The jobs of a comparison: one per data set, method and seed, each with its own run folder.
-
-Files of a comparison beside its runs: compare.json (settings); table.json, table.md and a page with images.
-"""
+"""The jobs of a comparison: one per data set, method and seed, each with its own run folder. Files of a
+comparison beside its runs: compare.json (settings); table.json, table.md and a page with images."""
 
 from __future__ import annotations
 
@@ -91,10 +89,8 @@ def plan(
     folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], shared: Shared
 ) -> list[Job]:
     """Plan and check the jobs of a comparison; seeds vary slowest, so that each method is fitted once early.
-
     Raises InputError for a data set without test views, a method that does not load, two data sets or methods
-    of one name, and existing runs with other settings.
-    """
+    of one name, and existing runs with other settings."""
     _unique((absolute(path).name for path in data), "DATA", "give the folders different names")
     _unique((Path(method).stem for method in methods), "--methods", "name each once")
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")

@@ -1,8 +1,6 @@
-"""One job in a separate process, whose crash is a row: `python -m mi_refgs.compare.worker RUN`.
-
-The process saves its state and ends when its standard input closes, which means that its parent is gone.
-Exit codes: 0 done, 2 failed (failed.json has the reason), 143 stopped.
-"""
+"""One job in a separate process, whose crash is a row: `python -m mi_refgs.compare.worker RUN`. The process
+saves its state and ends when its standard input closes, which means that its parent is gone. Exit codes: 0
+done, 2 failed (failed.json has the reason), 143 stopped."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""COLMAP's model files: read as text or binary, written as text.
-
-COLMAP's own library is an extra, and allocates what a file promises before it compares the file's length.
-"""
+"""COLMAP's model files: read as text or binary, written as text. COLMAP's own library is an extra, and
+allocates what a file promises before it compares the file's length."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 """Data sets: the interface and registry of readers, and one split of views with what is known of their scene.
-
-Colour: PNG targets stay sRGB-encoded and are composited in that space, as such data are made:
-A·rgb + (1 − A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·background.
-"""
+Colour: PNG targets stay sRGB-encoded and are composited in that space, as such data are made: A·rgb + (1 −
+A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·background."""
 
 from __future__ import annotations
 
@@ -118,10 +116,8 @@ def reader_of(folder: Path) -> Reader:
 
 
 def held_out(ordered: Sequence[Item], split: str, source: Path | None = None) -> list[Item]:
-    """The items of a split of one list: every eighth, from the first, is a test view.
-
-    Raises InputError that names the `source`, if it is given, where there are none.
-    """
+    """The items of a split of one list: every eighth, from the first, is a test view. Raises InputError that
+    names the `source`, if it is given, where there are none."""
     items = [item for i, item in enumerate(ordered) if (i % HOLDOUT == 0) == (split == "test")]
     if source is not None and not items:
         raise InputError(f"zero {split} views", file=source, remedy="add images")
@@ -144,10 +140,8 @@ def make_view(
     to_world: np.ndarray,
     lens: Lens | None = None,
 ) -> tuple[View, Undistortion | None]:
-    """Make the view of an image; also returns how maps of the averaged image's size are undistorted.
-
-    Raises InputError, which begins with `where`, for an impossible focal length or lens.
-    """
+    """Make the view of an image; also returns how maps of the averaged image's size are undistorted. Raises
+    InputError, which begins with `where`, for an impossible focal length or lens."""
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
             raise InputError(f"{focal:.3g} pixels is out of range", where, "focal length", "correct it")

@@ -1,8 +1,6 @@
-"""Images of a data set: where their files are, how a file becomes an image of a view, and a bounded cache.
-
-A file is decoded, its colour multiplied by alpha (its own, or that of a mask), averaged over blocks of
-pixels, undistorted and composited onto the background. An orientation in EXIF data is ignored, as in COLMAP.
-"""
+"""Images of a data set: where their files are, how a file becomes an image of a view, and a bounded cache. A
+file is decoded, its colour multiplied by alpha (its own, or that of a mask), averaged over blocks of pixels,
+undistorted and composited onto the background. An orientation in EXIF data is ignored, as in COLMAP."""
 
 from __future__ import annotations
 

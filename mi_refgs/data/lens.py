@@ -79,10 +79,8 @@ class Lens:
 
 @dataclass(frozen=True)
 class Undistortion:
-    """Resampling of images of one lens: same size and principal point, focal length × zoom.
-
-    The zoom is the smallest from 1 on for which every pixel of the result has data.
-    """
+    """Resampling of images of one lens: same size and principal point, focal length × zoom. The zoom is the
+    smallest from 1 on for which every pixel of the result has data."""
 
     lens: Lens
     camera: tuple[int, int, float, float, float, float]  # width, height, fx, fy, cx, cy; distorted image

@@ -73,9 +73,7 @@ def support_planes(
     most: int = PLANE_COUNT,
 ) -> tuple[Plane, ...]:
     """The planes that support an object in a sphere, at most so many, each a PLANE_MARGIN above the surface.
-
-    Enough points must be on a plane, and nearly all cameras above it.
-    """
+    Enough points must be on a plane, and nearly all cameras above it."""
     rng = np.random.default_rng(0)
     radius, width = region.radius, width * region.radius
     points = points[np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * radius]
@@ -138,11 +136,9 @@ def shown_whole(views: Sequence[View], region: Region, points: np.ndarray, scatt
 
 
 def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region | None:
-    """The region of an object from points (N, 3) on all surfaces of a fit; None without a group of points.
-
-    It is a ball and a box around the object, above the planes of `region`, or, if it has none, above one of
-    these points: a table without texture has no sparse points.
-    """
+    """The region of an object from points (N, 3) on all surfaces of a fit; None without a group of points. It
+    is a ball and a box around the object, above the planes of `region`, or, if it has none, above one of
+    these points: a table without texture has no sparse points."""
     if not region.planes:
         region = replace(region, planes=support_planes(points, origins, region, FITTED.width, most=1))
     group = object_points(region, points, seen, FITTED)
@@ -216,9 +212,7 @@ def seen_share(views: Sequence[View], points: np.ndarray) -> np.ndarray:
 
 def in_free_space(views: Sequence[View], region: Region, points: np.ndarray) -> np.ndarray:
     """Mask (N,) of points (N, 3) that lie in an image, at less than FREE_SHARE of the object's depth.
-
-    Photographs show nothing there; surfels there fit one image and hide the scene in others.
-    """
+    Photographs show nothing there; surfels there fit one image and hide the scene in others."""
     centre, found = np.array(region.centre), np.zeros(len(points), bool)
     for view in views:
         found |= view.project(points)[2] & (view.depth_of(points) < FREE_SHARE * view.depth_of(centre))

@@ -1,8 +1,6 @@
-"""The region of interest: a sphere above planes that support the object, such as a table or a wall.
-
-The contraction maps all of space into a ball of twice the sphere's radius, so that random samples in
-contracted space cover near and far. [Mip-NeRF 360, Barron et al. 2022, eq. 10]
-"""
+"""The region of interest: a sphere above planes that support the object, such as a table or a wall. The
+contraction maps all of space into a ball of twice the sphere's radius, so that random samples in contracted
+space cover near and far. [Mip-NeRF 360, Barron et al. 2022, eq. 10]"""
 
 from __future__ import annotations
 
@@ -117,9 +115,7 @@ def _numbers(value: object, count: int) -> list[float] | None:
 
 def region_of(views: Sequence[View]) -> Region:
     """The sphere around the point that all cameras look at, as large as the median view shows entirely.
-
-    Raises InputError if there is no such point, if it is behind half of the cameras, and if one is there.
-    """
+    Raises InputError if there is no such point, if it is behind half of the cameras, and if one is there."""
     focus, distance = view_focus(views)
     origins = np.array([view.to_world[:3, 3] for view in views])
     ahead = [float(view.depth_of(focus)) > 0 for view in views]

@@ -1,8 +1,6 @@
-"""Registration of a camera: the rigid correction of its pose that fits renders to its image.
-
-Gauss-Newton from averaged images to whole ones, on differences as displayed; derivatives are differences of
-renders. [Lucas and Kanade 1981; coarse to fine: Bergen et al. 1992]
-"""
+"""Registration of a camera: the rigid correction of its pose that fits renders to its image. Gauss-Newton
+from averaged images to whole ones, on differences as displayed; derivatives are differences of renders.
+[Lucas and Kanade 1981; coarse to fine: Bergen et al. 1992]"""
 
 from __future__ import annotations
 
@@ -25,10 +23,8 @@ Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a vi
 
 
 def registered(view: View, render: Render, distance: float) -> View:
-    """The view with the pose whose render differs least from its image.
-
-    `distance`: of what the camera looks at, scene units.
-    """
+    """The view with the pose whose render differs least from its image. `distance`: of what the camera looks
+    at, scene units."""
     view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
     while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
         blocks.insert(0, 2 * blocks[0])
@@ -40,10 +36,8 @@ def registered(view: View, render: Render, distance: float) -> View:
 
 
 def _difference(view: View, render: Render, block: int) -> np.ndarray:
-    """Render minus image, both averaged over block × block pixels as displayed, flat.
-
-    Renders are averaged, too: a smaller render would show other details, and fit best at another pose.
-    """
+    """Render minus image, both averaged over block × block pixels as displayed, flat. Renders are averaged,
+    too: a smaller render would show other details, and fit best at another pose."""
     shown, truth = (box_downscale(np.clip(image, 0, 1), block) for image in (render(view), view.displayed))
     return np.asarray(shown - truth, np.float64).ravel()
 

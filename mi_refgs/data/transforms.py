@@ -185,10 +185,8 @@ def _inside(transforms: Path, field: str, name: object) -> Path:
 
 
 def read_points(path: Path) -> PointCloud | None:
-    """Read points of a PLY file: x, y, z and red, green, blue of 8 bits or 0 … 1, sRGB-encoded.
-
-    Points without usable numbers are left out; None without any.
-    """
+    """Read points of a PLY file: x, y, z and red, green, blue of 8 bits or 0 … 1, sRGB-encoded. Points
+    without usable numbers are left out; None without any."""
     require_file(path)
     with path.open("rb") as file:
         vertices = read_vertices(path, file)
@@ -280,10 +278,8 @@ def _intrinsics(frame: Frame, image: ImageFile) -> tuple[float, float, float, fl
 def _map(
     file: Path, field: str, expected: tuple[int, int, int], downscale: int, straight: Undistortion | None
 ) -> np.ndarray:
-    """A map of `expected` shape, at the view's size: per pixel the mean over the surface in its block.
-
-    The last of two or four channels, where the others are defined, becomes the fraction of the block.
-    """
+    """A map of `expected` shape, at the view's size: per pixel the mean over the surface in its block. The
+    last of two or four channels, where the others are defined, becomes the fraction of the block."""
     pixels = read_exr_image(file, vectors=True)
     if pixels.shape != expected:
         remedy = "export both at one size or remove the key"
@@ -312,10 +308,8 @@ def _shiny_blender_maps(
     straight: Undistortion | None,
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """World normals (h, w, 3) and depths (h, w, 1) beside an image of Shiny Blender, None without a file.
-
     Normals n are stored as (n + 1) / 2 in 8 bits; depths z along the viewing axis as 1 / (1 + z), and 0 off
-    the object. [Ref-NeRF, Verbin et al. 2022]
-    """
+    the object. [Ref-NeRF, Verbin et al. 2022]"""
     normal = depth = None
     if file := _beside(image, NORMALS):
         pixels = 2 * _of_shape(file, read_png(file)[..., :3], shape) - 1

@@ -118,11 +118,9 @@ def _mean(parts: list[np.ndarray]) -> float | None:
 def material_maps(
     fitted: TrainedScene, samples: int = 1
 ) -> Callable[[Camera, RenderedView], dict[str, np.ndarray]]:
-    """Return a function from a camera and its render to maps of materials, (H, W) or (H, W, 3) by name.
-
-    Where the diffuse part was fitted as a colour, albedo is rendered from the materials that `relightable`
-    makes of it, with `samples` per pixel: the fitted attribute is only the colour of metals.
-    """
+    """Return a function from a camera and its render to maps of materials, (H, W) or (H, W, 3) by name. Where
+    the diffuse part was fitted as a colour, albedo is rendered from the materials that `relightable` makes of
+    it, with `samples` per pixel: the fitted attribute is only the colour of metals."""
     if "radiance_sh" not in fitted.shading.required_attributes:
 
         def comparable(camera: Camera, rendered: RenderedView) -> dict[str, np.ndarray]:

@@ -1,7 +1,5 @@
 """Error budget: how the squared error of test images divides among silhouettes, creases and smooth surfaces.
-
-Pixels are classified by ground truth alone, so that the classes of two runs on one data set are the same.
-"""
+Pixels are classified by ground truth alone, so that the classes of two runs on one data set are the same."""
 
 from __future__ import annotations
 
@@ -26,10 +24,8 @@ CLASSES = tuple(PIXEL_CLASSES)
 
 def classify(view: View, surface: TrueSurface | None) -> np.ndarray | None:
     """Return the index in CLASSES (H, W) of each pixel of a loaded view; None without true depth and normals.
-
     At a depth edge, the line between the points of neighbouring pixels leaves the tangent plane of either by
-    more than CREASE_DEGREES.
-    """
+    more than CREASE_DEGREES."""
     if view.depth is None or view.normal is None:
         return None
     camera, covered, shape = view.camera(), view.covered(), view.depth.shape

@@ -1,7 +1,5 @@
-"""Images for display: rendered views, maps as colours, contact sheets, environment maps. All NumPy.
-
-An image is (H, W, 3), display-encoded, in [0, 1].
-"""
+"""Images for display: rendered views, maps as colours, contact sheets, environment maps. All NumPy. An image
+is (H, W, 3), display-encoded, in [0, 1]."""
 
 from __future__ import annotations
 
@@ -122,9 +120,7 @@ def over_colour(image: np.ndarray, alpha: np.ndarray, colour: np.ndarray | float
 
 def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Tone-map a fitted environment map (h, w, 3), linear, and the ground truth at one exposure, by title.
-
-    The fitted one is first scaled per channel to the ground truth by least squares.
-    """
+    The fitted one is first scaled per channel to the ground truth by least squares."""
     if truth is None:
         return {"fitted environment": light_image(light)}
     fitted = light_image(light * np.array(environment(light, truth)["env_scale"]), truth)
@@ -132,11 +128,9 @@ def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str
 
 
 def light_image(radiance: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """Map a lat-long map (h, 2h, 3) of any range to an image with +z at the top.
-
-    The curve is x / (1 + x) [Reinhard et al. 2002, eq. 3]. The exposure maps the average luminance of
-    `reference`, or of the map itself, over the sphere to LIGHT_KEY.
-    """
+    """Map a lat-long map (h, 2h, 3) of any range to an image with +z at the top. The curve is x / (1 + x)
+    [Reinhard et al. 2002, eq. 3]. The exposure maps the average luminance of `reference`, or of the map
+    itself, over the sphere to LIGHT_KEY."""
     reference = radiance if reference is None else reference
     rows = np.sin((np.arange(len(reference)) + 0.5) / len(reference) * np.pi)
     mean = float(np.average((reference @ LUMINANCE).mean(axis=1), weights=rows))

@@ -1,8 +1,6 @@
-"""Where the time of a training step goes: wall time and kernel launches by phase, between barriers.
-
-The clock listens to the hooks of `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit:
-identities at the boundaries between phases notify the clock of the phase that the pass has reached.
-"""
+"""Where the time of a training step goes: wall time and kernel launches by phase, between barriers. The clock
+listens to the hooks of `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit: identities at the
+boundaries between phases notify the clock of the phase that the pass has reached."""
 
 from __future__ import annotations
 
@@ -115,10 +113,8 @@ class Phase:
 
 
 def phases_of(step: Callable[[], Any], steps: int) -> list[Phase]:
-    """Measure the phases of a step, in the order of PHASES.
-
-    The sum exceeds the time of a step if kernels fuse across phases, since there are barriers in between.
-    """
+    """Measure the phases of a step, in the order of PHASES. The sum exceeds the time of a step if kernels
+    fuse across phases, since there are barriers in between."""
     clocks = [PhaseClock() for _ in range(WARM_UP + steps)]
     for clock in clocks:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory), listening(clock):

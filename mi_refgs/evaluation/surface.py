@@ -56,9 +56,7 @@ class TrueSurface:
 
     def concave(self, view: View) -> np.ndarray | None:
         """Find pixels (H, W) whose point on the true surface has an ambient visibility below CONCAVE_BELOW.
-
-        Pixels beside the object are False. None where the view has no true depth and normals.
-        """
+        Pixels beside the object are False. None where the view has no true depth and normals."""
         if view.depth is None or view.normal is None:
             return None
         camera = view.camera()

@@ -1,8 +1,6 @@
-"""Bake a scene to a textured mesh, which the mesh formats share.
-
-Materials and normals are those of rendered views: of the blended surfels, averaged over the views that see a
-point of the mesh. Points that no view sees get those of the surfels around the mesh's vertices.
-"""
+"""Bake a scene to a textured mesh, which the mesh formats share. Materials and normals are those of rendered
+views: of the blended surfels, averaged over the views that see a point of the mesh. Points that no view sees
+get those of the surfels around the mesh's vertices."""
 
 from __future__ import annotations
 
@@ -61,10 +59,8 @@ class TexturedMesh:
 @remember_last
 def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int) -> TexturedMesh:
     """Bake the object to a mesh of at most about `faces` triangles with textures of texture² texels.
-
     Background Gaussians are left out (`runs.relightable` says which materials the object gets). Raises
-    InputError for a scene without mesh, light or materials, numbers out of range, and missing packages.
-    """
+    InputError for a scene without mesh, light or materials, numbers out of range, and missing packages."""
     if faces < 100:
         raise InputError(f"{faces} is out of range", "--faces", remedy="give a number from 100")
     if not 16 <= texture <= 8192:
@@ -129,11 +125,9 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
 
 
 def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a mesh into charts that fill a texture of size² texels without overlap; some are mirrored.
-
-    Returns for the V vertices of the cut mesh the index (V,) in the mesh, its faces (F, 3) in the same order,
-    and the texture coordinates (V, 2) in 0 … 1, v upwards.
-    """
+    """Cut a mesh into charts that fill a texture of size² texels without overlap; some are mirrored. Returns
+    for the V vertices of the cut mesh the index (V,) in the mesh, its faces (F, 3) in the same order, and the
+    texture coordinates (V, 2) in 0 … 1, v upwards."""
     import xatlas
     atlas = xatlas.Atlas()
     atlas.add_mesh(mesh.vertices, mesh.faces)
@@ -145,11 +139,9 @@ def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, UInt32, Point2f]:
-    """Find the texels of a size² texture whose centre lies in a triangle.
-
-    Returns which they are (size, size) bool, the first row at v = 1, and for the T of them, row by row, the
-    triangle (T,) and the barycentric coordinates (T,) of its second and third corner.
-    """
+    """Find the texels of a size² texture whose centre lies in a triangle. Returns which they are (size, size)
+    bool, the first row at v = 1, and for the T of them, row by row, the triangle (T,) and the barycentric
+    coordinates (T,) of its second and third corner."""
     plane = Occluder(Mesh(np.pad(uv, ((0, 0), (0, 1))).astype(np.float32), faces, FLAT))
     row, column = np.divmod(np.arange(size * size), size)
     above = mi.Point3f(upload((column + 0.5) / size), upload(1 - (row + 0.5) / size), mi.Float(1))
@@ -201,9 +193,7 @@ def _points(
     mesh: Mesh, scene: TrainedScene, triangle: UInt32, barycentric: Point2f
 ) -> tuple[Point3f, list[Float]]:
     """Return the mesh's vertices, then T points on its triangles: positions (V + T,) and their COLUMNS.
-
-    Materials are those of the surfels around the vertices, normals those of the mesh.
-    """
+    Materials are those of the surfels around the vertices, normals those of the mesh."""
     nearby = VertexSurfels.of(mesh, scene.surfels)
     vertices = dr.arange(mi.UInt32, len(mesh.vertices))
     corners = [dr.gather(mi.UInt32, nearby.faces, 3 * triangle + i) for i in range(3)]
@@ -227,11 +217,9 @@ def _mean_of_views(
     start: list[Float],  # COLUMNS × (P,)
     reach: float,  # scene units
 ) -> np.ndarray:
-    """Average COLUMNS over the views that see each point: (P, COLUMNS) float32, from those at `start`.
-
-    A view weighs by its alpha and the squared cosine at which it sees the point; it sees points that are less
-    than `reach` in front of or behind its expected depth.
-    """
+    """Average COLUMNS over the views that see each point: (P, COLUMNS) float32, from those at `start`. A view
+    weighs by its alpha and the squared cosine at which it sees the point; it sees points that are less than
+    `reach` in front of or behind its expected depth."""
     outward = mi.Vector3f(*start[5:])
     weight = dr.full(mi.Float, UNSEEN, dr.width(points))
     total = [UNSEEN * column for column in start]

@@ -80,11 +80,9 @@ def _file(shot: Shot) -> FileCamera:
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Read the pinhole cameras of a transforms.json; its images are not read.
-
-    Keys as in `data.transforms`, and near (depth of the near plane, 0 by default). Raises InputError for a
-    file without sizes, focal lengths or poses, and for another lens.
-    """
+    """Read the pinhole cameras of a transforms.json; its images are not read. Keys as in `data.transforms`,
+    and near (depth of the near plane, 0 by default). Raises InputError for a file without sizes, focal
+    lengths or poses, and for another lens."""
     frames = Frame.all_of(path)
     if not frames:
         raise InputError("empty", path, "frames", "add one entry for each camera")

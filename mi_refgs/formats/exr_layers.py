@@ -20,12 +20,10 @@ LETTERS = {"normal": "XYZ", "depth": "Z"}  # letters of layers that are no colou
 def write(
     trained: TrainedScene, target: Path, shots: Sequence[Shot], *, view: int, samples: int, object: bool
 ) -> list[Path]:
-    """One view with all its layers in one EXR file, as Blender, Nuke and Natron name them.
-
-    R, G, B, A is the image: linear radiance, premultiplied. Every other layer is NAME.R, NAME.G, NAME.B, for
-    vectors NAME.X …, and for one number NAME.V; depth is depth.Z, scene units along the viewing axis. The
-    background map is the layer background, which R, G, B do not contain: add (1 - A) times it.
-    """
+    """One view with all its layers in one EXR file, as Blender, Nuke and Natron name them. R, G, B, A is the
+    image: linear radiance, premultiplied. Every other layer is NAME.R, NAME.G, NAME.B, for vectors NAME.X …,
+    and for one number NAME.V; depth is depth.Z, scene units along the viewing axis. The background map is the
+    layer background, which R, G, B do not contain: add (1 - A) times it."""
     if not 0 <= view < len(shots):
         remedy = f"there are {len(shots)}, give 0 to {len(shots) - 1}"
         raise InputError(f"{view} is out of range", "--view", remedy=remedy)

@@ -41,9 +41,7 @@ def write(
 
 def read_splats(path: Path, linear: bool = False) -> TrainedScene:
     """Read a PLY file of 3D Gaussians or surfels: positions, rotations, scales, opacities and colours.
-
-    `linear`: its colours are linear radiance, as this package writes them.
-    """
+    `linear`: its colours are linear radiance, as this package writes them."""
     _require_splat_file(path)
     surfels = read_ply(path)
     if not surfels.count:

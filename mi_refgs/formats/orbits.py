@@ -29,10 +29,8 @@ def shots_around(
     size: int = SIZE,  # pixels per side
     elevation: tuple[float, float] = ELEVATION,  # degrees
 ) -> list[Shot]:
-    """Return cameras on a sphere around the surfels, z up, evenly spread within each split.
-
-    The images show everything but strays (INSIDE). The first camera of a split is at middle height.
-    """
+    """Return cameras on a sphere around the surfels, z up, evenly spread within each split. The images show
+    everything but strays (INSIDE). The first camera of a split is at middle height."""
     position, weight = _weighted(surfels)
     middle = _middle(position, weight)
     deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)
@@ -59,10 +57,8 @@ def turntable_cameras(
     scene: TrainedScene, cameras: Sequence[Camera], count: int, region: Region | None = None
 ) -> list[Camera]:
     """Return cameras on a circle around the object, z up, with the median distance and height of `cameras`.
-
     They have the first one's lens. The object is what lies in the `region`; without one, all of the scene but
-    strays: the box of INSIDE of the surfels by opacity, or of the mesh's vertices.
-    """
+    strays: the box of INSIDE of the surfels by opacity, or of the mesh's vertices."""
     position, weight = _weighted(scene.surfels)
     if scene.mesh is not None:
         position, weight = scene.mesh.vertices.astype(np.float64), np.ones(len(scene.mesh.vertices))

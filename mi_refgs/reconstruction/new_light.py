@@ -1,8 +1,6 @@
-"""New lights for relighting, and the test views of a data set under them.
-
-The first row of a panorama is its zenith, Mitsuba's y axis; in the world of a scene z is up. Maps that this
-package writes (environment.exr, envmap.exr) are in world directions already.
-"""
+"""New lights for relighting, and the test views of a data set under them. The first row of a panorama is its
+zenith, Mitsuba's y axis; in the world of a scene z is up. Maps that this package writes (environment.exr,
+envmap.exr) are in world directions already."""
 
 from __future__ import annotations
 
@@ -84,10 +82,8 @@ AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray
 
 
 def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> EnvironmentLight:
-    """Convert a light, its file or its radiance (h, w, 3) to a light; options as in `NewLight`.
-
-    An `EnvironmentLight` is in world directions already. Raises InputError for options of a `NewLight`.
-    """
+    """Convert a light, its file or its radiance (h, w, 3) to a light; options as in `NewLight`. An
+    `EnvironmentLight` is in world directions already. Raises InputError for options of a `NewLight`."""
     if isinstance(light, NewLight):
         if world or rotate or exposure:
             remedy = "give them to NewLight"
@@ -102,11 +98,9 @@ def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> E
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
     """Find the data set with test views under this light; return it and the light of its renders, or None.
-
     The light must be the map that `refgs dataset --relight` was given, by the content of the file, or an
     environment.exr of the data set itself, which requires `world`, unless its images show an object in a
-    room; a rotated light has no ground truth.
-    """
+    room; a rotated light has no ground truth."""
     content = light.path.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     lights = recorded_lights(data / "dataset.json")

@@ -171,10 +171,8 @@ RULES: tuple[tuple[tuple[str, ...], Callable[[_Parameters], Materials]], ...] = 
 
 
 def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 and faces (F, 3) of shapes of a scene, concatenated.
-
-    Spheres, disks and cylinders are tessellated. Raises InputError that names another shape but a mesh.
-    """
+    """Vertices (V, 3) float64 and faces (F, 3) of shapes of a scene, concatenated. Spheres, disks and
+    cylinders are tessellated. Raises InputError that names another shape but a mesh."""
     vertices, faces, count = [], [], 0
     for points, triangles in map(_triangles, shapes):
         vertices.append(points)

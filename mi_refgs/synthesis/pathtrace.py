@@ -57,11 +57,9 @@ def camera_poses(
     rng: np.random.Generator,
     azimuth: tuple[float, float] = (0.0, 360.0),
 ) -> np.ndarray:
-    """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up.
-
-    A spherical Fibonacci lattice over the band of elevations (degrees), rotated by a random azimuth, jittered
-    by a third of its spacing, and compressed into the range of azimuths (degrees).
-    """
+    """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up. A spherical
+    Fibonacci lattice over the band of elevations (degrees), rotated by a random azimuth, jittered by a third
+    of its spacing, and compressed into the range of azimuths (degrees)."""
     low, high = (math.sin(math.radians(e)) for e in elevation)
     jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
     z = low + (high - low) * (np.arange(count) + 0.5 + jitter[:, 0]) / count
@@ -74,11 +72,9 @@ def camera_poses(
 
 
 def environment_image(scene: Scene, height: int) -> np.ndarray:
-    """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`.
-
-    First row at +y, last at -y; column 0 beside −z, turning to +x. An `envmap` of this size that is not
-    rotated is returned unchanged; finer ones are averaged.
-    """
+    """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`. First row
+    at +y, last at -y; column 0 beside −z, turning to +x. An `envmap` of this size that is not rotated is
+    returned unchanged; finer ones are averaged."""
     import drjit as dr
     import mitsuba as mi
 
@@ -158,11 +154,9 @@ class Cameras:
 
 
 class Tracer:
-    """One sensor that moves from view to view, so that each kernel is compiled once.
-
-    If `cameras` have the objects of an open scene, images show everything, also emitters, without alpha, and
-    maps are of those shapes only.
-    """
+    """One sensor that moves from view to view, so that each kernel is compiled once. If `cameras` have the
+    objects of an open scene, images show everything, also emitters, without alpha, and maps are of those
+    shapes only."""
 
     def __init__(self, scene: Scene, cameras: Cameras) -> None:
         import mitsuba as mi

@@ -45,10 +45,8 @@ def load_scene(scene: Path, whole: bool = False) -> Any:
 
 def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
     """The scene with a lat-long map (EXR, HDR) in place of its environment; its other emitters are kept.
-
     `objects`: shapes that are lit alone, without the other shapes and emitters. The map is rotated as the
-    scene's own `envmap` is; without one, its y becomes z, which is up.
-    """
+    scene's own `envmap` is; without one, its y becomes z, which is up."""
     import mitsuba as mi
     turned: Any = mi.ScalarTransform4f().rotate(*Z_UP)
     environment = scene.environment()
@@ -82,10 +80,8 @@ def _scene_of(parts: Sequence[Any]) -> Any:
 def prepare_folder(
     out: Path, wanted: dict[str, Any], overwrite: bool, relight: Sequence[LightFile] = ()
 ) -> None:
-    """Make the folders and record the settings `wanted`.
-
-    Raises InputError for a folder with other files, or of other settings, which `overwrite` removes.
-    """
+    """Make the folders and record the settings `wanted`. Raises InputError for a folder with other files, or
+    of other settings, which `overwrite` removes."""
     names = [light.name for light in relight]
     if len({*names}) < len(names):
         files = ", ".join(str(light.path) for light in relight)

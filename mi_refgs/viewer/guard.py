@@ -1,9 +1,6 @@
-"""Access control of a page: viser itself answers every host and every site.
-
-A page listens at this machine only unless the user names another address. A request needs the page's own host
-name, so that no foreign name that resolves to this machine reaches it, and no other site's `Origin`; messages
-have a largest size.
-"""
+"""Access control of a page: viser itself answers every host and every site. A page listens at this machine
+only unless the user names another address. A request needs the page's own host name, so that no foreign name
+that resolves to this machine reaches it, and no other site's `Origin`; messages have a largest size."""
 
 from __future__ import annotations
 

@@ -188,9 +188,7 @@ def write_view(
     scene: ReconstructionView, pose: Pose, size: tuple[int, int], look: DisplayOptions, folder: Path
 ) -> Path:
     """Write a view of width × height pixels as PNG, EXR and camera, with the next free number of a folder.
-
-    Returns the path of the PNG; raises InputError if it cannot be written.
-    """
+    Returns the path of the PNG; raises InputError if it cannot be written."""
     (width, height), camera = size, pose.camera(*size)
     planes = planes_of(scene.fine(camera, look), camera, look, scene.light)
     channels = planes if look.what == IMAGE else values_of_planes(look.what, planes)

@@ -75,10 +75,8 @@ class RegionPanel:
 
 
 def save_region(region: Region, data: Dataset, again: bool = False) -> str:
-    """Write a region in the coordinates of a data set's files; return what the user does next.
-
-    Raises InputError for a region.json that is there, unless it is an estimate or this page saves it `again`.
-    """
+    """Write a region in the coordinates of a data set's files; return what the user does next. Raises
+    InputError for a region.json that is there, unless it is an estimate or this page saves it `again`."""
     estimated = data.region is not None and data.region.estimated
     if (data.path / REGION_FILE).exists() and not (estimated or again):
         remedy = "move it away, or correct it by hand"
@@ -96,10 +94,8 @@ def support_planes(planes: Sequence[Plane]) -> Sequence[Plane]:
 
 
 def adjusted(region: Region, centre: np.ndarray, radius: float, heights: Sequence[float]) -> Region:
-    """Return a region with another centre (3,) and radius, and each support plane raised by scene units.
-
-    The box around a fitted object moves and grows with the sphere.
-    """
+    """Return a region with another centre (3,) and radius, and each support plane raised by scene units. The
+    box around a fitted object moves and grows with the sphere."""
     planes = [(a, b, c, d + up) for (a, b, c, d), up in zip(region.planes, heights, strict=False)]
     for a, b, c, d in region.planes[len(heights) :]:
         inward = d - float(np.dot((a, b, c), region.centre))

@@ -1,7 +1,5 @@
-"""Sizes of displayed images, and when they are due: coarse during motion, fine at rest, then supersampled.
-
-A kernel is compiled per size. So there are few: levels whose areas double, in a few aspect ratios.
-"""
+"""Sizes of displayed images, and when they are due: coarse during motion, fine at rest, then supersampled. A
+kernel is compiled per size. So there are few: levels whose areas double, in a few aspect ratios."""
 
 from __future__ import annotations
 

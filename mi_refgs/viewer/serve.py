@@ -33,10 +33,8 @@ def serve(
     data: Path | None = None,
     tell: Tell = print,
 ) -> Page:
-    """Return the page of a run, with the views of its data set, or of that in `data`; writes nothing.
-
-    Raises InputError for a folder that is no run or has no fit, for a port that is taken, and without viser.
-    """
+    """Return the page of a run, with the views of its data set, or of that in `data`; writes nothing. Raises
+    InputError for a folder that is no run or has no fit, for a port that is taken, and without viser."""
     found = splits_of(run, data, tell)
     some = found.get("train") or found.get("test")
     scene = ReconstructionView(newest(run, run.method()), None if some is None else some.region)

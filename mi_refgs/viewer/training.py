@@ -1,7 +1,5 @@
-"""The page of a running fit: images between steps, curves of its loss and PSNR.
-
-Images are rendered only while a page is open, and then take at most SHARE of the time.
-"""
+"""The page of a running fit: images between steps, curves of its loss and PSNR. Images are rendered only
+while a page is open, and then take at most SHARE of the time."""
 
 from __future__ import annotations
 

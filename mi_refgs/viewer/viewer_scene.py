@@ -79,10 +79,8 @@ class ViewerScene(ABC):
 
 
 def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Float]:
-    """Return what is averaged over samples, (H*W,) each: the premultiplied image or AOV, and alpha.
-
-    An image with background or environment map includes it; its alpha is 1.
-    """
+    """Return what is averaged over samples, (H*W,) each: the premultiplied image or AOV, and alpha. An image
+    with background or environment map includes it; its alpha is 1."""
     if look.what != IMAGE:
         return aov_planes(look.what, frame, camera)
     behind = frame.background
@@ -94,10 +92,8 @@ def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light |
 
 
 def displayed_planes(planes: list[Float], look: DisplayOptions, depths: tuple[float, float]) -> list[Float]:
-    """Return display-encoded RGB planes, not clipped, of the mean of `planes_of`.
-
-    The first of the two `depths` is displayed as white, the second as black.
-    """
+    """Return display-encoded RGB planes, not clipped, of the mean of `planes_of`. The first of the two
+    `depths` is displayed as white, the second as black."""
     what, alpha, behind = look.what, planes[-1], BACKDROPS.get(look.backdrop, 1.0)
     values = planes if what == IMAGE else values_of_planes(what, planes)
     if what == IMAGE or what in TERMS:
