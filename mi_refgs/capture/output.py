@@ -106,6 +106,7 @@ def write_images(
 
     def write(photograph: Photograph) -> None:
         from PIL import Image
+
         camera, image = straight[photograph.copy], folder / IMAGES / photograph.name
         if camera.undo is None and photograph.as_displayed:
             replace_file(image, partial(shutil.copyfile, photograph.path))

@@ -69,6 +69,7 @@ class Photograph:
     def load(self, longest: int | None = None) -> Any:
         """The image as oriented in the data set: an RGB PIL image of at most `longest` pixels per side."""
         from PIL import Image
+
         with open_image(self.path) as image:
             if image.mode.startswith(("I", "F")):
                 remedy = "save it as JPEG or 8-bit PNG"
@@ -85,6 +86,7 @@ class Photograph:
     def turned(self, stored: Any, orientation: int) -> Any:
         """Rotate a PIL image from an orientation of EXIF to that of the data set."""
         from PIL import Image, ImageOps
+
         upright = Image.fromarray(np.asarray(stored))  # without EXIF data of its own
         upright.getexif()[ORIENTATION] = orientation
         upright = ImageOps.exif_transpose(upright)
@@ -166,6 +168,7 @@ def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
     """The mask as oriented in the data set, (H, W, 1) uint8, 255 on the object. A mask of the stored size is
     rotated like the photograph, unless that is also the displayed size."""
     from PIL import Image
+
     mask = Image.fromarray(to_8_bits(read_mask(path)))
     orientation = 1 if mask.size == photograph.size else photograph.orientation
     return np.asarray(photograph.turned(mask, orientation))[..., None]

@@ -80,6 +80,7 @@ def parse(argv: Sequence[str]) -> Any:
     for an unknown command, SystemExit after `--help` and for bad options, as tyro does."""
     import tyro
     from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
+
     name, *options = argv
     kind, summary = command_class(name)
     description = f"{summary[0].upper()}{summary[1:]}.\n\n{inspect.cleandoc(kind.__doc__ or '')}"

@@ -36,6 +36,7 @@ class Capture:
         """Estimate the cameras."""
         from mi_refgs.capture.pipeline import capture, report_text
         from mi_refgs.data.region import Region
+
         region = None
         if self.region is not None:
             region = Region.of({"centre": [*self.region[:3]], "radius": self.region[3]}, "--region")

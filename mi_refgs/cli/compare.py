@@ -93,6 +93,7 @@ class Compare:
     def _plan(self, workers: int, threads: int | None) -> list[Job]:
         """Return the checked jobs, after writing them into their run folders."""
         from mi_refgs.compare import jobs
+
         methods = separated(self.methods)
         if not methods:
             raise InputError("none given", "--methods", remedy=f"name some of {METHODS}")

@@ -106,6 +106,7 @@ class Doctor:
         """Examine the data set or the installation."""
         if self.data is not None:
             from mi_refgs.data.survey import survey, survey_text
+
             found = survey(self.data)
             return Result(found, survey_text(found))
         report = examine()

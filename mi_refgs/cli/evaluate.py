@@ -26,6 +26,7 @@ class Eval:
         """Evaluate the run."""
         from mi_refgs.evaluation.evaluate import SHEET, evaluate
         from mi_refgs.runs.run import Run
+
         folder = Run(self.run_folder)
         result = evaluate(folder, self.data, progress=True, samples=self.samples)
         return Result(result, f"{table(result)}\nsheet: {self.run_folder / SHEET}")

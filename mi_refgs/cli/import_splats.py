@@ -52,6 +52,7 @@ class Import:
         for option in (name for name, value in given.items() if value and not self.relightable):
             raise InputError("only a relightable import is fitted", option, remedy="add --relightable")
         from mi_refgs.formats.cameras import read_cameras
+
         cameras = None if self.camera is None else read_cameras(self.camera)
         return self._fitted(cameras) if self.relightable else self._as_it_is(cameras)
 
@@ -59,6 +60,7 @@ class Import:
         from mi_refgs.reconstruction.reconstruction import import_splats
         from mi_refgs.runs.export import save
         from mi_refgs.runs.run import Run
+
         Run(self.output).require_none()
         made = import_splats(self.file, linear=self.linear, box=self.box)
         cameras = made.cameras() if cameras is None else cameras

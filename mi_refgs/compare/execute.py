@@ -136,14 +136,13 @@ def run_on_cluster(jobs: Sequence[Job], address: str, report: Report) -> None:
                         distributed.wait(list(pending), timeout=POLL, return_when="FIRST_COMPLETED")
                     for future in [future for future in pending if future.done()]:
                         job, failure = pending.pop(future), future.exception()
-                        report(job, future.result() if failure is None else _given_up(job, failure))
+                        if failure is None:
+                            report(job, future.result())
+                            continue
+                        reason = str(failure).splitlines()[0]
+                        reason = f"the cluster gave it up: {type(failure).__name__}: {reason}"
+                        job.run.write_json(FAILED, {"reason": reason})
+                        report(job, reason)
                     release()
             finally:
                 client.cancel(list(pending))  # what the scheduler has not begun would outlive us
-
-
-def _given_up(job: Job, error: BaseException) -> str:
-    """Write why the cluster gave a job up into its run folder, and return it."""
-    reason = f"the cluster gave it up: {type(error).__name__}: {str(error).splitlines()[0]}"
-    job.run.write_json(FAILED, {"reason": reason})
-    return reason

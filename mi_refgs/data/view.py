@@ -93,6 +93,7 @@ class View:
     def camera(self) -> Camera:
         """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
         from mi_refgs.splat.camera import Camera
+
         focal = (-self.fx, -self.fy)
         return Camera.from_pose(self.width, self.height, *focal, self.cx, self.cy, self.to_world, self.near)
 

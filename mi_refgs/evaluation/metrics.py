@@ -52,6 +52,7 @@ def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
     """Return (LPIPS, ""), or (None, reason) without the extra `lpips` or its weights."""
     try:
         import torch
+
         measure = _lpips_network()
         with torch.no_grad():
             planes = [array.transpose(2, 0, 1)[None] for array in _pair(image, truth)]
@@ -66,6 +67,7 @@ def lpips(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
 @functools.cache
 def _lpips_network() -> Any:
     import lpips as package
+
     return package.LPIPS(net="alex", verbose=False).eval()  # as the authors recommend for comparing images
 
 

@@ -129,6 +129,7 @@ def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for the V vertices of the cut mesh the index (V,) in the mesh, its faces (F, 3) in the same order, and the
     texture coordinates (V, 2) in 0 … 1, v upwards."""
     import xatlas
+
     atlas = xatlas.Atlas()
     atlas.add_mesh(mesh.vertices, mesh.faces)
     packing = xatlas.PackOptions()

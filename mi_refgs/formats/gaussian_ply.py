@@ -42,7 +42,21 @@ def write(
 def read_splats(path: Path, linear: bool = False) -> TrainedScene:
     """Read a PLY file of 3D Gaussians or surfels: positions, rotations, scales, opacities and colours.
     `linear`: its colours are linear radiance, as this package writes them."""
-    _require_splat_file(path)
+    try:
+        with path.open("rb") as file:
+            header = read_header(path, file, EXPECTED)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
+    tables = {element.name: {name for name, _ in element.fields} for element in header.elements}
+    names = tables.get("vertex", set())
+    if "packed_position" in names:
+        remedy = f"write it as a plain one, as `splat-transform {path.name} plain.ply` does"
+        raise InputError("a compressed PLY", path, "packed_position", remedy)
+    if not {"opacity", "scale_0", "rot_0"} & names:
+        what = "a mesh" if tables.get("face") is not None else "points without size or opacity"
+        raise InputError(f"{what}, no Gaussians", path, "vertex", f"give {EXPECTED}")
+    if not any(name.startswith("f_dc_") for name in names):
+        raise InputError("the property is missing", path, "f_dc_0", "export the file again with its colours")
     surfels = read_ply(path)
     if not surfels.count:
         raise InputError("there are none", path, "vertex", "export the file again")
@@ -60,22 +74,3 @@ def method_of(trained: TrainedScene, name: str) -> Method:
     count, stages = surfels.count, {"imported": Stage(1, trained.shading)}
     options = SurfelOptions(surfels.primitive.name, ("radiance_sh",), count, count, degree=degree)
     return Method(1, stages, surfels=options, data=DataOptions(downscale=1), name=name, preset="standard")
-
-
-def _require_splat_file(path: Path) -> None:
-    """Raise InputError for PLY files of other things, by their header."""
-    try:
-        with path.open("rb") as file:
-            header = read_header(path, file, EXPECTED)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
-    tables = {element.name: {name for name, _ in element.fields} for element in header.elements}
-    names = tables.get("vertex", set())
-    if "packed_position" in names:
-        remedy = f"write it as a plain one, as `splat-transform {path.name} plain.ply` does"
-        raise InputError("a compressed PLY", path, "packed_position", remedy)
-    if not {"opacity", "scale_0", "rot_0"} & names:
-        what = "a mesh" if tables.get("face") is not None else "points without size or opacity"
-        raise InputError(f"{what}, no Gaussians", path, "vertex", f"give {EXPECTED}")
-    if not any(name.startswith("f_dc_") for name in names):
-        raise InputError("the property is missing", path, "f_dc_0", "export the file again with its colours")

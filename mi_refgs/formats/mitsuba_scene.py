@@ -42,7 +42,10 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     # Mesh, textures and light
     made = bake(trained, shots, faces, texture)
     make_folder(target)
-    write_bytes(target / MESH, _ply(made))
+    mesh = trimesh.Trimesh(made.vertices, made.faces, vertex_normals=made.normals, process=False)
+    mesh.vertex_attributes.update({"s": made.uv[:, 0], "t": 1 - made.uv[:, 1]})  # v: from the first row
+    data: Any = mesh.export(file_type="ply", vertex_normal=True)
+    write_bytes(target / MESH, bytes(data))
     write_png(target / TEXTURES["base_color"], srgb_from_linear(base_colour(made)))
     for name in ("roughness", "metallic"):
         write_png(target / TEXTURES[name], getattr(made, name))
@@ -65,14 +68,6 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
         add_sensor(scene, shot.camera, f"sensor_{index}")
     write_xml(target / SCENE, scene)
     return [target / name for name in (SCENE, MESH, *TEXTURES.values(), LIGHT)]
-
-
-def _ply(made: TexturedMesh) -> bytes:
-    """Encode the mesh; Mitsuba's v begins at the first row of a texture."""
-    mesh = trimesh.Trimesh(made.vertices, made.faces, vertex_normals=made.normals, process=False)
-    mesh.vertex_attributes.update({"s": made.uv[:, 0], "t": 1 - made.uv[:, 1]})
-    data: Any = mesh.export(file_type="ply", vertex_normal=True)
-    return bytes(data)
 
 
 def base_colour(made: TexturedMesh) -> np.ndarray:

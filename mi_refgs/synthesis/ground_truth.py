@@ -42,6 +42,7 @@ class Materials(NamedTuple):
 
     def where(self, mask: Bool, other: Materials) -> Materials:
         import drjit as dr
+
         pairs = zip(self, other, strict=True)
         return Materials(*((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs))
 
@@ -62,6 +63,7 @@ class Materials(NamedTuple):
 def materials_at(scene: Scene, si: Any) -> Materials:
     """Materials of the scene's shapes at surface interactions `si`; of instances of groups unknown."""
     import mitsuba as mi
+
     found, here = Materials.of(), si.bsdf()
     bsdfs = {id(bsdf): bsdf for shape in scene.shapes() if (bsdf := shape.bsdf()) is not None}
     for bsdf in bsdfs.values():
@@ -94,6 +96,7 @@ class _Parameters:
     def number(self, name: str, default: float = 0.0) -> Float:
         """A parameter as mi.Float; `default` without one."""
         import mitsuba as mi
+
         if isinstance(texture := self.children.get(name), mi.Texture):
             return mi.Float(texture.eval_1(self.si, self.active))
         return mi.Float(self.values[name] if name in self.children else default)
@@ -101,6 +104,7 @@ class _Parameters:
     def colour(self, name: str, default: float = 1.0) -> Color3f:
         """A parameter as mi.Color3f; `default` without one."""
         import mitsuba as mi
+
         texture = self.children.get(name)
         return mi.Color3f(default if texture is None else texture.eval(self.si, self.active))
 
@@ -124,6 +128,7 @@ def _principled(p: _Parameters) -> Materials:
 
 def _conductor(p: _Parameters) -> Materials:
     import drjit as dr
+
     eta, k = p.colour("eta"), p.colour("k")
     # Reflectance at normal incidence; η = 0 (`material = none`) gives 1.
     f0 = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
@@ -134,6 +139,7 @@ def _conductor(p: _Parameters) -> Materials:
 def _plastic(p: _Parameters) -> Materials:
     import drjit as dr
     import mitsuba as mi
+
     albedo = p.colour("diffuse_reflectance")
     if "nonlinear = 1" in str(p.bsdf):  # no parameter says so
         inside = mi.fresnel_diffuse_reflectance(1 / p.number("eta", 1.5))
@@ -143,6 +149,7 @@ def _plastic(p: _Parameters) -> Materials:
 
 def _two_sided(p: _Parameters) -> Materials:
     import drjit as dr
+
     front = p.si.wi.z > 0
     behind = type(p.si)(p.si)
     behind.wi.z = dr.abs(p.si.wi.z)
@@ -183,6 +190,7 @@ def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
 
 def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     import mitsuba as mi
+
     if shape.is_mesh():
         points = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
         return points, np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)

@@ -37,6 +37,7 @@ def reach(shapes: Sequence[Any], centre: np.ndarray) -> float:
     """The radius around a centre (3,) that contains every surface of the shapes."""
     import drjit as dr
     import mitsuba as mi
+
     side = math.isqrt(SURFACE_SAMPLES)
     x, y = dr.meshgrid(dr.linspace(mi.Float, 0, 1 - 1e-6, side), dr.linspace(mi.Float, 0, 1 - 1e-6, side))
     radius = 0.0
@@ -115,6 +116,7 @@ def _panorama(radiance: Callable[[Vector3f], Color3f], height: int) -> np.ndarra
     """Radiance (height, 2·height, 3) by world direction, on the grid of `environment_image`."""
     import drjit as dr
     import mitsuba as mi
+
     rows = (height - 1) * ENVIRONMENT_OVERSAMPLING + 1
     columns = 2 * height * ENVIRONMENT_OVERSAMPLING
     index = dr.arange(mi.UInt32, rows * columns)
@@ -186,6 +188,7 @@ class Tracer:
         """Premultiplied linear RGBA (H, W, 4) of one view; RGB (H, W, 3) of an open scene."""
         import drjit as dr
         import mitsuba as mi
+
         self._look(pose)
         seeds = [seed, *np.random.SeedSequence(seed).generate_state(self.passes)[1:]]
         image = np.zeros((self.height, self.width, 3 if self.objects else 4))
@@ -225,5 +228,6 @@ class Tracer:
 
     def _look(self, pose: np.ndarray) -> None:
         import mitsuba as mi
+
         self.params["to_world"] = mi.ScalarTransform4f(pose)
         self.params.update()

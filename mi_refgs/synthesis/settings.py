@@ -32,6 +32,7 @@ FILES = (
 def load_scene(scene: Path, whole: bool = False) -> Any:
     """Load a Mitsuba scene; `whole`: keep shapes and their ids, else meshes of one material are merged."""
     import mitsuba as mi
+
     try:
         with mitsuba_exr():
             loaded = mi.load_file(str(scene), optimize=not whole)
@@ -48,6 +49,7 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
     `objects`: shapes that are lit alone, without the other shapes and emitters. The map is rotated as the
     scene's own `envmap` is; without one, its y becomes z, which is up."""
     import mitsuba as mi
+
     turned: Any = mi.ScalarTransform4f().rotate(*Z_UP)
     environment = scene.environment()
     if environment is not None:
@@ -66,6 +68,7 @@ def without(scene: Scene, objects: Sequence[Any]) -> Any:
 def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
     """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
     import mitsuba as mi
+
     left_out = {shape.id() for shape in objects}
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
     lamps = [lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)]
@@ -74,6 +77,7 @@ def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
 
 def _scene_of(parts: Sequence[Any]) -> Any:
     import mitsuba as mi
+
     return mi.load_dict({"type": "scene"} | {f"part_{i}": part for i, part in enumerate(parts)})
 
 

@@ -90,7 +90,11 @@ class Page:
         self.url = f"http://{shown}:{self.server.get_port()}/"
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self.server.gui.main_panel.dock_right()
-        self._set_start()
+        pose, camera, up = self.start(), self.server.initial_camera, self.up
+        self.server.scene.set_up_direction(tuple(up))
+        camera.position, camera.look_at = pose.position, pose.look_at(self.scene.centre)
+        camera.up = pose.to_world[:3, 1] if abs(pose.forward @ up) > 0.99 else up
+        camera.fov, camera.near, camera.far = pose.fov, 1e-3 * self.scene.radius, 1e3 * self.scene.radius
 
     def start(self) -> Pose:
         """Return the initial pose: the first test view, or one a little from above."""
@@ -101,15 +105,6 @@ class Page:
         origin = centre + distance * outward / np.linalg.norm(outward)
         look_at = mi.ScalarTransform4f().look_at(origin, centre, [0, 0, 1])
         return Pose(np.array(look_at.matrix, np.float64), START_FOV, 1.0)
-
-    def _set_start(self) -> None:
-        pose, camera, up = self.start(), self.server.initial_camera, self.up
-        self.server.scene.set_up_direction(tuple(up))
-        camera.position = pose.position
-        camera.look_at = pose.look_at(self.scene.centre)
-        camera.up = pose.to_world[:3, 1] if abs(pose.forward @ up) > 0.99 else up
-        camera.fov = pose.fov
-        camera.near, camera.far = 1e-3 * self.scene.radius, 1e3 * self.scene.radius
 
     def go(self, client: Any, pose: Pose) -> None:
         """Move the camera of a page, a client of viser."""

@@ -84,6 +84,8 @@ class TrainingPage(Page):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Serve the page."""
+        from viser import uplot
+
         data = {"train": trainer.data}
         super().__init__(Training(trainer), data, run.path.resolve().name, address, run.path / "views")
         self.loop.display(largest=LARGEST)
@@ -91,7 +93,15 @@ class TrainingPage(Page):
         self.log, self.clock = run.path / LOG, clock
         self.since, self.spent, self.refreshed = clock(), 0.0, -REFRESH
         add_display(self)
-        self.curves = self._add_curves()
+        self.curves, empty, iteration = dict[str, Any](), np.zeros(1), uplot.Series(label="iteration")
+        scales = {"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)}
+        with self.server.gui.add_folder("Training"):
+            for name, colour in CURVES.items():
+                series = (iteration, uplot.Series(label=name, stroke=colour, width=2))
+                plot = self.server.gui.add_uplot(
+                    (empty, empty), series, scales=scales, title=name, aspect=2.0
+                )
+                self.curves[name] = plot
         add_cameras(self)
         self.listen()
 
@@ -110,14 +120,3 @@ class TrainingPage(Page):
         if self.spent <= SHARE * (now - self.since):
             self.loop.step()
             self.spent += self.clock() - now
-
-    def _add_curves(self) -> dict[str, Any]:
-        from viser import uplot
-        gui, empty, iteration = self.server.gui, np.zeros(1), uplot.Series(label="iteration")
-        scales = {"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)}
-        curves = {}
-        with gui.add_folder("Training"):
-            for name, colour in CURVES.items():
-                series = (iteration, uplot.Series(label=name, stroke=colour, width=2))
-                curves[name] = gui.add_uplot((empty, empty), series, scales=scales, title=name, aspect=2.0)
-        return curves
