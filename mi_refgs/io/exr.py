@@ -36,11 +36,8 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def read_exr_image(path: str | Path, vectors: bool = False) -> np.ndarray:
-    """EXR file as float32 (H, W, C): R, G, B, A; R, G, B; Y, A; or a single channel.
-
-    `vectors`: also X, Y, Z, which are no colours. Raises InputError as `read_exr` does, if the file has none
-    of these sets of channels, and for colours in other primaries than those of linear sRGB.
-    """
+    """EXR file as float32 (H, W, C): RGBA, RGB, YA or one channel; with `vectors` also XYZ. Raises InputError
+    as `read_exr`, without such channels, and for primaries other than sRGB's."""
     channels = read_exr(path)
     names = _image_channels(Path(path), channels, _header(Path(path)), vectors)
     return np.stack([channels[name] for name in names], axis=-1)
@@ -54,10 +51,8 @@ def exr_has_alpha(path: Path) -> bool:
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of an EXR file's data window.
-
-    Raises InputError for a missing file, a broken or impossible header, several parts, and deep pixels.
-    """
+    """Width and height of an EXR file's data window; raises InputError for a file that `read_exr` refuses
+    too."""
     require_file(path)
     header = _header(path)
     (left, top), (right, bottom) = header["dataWindow"]
@@ -105,10 +100,8 @@ def _readable(path: Path, field: str = "pixels") -> Iterator[None]:
 
 
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
-    """Write an (H, W, C) or (H, W) array as ZIP-compressed float32 (or float16) EXR, atomically.
-
-    `names` has one letter per channel; by default Y, RGB or RGBA. Raises InputError as `replace_file` does.
-    """
+    """Write an (H, W, C) or (H, W) array as ZIP-compressed EXR, float32 or float16, atomically. `names` has
+    one letter per channel, by default Y, RGB or RGBA. Raises InputError as `replace_file` does."""
     image = np.asarray(image)
     planes = image[..., None] if image.ndim == 2 else image
     names = names or {1: "Y", 3: "RGB", 4: "RGBA"}[planes.shape[-1]]

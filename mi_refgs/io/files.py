@@ -44,11 +44,8 @@ def make_folder(path: Path) -> None:
 
 
 def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Write a file atomically: `write(temporary)` makes a file beside `path`, which is then moved there.
-
-    Its folder is made if need be. Data are flushed to disk before the move: also a power cut leaves the old
-    file or the new one. A killed process may leave the temporary file. Raises InputError if that fails.
-    """
+    """Write a file atomically, also if power fails: `write(temporary)` makes a file beside `path`, whose
+    folder is made, and which is then moved there. Raises InputError if that fails."""
     path = Path(path)
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
@@ -80,11 +77,8 @@ class BusyError(InputError):
 
 @contextlib.contextmanager
 def locked(path: Path, busy: str, wait: float = 0.0) -> Iterator[None]:
-    """Lock the file at `path`; the operating system releases the lock however this process ends.
-
-    The lock is re-entrant per thread. Nothing is locked where the file system has no locks. Raises BusyError
-    with the message `busy` if the file stays locked elsewhere for `wait` seconds.
-    """
+    """Lock the file at `path`, re-entrant per thread, if its file system has locks; the system releases it
+    however this process ends. Raises BusyError(`busy`) if it stays locked for `wait` seconds."""
     key = path.parent.resolve() / path.name
     held: set[Path] = _OWN.__dict__.setdefault("held", set())
     if key in held:

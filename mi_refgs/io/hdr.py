@@ -16,10 +16,8 @@ SCALES = np.append(0, np.ldexp(1.0, np.arange(1, 256) - 136)).astype(np.float32)
 
 
 def read_hdr(path: Path) -> np.ndarray:
-    """A Radiance image (Ward, "Real Pixels", 1991) as linear float32 (H, W, 3); raises InputError.
-
-    Mitsuba's reader is not used: it writes out of bounds where a run is longer than its row.
-    """
+    """A Radiance image (Ward, "Real Pixels", 1991) as linear float32 (H, W, 3); raises InputError. Mitsuba's
+    reader writes out of bounds where a run is longer than its row."""
     require_file(path)
     data = path.read_bytes()
     size = re.search(rb"\n\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:MAX_HDR_HEADER])

@@ -91,11 +91,8 @@ def read_png(path: str | Path) -> np.ndarray:
 
 
 def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
-    """8-bit image file (PNG, JPEG) as uint8 (H, W, 3 or 4), and the factor by which both sides are smaller.
-
-    The factor divides `shrink`: 2, 4 or 8 for JPEG files, which are so decoded at lower cost, else 1. An
-    incomplete last block counts as a pixel. Raises InputError as `read_png` does.
-    """
+    """8-bit PNG or JPEG as uint8 (H, W, 3 or 4), and the factor by which both sides are smaller: it divides
+    `shrink`, and is 1 but for JPEG files. Raises InputError as `read_png` does."""
     path = Path(path)
     with open_image(path) as image:
         if image.mode.startswith(("I", "F")):
@@ -107,11 +104,8 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
 
 
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
-    """Brightness (H, W) of a PNG or JPEG of 8 or 16 bits, or alpha if it has transparent pixels; and white.
-
-    White is the smallest of 1, 255 and 65535 that no number of the file exceeds: files of 8 and 16 bits may
-    contain labels, and files of 16 bits numbers of 8.
-    """
+    """Brightness (H, W) of a PNG or JPEG, or alpha if it has transparent pixels; and white, the smallest of
+    1, 255 and 65535 that no number exceeds: a mask may contain labels."""
     path = Path(path)
     with open_image(path) as image:
         if image.mode.startswith("I"):
@@ -187,10 +181,8 @@ def to_8_bits(image: np.ndarray) -> np.ndarray:
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write an (H, W), grey, or (H, W, 3 or 4) image, sRGB encoded in [0, 1] (clipped), as 8-bit PNG.
-
-    Raises InputError as `replace_file` does.
-    """
+    """Write an (H, W) or (H, W, 3 or 4) image, sRGB encoded in [0, 1], as 8-bit PNG; raises as
+    `replace_file`."""
     from PIL import Image
 
     pixels = to_8_bits(image)

@@ -45,11 +45,8 @@ class Header:
 
 
 def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or mesh.ply of a run") -> Header:
-    """Read the header; the file position is then that of the data.
-
-    Raises InputError for a file without PLY header (the remedy is to give `wanted`) and for a header that
-    promises more rows than the file contains.
-    """
+    """Read the header up to the data. Raises InputError for a file without PLY header (the remedy is to give
+    `wanted`) and for a header that promises more rows than the file contains."""
     if file.readline(MAX_LINE).strip() != b"ply":
         raise InputError("not a PLY file", path, "header", f"give {wanted}")
     order, comments = "", []
@@ -94,10 +91,8 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
 
 
 def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
-    """The `vertex` element as a structured array.
-
-    Raises InputError as `read_header` does, and for vertices that are not the first element or have lists.
-    """
+    """The `vertex` element as a structured array. Raises InputError as `read_header` does, and for vertices
+    that are not the first element or have lists."""
     header = read_header(path, file)
     vertex, text = header.elements[0], header.order == "a"
     if vertex.name != "vertex":

@@ -52,10 +52,8 @@ def require_supported_variant(what: str) -> None:
 
 
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
-    """A flat copy in memory aligned to SIMD vectors, LOOK_AHEAD zeros after its end.
-
-    Dr.Jit compiles one kernel for aligned and another for unaligned memory; NumPy's is either by chance.
-    """
+    """A flat copy aligned to SIMD vectors, LOOK_AHEAD zeros after its end: Dr.Jit has one kernel more for
+    others."""
     size, count = np.dtype(dtype).itemsize, np.size(values)
     whole: np.ndarray = np.zeros((count + LOOK_AHEAD) * size + ALIGNMENT, np.uint8)
     start = -whole.ctypes.data % ALIGNMENT
@@ -65,12 +63,9 @@ def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
 
 
 def upload(values: np.ndarray, kind: Any = None) -> Any:
-    """A flat mi.Float (or another `kind`) with the values, in memory that Dr.Jit has allocated.
-
-    `mi.Float(values)` wraps NumPy's memory on the CPU: kernels read whole SIMD vectors beyond its end, and
-    the process crashes if the next page is not mapped. Arrays of vectors, such as `mi.Point3f(points.T)`, are
-    copied by Dr.Jit. Raises InputError under a variant that is not supported.
-    """
+    """A flat mi.Float (or another `kind`) with the values, in memory of Dr.Jit. `mi.Float(values)` wraps
+    NumPy's on the CPU, beyond whose end kernels read. Raises InputError under a variant that is not
+    supported."""
     require_supported_variant("mi_refgs")
     kind = mi.Float if kind is None else kind
     dtypes = {mi.Float: np.float32, mi.UInt32: np.uint32, mi.Int32: np.int32, mi.Bool: np.bool_}
@@ -94,9 +89,7 @@ def upload_tensor(values: np.ndarray, kind: Any = None) -> Any:
 
 def replayed(function: Callable[..., Any], limit: int | None = None) -> Callable[..., Any]:
     """Trace a function by `dr.freeze` per kind of arguments (at most `limit` are kept) and replay it.
-
-    Python's garbage collector is off meanwhile: to free a scene while recording aborts the process.
-    """
+    Python's garbage collector is off meanwhile: to free a scene while recording aborts the process."""
     frozen = dr.freeze(function, limit=limit, warn_after=10**9)
 
     @functools.wraps(function)

@@ -50,10 +50,8 @@ def of_fit(pixels: int, surfels: int, images: float) -> float:
 
 
 def require(needed: float, what: str, remedy: str) -> None:
-    """Raise InputError if a process that needs so many bytes in all, with those it has, would not fit.
-
-    `what` names the computation and its size, `remedy` what to do.
-    """
+    """Raise InputError, with `what` and `remedy`, if a process that needs so many bytes in all would not
+    fit."""
     there = available() + resident()
     if needed > there:
         numbers = f"needs {needed / 1e9:.2g} GB of memory, {there / 1e9:.2g} GB are available"

@@ -13,11 +13,8 @@ ACCESS = 8  # floats per access: Dr.Jit's LLVM code splits wider ones
 
 
 def columns_of(array: Float, width: int) -> list[Float]:
-    """Columns (N,) of N · width floats without padding, under AD.
-
-    The adjoint of a gather would write into the gradient of `array`, where other terms of a loss write in
-    another mode, and one of the two would be lost: this one is computed in memory of its own.
-    """
+    """Columns (N,) of N · width floats without padding, under AD. Their adjoint is computed in memory of its
+    own: a gather's would be lost where other terms write to `array` in another mode."""
     return list(dr.custom(_Columns, array, width))
 
 

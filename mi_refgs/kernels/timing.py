@@ -1,7 +1,4 @@
-"""Named phases of a step, for a listener that times them; without one, all functions here do nothing.
-
-Names of phases are those of `evaluation.profile`.
-"""
+"""Named phases (of `evaluation.profile`) of a step, for a listener that times them, if there is one."""
 
 from __future__ import annotations
 

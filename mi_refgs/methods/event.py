@@ -11,11 +11,8 @@ Fit = TypeVar("Fit")
 
 
 class Event(Generic[Fit]):
-    """What happens to a fit beside its gradient steps; subclasses are frozen dataclasses of their settings.
-
-    `Fit` is `mi_refgs.Trainer`. After each step, the events that are due happen in the order of
-    `fitting.events`. What they change belongs to the fit, which is saved; an event has no state.
-    """
+    """What happens to a fit (a `mi_refgs.Trainer`) after steps, in the order of `fitting.events`; subclasses
+    are frozen dataclasses of settings, without state: what they change belongs to the fit."""
 
     name: ClassVar[str]  # of its table in a method file, `[event.NAME]`
     always: ClassVar[bool] = False  # happens, with the settings' defaults, in methods without its table

@@ -1,7 +1,5 @@
-"""A method as data: the contents of a file of `variants/`, in frozen dataclasses.
-
-Iteration numbers in a file count in its own `iterations`, and are scaled to those of a preset.
-"""
+"""A method as data: a file of `variants/` in frozen dataclasses. Iteration numbers count in the file's own
+`iterations`, and are scaled to those of a preset."""
 
 from __future__ import annotations
 
@@ -212,10 +210,7 @@ class DataOptions:
         return min(due, key=lambda images: images.until).block if due else 1
 
     def crop_of(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of the part of an image that a step renders.
-
-        The rest is whole patches of the splatter, so that crops along every border have the same kernels.
-        """
+        """Width and height of the part of an image that a step renders: whole patches, for equal kernels."""
         if self.crop is None or self.crop >= width * height:
             return width, height
         left_out = 1 - math.sqrt(self.crop / (width * height))

@@ -1,7 +1,4 @@
-"""Read methods strictly from TOML: a file, those that it extends, `key=value` assignments, a preset.
-
-No other module opens a TOML file, and none contains a method's name.
-"""
+"""Read methods strictly from TOML: a file, those that it extends, `key=value` assignments, a preset."""
 
 from __future__ import annotations
 
@@ -59,9 +56,7 @@ def preset_of(text: str) -> Preset:
 
 def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | None = None) -> Method:
     """Read a method by name or TOML path, scaled to a preset; `assignments`, key=value, apply unscaled.
-
-    Raises InputError that names the file and the key for anything unknown or of the wrong type.
-    """
+    Raises InputError that names the file and the key for anything unknown or of the wrong type."""
     path, chosen = _find(name, "--method", Path()), preset_of(preset)
     method = _built(_extended(path, []), path)
     table = plain(scaled(method, chosen.iterations / method.iterations))
@@ -116,10 +111,8 @@ def for_purpose(purpose: str) -> str:
 
 
 def differences(before: Method, now: Method) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys by which two resolved methods differ, each with both values, None for no such key.
-
-    The table `about`, the file's place and how changes were written are not compared.
-    """
+    """Dotted keys by which two resolved methods differ beside `about`, with both values, None for no such
+    key."""
     compared = (replace(method, about=About(), file="", assignments=()) for method in (before, now))
     first, second = (_flat(plain(method)) for method in compared)
     keys = sorted(first.keys() | second.keys())

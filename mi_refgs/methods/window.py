@@ -11,11 +11,8 @@ TIE = 1e-6  # intervals by which a scaled window may miss a multiple of its inte
 
 @dataclass(frozen=True)
 class Window:
-    """Events at the multiples of `every` with start < multiple ≤ until, each at the nearest iteration.
-
-    In iterations, but not whole ones: a preset scales them, and rounded they would hold another number of
-    events. Events that fall on one iteration (`every` below 1) happen once.
-    """
+    """Events at the multiples of `every` with start < multiple ≤ until, once at each nearest iteration; not
+    whole numbers: presets scale them."""
 
     start: float
     until: float

@@ -56,10 +56,8 @@ class Mesh:
 
 
 def extract_mesh(tsdf: TSDF) -> Mesh:
-    """Zero level set of the field by marching cubes (Lewiner et al. 2003), without floaters.
-
-    The surface has no degenerate triangles and is closed by a cap at the border of the volume. Components of
-    less than COMPONENT_KEEP of the largest one's area are dropped. No derivative."""
+    """Zero level set of the field by marching cubes (Lewiner et al. 2003), detached: closed by a cap at the
+    border, without degenerate triangles and components below COMPONENT_KEEP of the largest one's area."""
     # One layer of free space all around closes surfaces that the box cuts.
     volume = np.pad(np.asarray(tsdf.volume, dtype=np.float32), 1, constant_values=1.0)
     volume = np.where(np.abs(volume) < ZERO_NUDGE, np.copysign(np.float32(ZERO_NUDGE), volume), volume)
@@ -72,10 +70,7 @@ def extract_mesh(tsdf: TSDF) -> Mesh:
 
 
 def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> Mesh:
-    """Keep the large closed components, without degenerate triangles and unused vertices.
-
-    Walls of inner cavities are removed: no ray that starts outside meets them.
-    """
+    """Keep the large closed components, without inner walls, degenerate triangles and unused vertices."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.update_faces(mesh.area_faces > 0)
     if not len(mesh.faces):
@@ -91,10 +86,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> Mesh:
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
-    """Write a binary PLY, voxel size in a comment; atomic: a kill leaves the old file or the new one.
-
-    Raises InputError if the path cannot be written.
-    """
+    """Write a binary PLY, voxel size in a comment, atomically; raises InputError if that fails."""
     data: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
     first, second, rest = data.split(b"\n", 2)
     comment = f"comment {VOXEL_COMMENT} {float(mesh.voxel)!r}".encode()
@@ -102,10 +94,8 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """Read a triangle mesh (PLY, OBJ, STL or OFF), and no other file that it refers to.
-
-    The voxel size is in the comment of `write_mesh`, else see FOREIGN_RESOLUTION. Raises InputError.
-    """
+    """Read a triangle mesh (PLY, OBJ, STL, OFF), and no file that it refers to; its voxel size is in the
+    comment of `write_mesh`, else see FOREIGN_RESOLUTION. Raises InputError."""
     path = Path(path)
     if not is_file(path):
         raise InputError("no such file", path, "mesh", "give the mesh.ply of a run")

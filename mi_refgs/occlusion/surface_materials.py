@@ -1,7 +1,4 @@
-"""Materials on the extracted mesh, taken from the surfels around each vertex, under AD.
-
-Neighbours, weights and normals of vertices are computed once per mesh, materials are gathered per render.
-"""
+"""Materials on the extracted mesh, under AD: of the surfels around each vertex, found once per mesh."""
 
 from __future__ import annotations
 
@@ -50,10 +47,8 @@ class VertexSurfels:
 
     @staticmethod
     def of(mesh: Mesh, surfels: Surfels) -> VertexSurfels:
-        """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint.
-
-        Footprints are wider by a voxel along the normal. Detached. Raises InputError without surfels.
-        """
+        """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint, which is
+        wider by a voxel along the normal. Detached. Raises InputError without surfels."""
         if not surfels.count:
             raise InputError("there are none to take materials from", "occluder", "surfels")
         usable, surfels = np.flatnonzero(surfels.usable().numpy()), surfels.detach().cleaned()

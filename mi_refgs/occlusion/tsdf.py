@@ -50,10 +50,8 @@ class TSDF:
 
 
 def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Box (lo, hi) with a margin around (N, 3) world points, without NaN and a few per cent of floaters.
-
-    Raises InputError if none is left.
-    """
+    """Box (lo, hi) with a margin around (N, 3) world points, without NaN and floaters; InputError if none is
+    left."""
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -166,10 +164,9 @@ class _Grid:
 def _sample(
     surface: Float, px: Float, py: Float, width: Int32, height: Int32, apart: Float, active: Bool
 ) -> tuple[Float, Bool, Bool]:
-    """Depth at a pixel position, whether it is a surface, and whether it is certainly background.
-
-    Bilinear where the four texels differ by less than `apart`, the truncation; else the nearest texel: a mean
-    across a depth edge lies on no surface. A silhouette is no background: carving would eat the rim."""
+    """Depth at a pixel position, whether it is a surface, and certainly background (not a silhouette).
+    Bilinear where the four texels differ by less than `apart`, else the nearest: no mean across a depth
+    edge."""
     fx, fy = dr.floor(px), dr.floor(py)
     wx, wy = px - fx, py - fy
     x0, y0 = mi.Int32(fx), mi.Int32(fy)

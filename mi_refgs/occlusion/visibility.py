@@ -32,10 +32,8 @@ class Hit:
 
 
 class Occluder:
-    """The extracted mesh in a private scene of its own, updated in place.
-
-    Evaluate results of `visible` before the next `update`: Dr.Jit traces rays when they are needed.
-    """
+    """The extracted mesh in a private scene, updated in place: evaluate what is `visible` before the next
+    `update`."""
 
     NAME = "occluder"
 
@@ -71,19 +69,15 @@ class Occluder:
         return self._mesh is None or not len(self._mesh.faces)
 
     def set_materials(self, surfels: Surfels) -> None:
-        """Find the surfels around every vertex, whose attributes `surface` then reads, under AD.
-
-        Required after `update`, and when surfels move or their number changes. Raises InputError without any.
-        """
+        """Find the surfels around every vertex for `surface`, after `update` and when surfels move or their
+        number changes. Raises InputError without any."""
         self.vertex_surfels = None
         if self._mesh is not None and not self.empty:
             self.vertex_surfels = VertexSurfels.of(self._mesh, surfels)
 
     def surface(self, surfels: Surfels, names: Sequence[str] = ()) -> Surface:
-        """The mesh with the present values of attributes of `surfels`, to look up where `closest` hits it.
-
-        Raises InputError without `set_materials` for this mesh and number of surfels, or an attribute.
-        """
+        """The mesh with present values of attributes of `surfels`, to look up where `closest` hits it. Raises
+        InputError without `set_materials` for this mesh and number of surfels, or an attribute."""
         if self.vertex_surfels is None:
             remedy = "call Occluder.set_materials after update"
             raise InputError("none are set", "occluder", "materials", remedy)
@@ -92,10 +86,9 @@ class Occluder:
     def visible(
         self, origin: Point3f, direction: Vector3f, normal: Vector3f = None, active: Bool = True
     ) -> Float:
-        """1 where the ray leaves the scene freely, 0 where the mesh blocks it.
-
-        `direction` and `normal` need not be unit. The origin (world) first moves OFFSET_VOXELS along the
-        normal, or along the ray without one. Rays without a finite direction or not `active` are visible."""
+        """1 where the ray, of any length, leaves the scene freely, is not `active` or not finite; 0 where it
+        is blocked. The origin (world) first moves OFFSET_VOXELS along the normal, or along the ray without
+        one."""
         if self.empty:
             return dr.full(mi.Float, 1, max(dr.width(origin), dr.width(direction)))
         with dr.suspend_grad():

@@ -64,10 +64,7 @@ def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Float]:
 
 
 def aov_planes(kind: str, frame: Frame, camera: Camera) -> list[Float]:
-    """Premultiplied planes of one type and their weight, to be averaged over samples.
-
-    `values_of_planes` of the means equals `aov_values` of a supersampled frame.
-    """
+    """Premultiplied planes of one type and their weight: means over samples, for `values_of_planes`."""
     values, weight = _weighted(kind, frame, camera)
     return [*(values if kind in PREMULTIPLIED else (value * weight for value in values)), weight]
 

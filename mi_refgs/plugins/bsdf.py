@@ -1,7 +1,4 @@
-"""The `refgs_bsdf` BSDF: the reflectance model that `mi_refgs.shade` approximates, for path tracers.
-
-Imported or reloaded for each variant: see `mi_refgs.plugins`.
-"""
+"""The `refgs_bsdf` BSDF, for path tracers: the reflectance model that `mi_refgs.shade` approximates."""
 
 from __future__ import annotations
 

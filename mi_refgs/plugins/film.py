@@ -22,10 +22,8 @@ Channels = Callable[[Frame, Camera, bool], list[Any]]
 
 @dataclass(frozen=True)
 class FilmImage:
-    """The image of a `view` through a sensor's film, and its derivatives in both modes, in passes.
-
-    Raises InputError for a film of another kind, and where an image of `surfels` does not fit into memory.
-    """
+    """The image of a `view` through a sensor's film, and its derivatives in both modes, in passes. Raises
+    InputError for another film, and where an image of `surfels` does not fit into memory."""
 
     sensor: Any
     spp: int  # see `render.samples`; 0: that of the sampler

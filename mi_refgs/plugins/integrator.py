@@ -1,7 +1,4 @@
-"""The `refgs` integrator: Gaussian surfels and deferred shading for `mi.render`.
-
-Imported or reloaded for each variant: see `mi_refgs.plugins`.
-"""
+"""The `refgs` integrator: Gaussian surfels and deferred shading for `mi.render`."""
 
 from __future__ import annotations
 

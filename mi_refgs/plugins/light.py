@@ -39,11 +39,8 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
 
 
 def emitter_light(emitter: Any, filtered: bool = True) -> Light:
-    """The light of an emitter of the scene, under AD: `filtered`, or with `radiance` only.
-
-    Gradients flow to its `scale` and `data`, or `radiance.value`. Raises InputError if `data` that is
-    resampled should receive some, and for any emitter but `envmap` and `constant`.
-    """
+    """The light of an emitter, `filtered` or with `radiance` only, under AD: gradients flow to `scale` and
+    `data`, or `radiance.value`. Raises InputError for resampled `data` with gradients, and other emitters."""
     params = mi.traverse(emitter)
     if "data" not in params:
         return ConstantLight(_constant_radiance(params, emitter))
@@ -60,10 +57,7 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
 
 
 def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scene: Any) -> Light | None:
-    """The integrator's own light, else the scene's; None if the model uses none.
-
-    Raises InputError if there is none.
-    """
+    """The integrator's light, else the scene's (InputError without one); None if the model uses none."""
     if shading.model.light == "none":
         return None
     if (light := shading.light_of(own)) is not None:
@@ -104,10 +98,8 @@ def _constant_radiance(params: Any, emitter: Any) -> Any:
 
 
 def _light_from_world(params: Any) -> Any:
-    """Rotation or reflection from world to light (mi.Matrix3f, detached), None for the identity.
-
-    Raises InputError if `to_world` has scale or shear.
-    """
+    """Rotation or reflection (mi.Matrix3f, detached), None for the identity; InputError for scale or
+    shear."""
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
     if np.abs(matrix - np.eye(3)).max() < 1e-7:
         return None

@@ -105,10 +105,8 @@ class Surfel:
 
 
 class Gaussian:
-    """3D Gaussians by EWA, Σ' = J W Σ Wᵀ Jᵀ + λ I. [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]
-
-    J is the derivative of the projection at the centre, whose slope is clamped to around the image.
-    """
+    """3D Gaussians by EWA, Σ' = J W Σ Wᵀ Jᵀ + λ I, J at the centre, its slope clamped to around the image.
+    [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]"""
 
     @staticmethod
     def culled(raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
@@ -151,10 +149,8 @@ class Gaussian:
 
 
 def _from_centre(p: Array, axes: Array, ray: Array) -> tuple[Array, list[Array]]:
-    """Difference (N, P) of 1 / depth to the centres', and offsets along t_u, t_v over depth, of rays (3, P).
-
-    Only the difference to the ray through the surfel's own centre meets the axes: nothing cancels.
-    """
+    """Difference (N, P) of 1 / depth to the centres', and offsets along t_u, t_v over depth, of rays (3, P):
+    only the difference to the ray through the surfel's centre meets the axes, so that nothing cancels."""
     beside = ray[None] - (p / p[:, 2:])[:, :, None]
     lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]
     along = [np.einsum("nk,nkp->np", axes[:, i], beside) for i in range(2)]

@@ -57,10 +57,8 @@ class Image:
 
 
 def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 1e-4) -> Image:
-    """Render an image, and with `weights` (P, …) of some maps the gradients of Σ weights · maps.
-
-    `band` is the relative width of the declared discontinuities.
-    """
+    """Image, and with `weights` (P, …) of some maps gradients of Σ weights · maps; `band`: of
+    discontinuities."""
     raw, around = (
         {n: np.asarray(x, np.float64) for n, x in table.items()} for table in (scene.raw, scene.around or {})
     )

@@ -1,7 +1,5 @@
-"""Environment maps in float64: prefiltered levels, lookups, and the lobe average that a level approximates.
-
-A lookup is texels (n, k) of the flat levels and their weights, which may be complex.
-"""
+"""Environment maps in float64: prefiltered levels, lookups (texels (n, k) of the flat levels, and their
+weights, which may be complex), and the lobe average that a level approximates."""
 
 from __future__ import annotations
 

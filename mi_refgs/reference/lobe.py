@@ -1,8 +1,5 @@
-"""The GGX lobe by brute force in NumPy float64: the integrals that `shade`'s options of accuracy approximate.
-
-GGX α = roughness², height-correlated Smith, Schlick. Directions are unit (3,) or (n, 3) arrays and point away
-from the surface; colours have three channels.
-"""
+"""The GGX lobe by brute force in float64: α = roughness², height-correlated Smith, Schlick. Directions are
+unit (3,) or (n, 3) arrays that point away from the surface; colours have three channels."""
 
 from __future__ import annotations
 
@@ -37,10 +34,8 @@ def frame(normal: Array) -> Array:
 def lobe_nodes(
     normal: Array, view: Array, roughness: float, rings: int = 200, spokes: int = 200
 ) -> tuple[Array, Array, Array]:
-    """Directions (n, 3), cosines of view and half vector (n,), and weights (n,) of a quadrature:
-
-    Σ weight F(cosine) L(direction) = ∫ f L cosθ dω. Midpoints over the half vectors, drawn from D cosθ.
-    """
+    """Directions (n, 3), cosines of view and half vector (n,), and weights (n,), with Σ weight F(cosine)
+    L(direction) = ∫ f L cosθ dω: midpoints over the half vectors, drawn from D cosθ."""
     α2 = roughness**4
     s = ((np.arange(rings) + 0.5) / rings)[:, None]
     n_h = np.sqrt(s**2 / (s**2 + α2 * (1 - s**2)))
@@ -142,12 +137,9 @@ def traced_fraction(
 
 
 def chain(hit: Hit, outgoing: Outgoing, origin: Array, direction: Array, bounces: int) -> Array | None:
-    """Radiance (3,) that arrives against a ray from what it meets; None if it meets nothing.
-
-    That is shaded with what its own mirror ray meets, and so on, `bounces` surfaces in all; what stops the
-    mirror ray of the last is black. `outgoing` is what leaves a surface with its unit normal, the view, the
-    visibility of the light along the mirror direction (0 or 1), and the radiance that arrives there instead.
-    """
+    """Radiance (3,) of what a ray meets, shaded with what its mirror ray meets, `bounces` surfaces in all;
+    None if it meets nothing. `outgoing` takes normal, view, visibility (0 or 1) of the light along the mirror
+    ray, and the radiance that arrives instead."""
     found = hit(origin, direction)
     if found is None:
         return None
@@ -162,11 +154,9 @@ def chain(hit: Hit, outgoing: Outgoing, origin: Array, direction: Array, bounces
 
 
 def blocked_mean(radiance: Array, weight: Array, blocked: Array, free: Array, fading: float) -> Array:
-    """Mean (3,) of the radiance (k, 3) of those of k ≥ 2 rays that are `blocked` (k,), weighted.
-
-    Per colour, where the largest product of weight and radiance exceeds k times the mean of the others, it
-    loses the share `fading` of the excess; rays that are not blocked have the radiance `free` (3,).
-    """
+    """Weighted mean (3,) of the radiance (k, 3) of those of k ≥ 2 rays that are `blocked` (k,), `free` (3,)
+    that of others. Per colour, the largest product loses `fading` of what exceeds k times the mean of the
+    others."""
     count, products = len(weight), weight[:, None] * np.where(blocked[:, None], radiance, free)
     for channel in range(3):
         first = int(np.argmax(np.where(blocked, products[:, channel], -1)))

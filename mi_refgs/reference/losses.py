@@ -47,10 +47,8 @@ def ssim(image: Array, target: Array) -> float:
 def normals_from_depth(
     depth: Array, alpha: Array, fx: float, fy: float, cx: float, cy: float, world_from_camera: Array
 ) -> tuple[Array, Array]:
-    """World normals (H, W, 3) of a camera-depth map and their validity (H, W), by central differences.
-
-    Invalid: steps between surfaces, which the viewing ray meets at a cosine of at most 0.2.
-    """
+    """World normals (H, W, 3) of a camera-depth map by central differences, and their validity (H, W): not at
+    steps between surfaces, which the viewing ray meets at a cosine of at most 0.2."""
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], axis=-1)

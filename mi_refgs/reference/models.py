@@ -1,7 +1,5 @@
-"""Reflectance models in float64: functions of points and a light to three terms of radiance.
-
-`taps` collects lookups in the light: texels, weights, and the factor of their sum.
-"""
+"""Reflectance models in float64: of points and a light to three terms of radiance. `taps` collects lookups in
+the light: texels, weights, and the factor of their sum."""
 
 from __future__ import annotations
 
@@ -147,10 +145,8 @@ def monte_carlo(points: Points, light: Light | None, options: Options, taps: Tap
 
 
 def hemisphere(count: int, normal: Array) -> Array:
-    """Directions (count, 3) of a Fibonacci hemisphere about a unit normal (3,), at least 10° high.
-
-    Frame: Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
-    """
+    """Directions (count, 3) of a Fibonacci hemisphere about a unit normal (3,), at least 10° high. [frame:
+    Duff et al. 2017, "Building an Orthonormal Basis, Revisited"]"""
     x, y, z = normal
     sign = math.copysign(1.0, z)
     a = -1 / (sign + z)

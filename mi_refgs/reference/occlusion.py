@@ -81,8 +81,7 @@ def fuse_point(
     truncation_voxels: float,
     unseen_vote: float,
 ) -> float:
-    """Fused signed distance of one point, in truncations: the table at the top of `occlusion.tsdf`, word by
-    word."""
+    """Fused signed distance of one point, in truncations, by the table at the top of `occlusion.tsdf`."""
     truncation = truncation_voxels * voxel
     total = weight = sightings = covered = 0.0
     for depth, (to_world, focal, size) in zip(depths, views, strict=True):
@@ -120,10 +119,8 @@ def fuse_point(
 
 
 def mesh_hit(vertices: Array, faces: Array, origin: Array, direction: Array) -> tuple[float, int, Array]:
-    """Distance along a ray to the nearest triangle, infinite for a miss; its index; shares (3,) of corners.
-
-    Either side counts. [Möller and Trumbore 1997]
-    """
+    """Distance along a ray to the nearest triangle, of either side, infinite for a miss; its index; shares
+    (3,) of corners. [Möller and Trumbore 1997]"""
     a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces, int)[:, k]] for k in range(3))
     across = np.cross(direction, c - a)
     determinant = np.sum((b - a) * across, axis=1)
@@ -147,10 +144,8 @@ def mesh_distance(vertices: Array, faces: Array, origin: Array, direction: Array
 def mirror_visibility(
     vertices: Array, faces: Array, eye: Array, normal: Array, ray: Array, offset: float
 ) -> Array:
-    """1 (P,), or 0 where the mirror rays of unit rays (P, 3) from the eye to the mesh are blocked.
-
-    They start `offset` off the mesh along the unit normals (P, 3).
-    """
+    """1 (P,), or 0 where mirror rays of unit rays (P, 3) from the eye, `offset` off along normals, are
+    blocked."""
     if not len(faces):
         return np.ones(len(normal))
     origin = np.broadcast_to(eye, ray.shape)
@@ -176,12 +171,9 @@ def ambient(
     bounces: int,
     brightest: float,
 ) -> Array:
-    """Ratios (V, 3) by the formula at the head of `shade.ambient`.
-
-    normals (V, 3), directions (V, K, 3), unit, with density cosine / π; light(ω) is radiance (3,), blurred.
-    outgoing(normal, view, free, ratio) is the radiance (3,) that leaves a hit, `free` if light arrives along
-    its mirror direction. Rays start `offset` off the surface.
-    """
+    """Ratios (V, 3) by the formula of `shade.ambient`, for normals (V, 3), unit directions (V, K, 3) of
+    density cosine / π, blurred light(ω) (3,), rays from `offset` off the surface, and radiance (3,)
+    outgoing(normal, view, free, ratio) of a hit, `free` if light arrives along its mirror direction."""
     ratio = np.ones((len(vertices), 3))
     for _ in range(bounces):
         found = np.zeros_like(ratio)

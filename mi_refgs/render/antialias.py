@@ -1,7 +1,5 @@
-"""Antialiasing of reflections: each pixel is shaded at four points, at interpolated normals and visibility.
-
-Compositing takes most of the time, and blended normals vary slowly: surfels are composited once per pixel.
-"""
+"""Antialiasing of reflections: each pixel, composited once, is shaded at four points, at interpolated normals
+and visibility."""
 
 from __future__ import annotations
 
@@ -33,12 +31,8 @@ def averaged(
     pixels: CompactedPixels | None,  # those of the P; None: all, in raster order
     visibility: bool,
 ) -> RadianceTerms:
-    """Mean over each pixel of the radiance at NODES, under AD.
-
-    Normals are interpolated between pixel centres as they were blended, so that empty pixels do not count,
-    and visibility if `visibility`, weighted by alpha. Materials are those of the centre: interpolation would
-    blur textures.
-    """
+    """Mean over each pixel of the radiance at NODES, under AD. Normals, as blended, and visibility (if
+    `visibility`), weighted by alpha, are interpolated; materials are the centre's: textures stay sharp."""
     ray = None if pixels is None else pixels.raster
     normal = [_interpolated(plane, camera, pixels) for plane in points.normal]
     free = None

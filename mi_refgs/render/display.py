@@ -1,7 +1,5 @@
-"""Display of linear radiance: the one place where the sRGB curve and the background are applied.
-
-Images are lists of planes: mi.Float of width H·W in raster order.
-"""
+"""Display of linear radiance, the one place of the sRGB curve: lists of mi.Float planes (H·W), raster
+order."""
 
 from __future__ import annotations
 
@@ -29,10 +27,8 @@ def srgb_from_linear(linear: Float) -> Float:
 def display_image(
     radiance: Iterable[Float], alpha: Float, background: Iterable[Float | float]
 ) -> list[Float]:
-    """Composite as 8-bit RGBA images do: A srgb(L / A) + (1 - A) background, per plane.
-
-    radiance: linear, premultiplied (L); background: display-encoded. Pixels with A < 1e-6 show it alone.
-    """
+    """Composite as 8-bit RGBA: A srgb(L / A) + (1 - A) background per plane, L linear, premultiplied,
+    `background` encoded; where A < 1e-6 the background alone."""
     seen = alpha >= ALPHA_EMPTY
     inverse = dr.select(seen, dr.rcp(dr.select(seen, alpha, 1.0)), 0.0)
     return [
@@ -51,11 +47,8 @@ def composited(frame: Frame) -> tuple[Color3f, Float]:
 def displayed(
     frame: Frame, background: np.ndarray, linear: bool, gain: Sequence[Any] | None = None
 ) -> list[Any]:
-    """Display-encoded planes of a frame.
-
-    Images with alpha were composited after encoding, linear data before it. The frame's own background
-    replaces `background`, linear. `gain`: factor per channel of radiance and of the frame's background.
-    """
+    """Display-encoded planes of a frame, whose own background replaces `background` (linear); `gain` per
+    channel. Images with alpha are composited after encoding, linear data before it."""
     radiance = list(frame.radiance)
     behind = [float(x) for x in background] if frame.background is None else list(frame.background)
     if gain is not None:

@@ -13,12 +13,9 @@ from mi_refgs.io.exr import mitsuba_exr
 
 
 def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) -> Any:
-    """Load a scene, its `refgs` integrator with these AOVs after its own: types, or `name:type`.
-
-    A pair that the integrator has already is not repeated. `object_only`: without the surroundings and the
-    background of that. Raises InputError for what Mitsuba cannot load, for a name of two types, and for AOVs
-    or `object_only` without a `refgs` integrator.
-    """
+    """Load a scene, its `refgs` integrator with these AOVs (types, or `name:type`) after its own,
+    `object_only` without what surrounds the object. Raises InputError for what cannot be loaded, for a name
+    of two types, and for AOVs or `object_only` without that integrator."""
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(str(path.parent.resolve()))

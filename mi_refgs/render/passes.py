@@ -1,7 +1,4 @@
-"""Rendering band of rows by band of rows, so that memory does not grow with the sample count.
-
-Bands have the tiles of the whole image, are equally high, and share one set of kernels.
-"""
+"""Rendering by bands of rows of one image's tiles, equally high for one set of kernels: bounded memory."""
 
 from __future__ import annotations
 
@@ -40,11 +37,9 @@ class Band:
 
 
 def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = None) -> list[Band]:
-    """Divide an image into bands of at most `most` samples (default: PASS_SAMPLES), factor² per pixel.
-
-    `margin`: pixels of neighbours on which a pixel depends. Without one, the last band may reach below the
-    image. A band has PATCH_EDGE rows of samples at least.
-    """
+    """Divide an image into bands of at most `most` samples (default: PASS_SAMPLES), factor² per pixel,
+    PATCH_EDGE rows at least. `margin`: pixels of neighbours; without one, the last band may reach below the
+    image."""
     most = PASS_SAMPLES if most is None else most
     width, height = camera.width, camera.height
     film, offset = camera.film or (width, height), camera.offset if camera.film else (0, 0)
@@ -69,11 +64,9 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
 def in_passes(
     draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0, surfels: int = 0
 ) -> Result:
-    """Call `draw` for each band of a camera's image and join the results; without derivatives.
-
-    `draw` renders factor² samples per pixel and returns arrays of one value per pixel, or one in all, in
-    lists, dictionaries and dataclasses. Raises InputError if the image does not fit into memory.
-    """
+    """Call `draw` (factor² samples per pixel) for each band and join its arrays, of one value per pixel or in
+    all, in lists, dictionaries and dataclasses; detached. Raises InputError if the image does not fit into
+    memory."""
     require_image((camera.width, camera.height), factor**2, surfels, channels=24)  # with all maps, about
     found = bands(camera, factor, margin)
     if found[0].camera is camera:

@@ -196,11 +196,8 @@ class _View:
 
 
 def _seen(surfels: Surfels, camera: Camera, sh_degree: int | None) -> SurfelView:
-    """Unit direction from the camera to each surfel, and its normal turned towards the camera.
-
-    A normal that points away by less than FACING_TOLERANCE stays: the surfel lies just behind a silhouette,
-    and turned round it would oppose its neighbours.
-    """
+    """Unit direction from the camera to each surfel, and its normal turned towards the camera, but for one
+    that points away by less than FACING_TOLERANCE, behind a silhouette: it would oppose its neighbours."""
     # A surfel at the camera's own position has no direction; it is culled, so any will do.
     direction = safe_normalize(camera.towards(surfels.position()))
     normal = surfels.primitive.normal(surfels)

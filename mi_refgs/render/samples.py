@@ -28,12 +28,9 @@ def samples_per_axis(samples: int) -> int:
 def supersampled(
     view: Callable[[Camera], Frame], camera: Camera, samples: int, details: bool = True
 ) -> Frame:
-    """Render a frame with k × k samples per pixel (`samples_per_axis`), box filtered; under AD.
-
-    Premultiplied values have plain means. Depth is weighted by alpha, maps by the opacity of the object, and
-    the background by 1 - alpha: compositing the mean frame equals the mean of composited samples. Without
-    `details`, there are neither terms nor maps.
-    """
+    """Render a frame with k × k samples per pixel (`samples_per_axis`), box filtered, under AD, as
+    `aov_values` weighs them; without `details` neither terms nor maps. Compositing it equals the mean of
+    composited samples."""
     factor = samples_per_axis(samples)
     fine_camera = camera.supersampled(factor)
     fine = view(fine_camera)

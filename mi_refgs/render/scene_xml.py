@@ -36,12 +36,9 @@ class SceneFiles:
 
 
 def write_scene_xml(path: str | Path, files: SceneFiles, shading: Shading, cameras: Sequence[Camera]) -> None:
-    """Write a Mitsuba scene with one `refgs` integrator and a sensor per camera, atomically.
-
-    The parameter `spp` is 1 by default: pixel centres, as in training. Mitsuba's sensors have square pixels:
-    where fx ≠ fy, the film has more of them along one axis, the same view to half a pixel at that border.
-    Raises InputError if the camera is mirrored, if occlusion has no mesh, or if the path cannot be written.
-    """
+    """Write a Mitsuba scene with one `refgs` integrator and a sensor per camera, atomically; `spp` is 1 as in
+    training. Pixels are square: where fx ≠ fy, the film has more along one axis. Raises InputError for a
+    mirrored camera, occlusion without mesh, or a path that cannot be written."""
     if shading.occlusion and files.mesh is None:
         raise InputError("there is none to trace", path, "mesh", "give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")

@@ -17,11 +17,8 @@ Step = tuple[int, int]
 def neighbours(
     plane: Float, width: int, height: int, steps: Sequence[Step], pixels: CompactedPixels | None = None
 ) -> list[Float]:
-    """The plane (mi.Float, raster order) shifted by each step: out_k(x, y) = plane(x + dx_k, y + dy_k).
-
-    Pixels outside repeat the border. Steps are (dx, dy) with entries in {-1, 0, 1}. A plane of compacted
-    `pixels`, which has no derivative here, is 0 at all others.
-    """
+    """The plane (mi.Float, raster order) by each step: out_k(x, y) = plane(x + dx_k, y + dy_k), dx, dy in
+    {-1, 0, 1}, borders repeated. A plane of compacted `pixels`, detached, is 0 at all others."""
     if pixels is None:
         return list(dr.custom(_Neighbours, plane, width, height, tuple(steps)))
     dr.eval(plane)

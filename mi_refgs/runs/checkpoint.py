@@ -1,7 +1,5 @@
-"""A checkpoint: named arrays in an .npz file that NumPy reads, with a checksum of all its bytes.
-
-The comment of the archive is "sha256 " and the SHA-256 of every byte before the digest.
-"""
+"""A checkpoint: named arrays in an .npz file whose comment is "sha256 " and the SHA-256 of all bytes before
+it."""
 
 from __future__ import annotations
 

@@ -44,12 +44,9 @@ from mi_refgs.surfels.ply import write_ply
 
 
 def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Camera] = ()) -> list[Path]:
-    """Write the artefacts into `folder`, each atomically; returns their paths.
-
-    `camera` and `more` become the sensors of scene.xml. Artefacts that the scene does not have are removed.
-    Raises BusyError for a run that another process trains; InputError if a file cannot be written or a value
-    is not finite.
-    """
+    """Write the artefacts into `folder`, each atomically; returns their paths. `camera` and `more` become the
+    sensors of scene.xml; others' artefacts go. Raises BusyError for a run in training; InputError if a file
+    cannot be written or a value is not finite."""
     write: dict[str, Callable[[Path], object]] = {SURFELS: partial(write_ply, surfels=fitted.surfels)}
     if fitted.light is not None:
         write[LIGHT_MAP] = fitted.light.write
@@ -100,10 +97,8 @@ def _fresh(run: Run, method: Method) -> TrainedScene | None:
 
 
 def newest(run: Run, method: Method) -> TrainedScene:
-    """The scene of the newest checkpoint or of newer artefacts; writes nothing.
-
-    It has the mesh even if shading does not use it. Raises InputError as `TrainedScene.read` does.
-    """
+    """The scene, with any mesh, of the newest checkpoint or newer artefacts; raises as
+    `TrainedScene.read`."""
     if (fresh := _fresh(run, method)) is not None:
         return fresh
     scene, mesh = TrainedScene.read(run.path), run.path / MESH
@@ -111,11 +106,8 @@ def newest(run: Run, method: Method) -> TrainedScene:
 
 
 def write_if_stale(run: Run, method: Method, camera: Callable[[TrainedScene], Camera]) -> TrainedScene:
-    """Write the artefacts of a run if there are none or the newest checkpoint is newer, and read them.
-
-    If another process trains the run, writes nothing and returns the newest checkpoint. `camera` chooses that
-    of scene.xml. Raises InputError if there is neither artefact nor checkpoint.
-    """
+    """Write the artefacts of a run if the newest checkpoint is newer, and read them; or return that
+    checkpoint if another process trains the run. Raises InputError if there is neither."""
     if (fresh := _fresh(run, method)) is not None:
         try:
             export(fresh, run.path, camera(fresh))
@@ -135,12 +127,9 @@ def save(
     region: Region | None = None,
     records: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write a scene that was not fitted here (edited, imported, relit, copied) as a run folder.
-
-    Returns its artefacts. `camera` and `more` become the sensors of scene.xml; `data` is the data set of its
-    test views; `records` are JSON files by name. config.toml is written last: if it is there, the folder is
-    complete. Raises InputError for a folder with a run or other files, and as `export` does.
-    """
+    """Write a scene that was not fitted here as a run folder, config.toml last; returns its artefacts.
+    `camera` and `more` become the sensors of scene.xml, `data` the data set of test views, `records` JSON
+    files by name. Raises InputError for a folder with a run or other files, and as `export` does."""
     run = Run(folder)
     run.require_none()
     own_folder(folder, RUN)

@@ -15,11 +15,8 @@ class TerminatedError(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def held_interrupts() -> Iterator[Callable[[], None]]:
-    """Delay the first Ctrl-C or SIGTERM, and yield a function that raises it; a second one is not delayed.
-
-    A state of the middle of a step could not be resumed to the same result. Nothing is delayed outside the
-    main thread, which alone gets signals; nor is a signal that is ignored, or handled outside Python.
-    """
+    """Delay the first Ctrl-C or SIGTERM, which the main thread alone gets, to the end of a step, and yield a
+    function that raises it; neither a second one, nor one that is ignored or handled outside Python."""
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return

@@ -45,14 +45,10 @@ def lacking(scene: TrainedScene) -> str:
 
 
 def relightable(scene: TrainedScene) -> TrainedScene:
-    """Reduce a scene to attributes that do not depend on its light, so that another can replace it.
-
-    A diffuse part that `split_sum` fitted as an SH colour becomes an albedo (`albedo_from_radiance`).
-    Attributes that are fitted to the light (radiance, indirect) are removed; interreflection is traced
-    instead, if the scene has a mesh. The light stays, infinitely far; the background is removed.
-
-    Raises SceneError for a scene without light, or whose model has no such attributes.
-    """
+    """Reduce a scene to attributes without light (`albedo_from_radiance` for an SH colour of `split_sum`):
+    radiance, indirect and background are removed; interreflection is traced if there is a mesh; the light
+    stays, infinitely far. Raises SceneError for a scene without light, or whose model has no such
+    attributes."""
     if why := lacking(scene):
         raise SceneError(why, remedy="fit one with materials and a light, as `--for relighting` does")
     shading = scene.shading.relit(scene.mesh is not None)
@@ -65,12 +61,9 @@ def relightable(scene: TrainedScene) -> TrainedScene:
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:
-    """Convert the diffuse radiance of each surfel to an albedo, under the light that it was fitted to.
-
-    R is the cosine-weighted mean of the radiance in front of a surfel, E the irradiance there times the
-    ambient visibility of the mesh, S a dielectric's reflectance at normal incidence. The diffuse albedo is
-    R / ((1 - S) E), clipped to 0 … 1; the albedo becomes metallic albedo + (1 - metallic) that.
-    """
+    """Convert the diffuse radiance to an albedo: that of the diffuse part is R / ((1 - S) E), clipped to 0 …
+    1, with R the cosine-weighted mean radiance in front of a surfel, E the irradiance times the mesh's
+    ambient visibility, S a dielectric's reflectance at normal incidence."""
     with dr.suspend_grad():
         surfels = surfels.cleaned()
         normal, vertex = outward(surfels, mesh)

@@ -107,10 +107,8 @@ class Run:
         return None if found is None else Region.of(found, self.path / DATASET)
 
     def cameras(self) -> dict[str, Any]:
-        """The decision about camera corrections, with the corrected poses by view; {} if nothing was decided.
-
-        Raises InputError for a record that cannot be used.
-        """
+        """The decision about camera corrections, with corrected poses by view; {} for none. Raises
+        InputError."""
         record, found = self.path / CAMERAS, self._record(CAMERAS)
         try:
             for name, pose in found.get("to_world", {}).items():
@@ -131,10 +129,8 @@ class Run:
             old.unlink(missing_ok=True)
 
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:
-        """The newest undamaged checkpoint, or None if there is none yet; names damaged ones on stderr.
-
-        Raises InputError if all are damaged, and for an attribute that is not registered.
-        """
+        """The newest undamaged checkpoint, None if there is none; damaged ones are named on stderr. Raises
+        InputError if all are, and for an attribute that is not registered."""
         damaged = []
         for path in reversed(self.checkpoints()):
             try:

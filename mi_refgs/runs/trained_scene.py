@@ -117,10 +117,7 @@ class TrainedScene:
         return fitted
 
     def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:
-        """A function that renders views without derivatives, with these AOVs (all, or by name).
-
-        `samples` per pixel, as in `render.samples`. Light and mesh are prepared once.
-        """
+        """A function that renders views, detached, with these AOVs (all, or by name), `samples` per pixel."""
         require_supported_variant("TrainedScene.renderer")
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)

@@ -20,11 +20,9 @@ from mi_refgs.runs.run import DATASET, Run
 
 
 def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> tuple[Method, Dataset]:
-    """The method with the size of images decided, and the training views in it, without ground truth.
-
-    The size is its own `data.downscale`, or the smallest that brings the first image to the pixels of its
-    preset: `tell` is called then. Raises InputError as `read_dataset` does.
-    """
+    """The method with its image size decided, and training views without ground truth: its own
+    `data.downscale`, or the smallest with its preset's pixels, which calls `tell`. Raises InputError as
+    `read_dataset` does."""
     pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
     views = read_views(method, path, "train", truth=False, pixels=pixels)
     if method.data.downscale is None and views.downscale > 1:
@@ -55,10 +53,8 @@ def read_views(
 
 
 def views_of_run(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
-    """A split of the data set of a run, or of the one at `path`, with the region of interest of the run.
-
-    Raises InputError as `read_dataset` and `Run.region` do, and if the run records no data set or it is gone.
-    """
+    """A split of the data set of a run (or at `path`), with the run's region of interest. Raises InputError
+    as `read_dataset` and `Run.region` do, and if the run records no data set or it is gone."""
     if path is None:
         record, path = run.path / DATASET, run.dataset()
         if path is None:

@@ -36,10 +36,8 @@ BRIGHTEST = 4.0  # largest ratio: a mirror that reflects a lamp into one of a fe
 def update_occluder_caches(
     occluder: Occluder, surfels: Surfels, light: Light | None, options: ShadingOptions
 ) -> None:
-    """Set `occluder.vertex_surfels` if hits are shaded, and `occluder.ambient` if there are `ambient_rays`.
-
-    Call it again when mesh, surfels or light have changed. Raises InputError as `Occluder.set_materials`.
-    """
+    """Set `occluder.vertex_surfels` if hits are shaded, `occluder.ambient` if there are `ambient_rays`, after
+    each change of mesh, surfels or light. Raises InputError as `Occluder.set_materials`."""
     if occluder.empty:
         return
     if options.traced_bounces or options.ambient_rays:

@@ -86,11 +86,8 @@ def device_table(variant: str) -> Any:
 
 
 def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Scale A and bias B of a GGX surface: its reflectance under constant light is F0·A + B.
-
-    Bilinear in the table, extrapolated over the outer half texels, both arguments clamped to [0, 1] and
-    differentiable.
-    """
+    """Scale A and bias B of the reflectance F0·A + B of a GGX surface under constant light: differentiable,
+    bilinear in the table, extrapolated over the outer half texels, both arguments clamped to [0, 1]."""
     data = device_table(mi.variant())
 
     def place(x: Any) -> tuple[Any, Any]:

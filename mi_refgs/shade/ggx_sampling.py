@@ -1,8 +1,5 @@
-"""Rays of the GGX lobe: visible normals at points that every pixel turns by a hash of its own index.
-
-The points repeat from render to render, differ between neighbouring pixels, and are spread evenly for any
-number of rays: a spiral of the golden ratio. Everything here is detached.
-"""
+"""Rays of the GGX lobe, detached: visible normals at points of a golden-ratio spiral, spread evenly for any
+number of rays, that every pixel turns by a hash of its own index."""
 
 from __future__ import annotations
 
@@ -26,11 +23,8 @@ def lobe_turn(index: mi.UInt32) -> mi.UInt32:
 
 
 def lobe_point(turn: mi.UInt32, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Point `ray` of `count` in the unit square, turned along its second coordinate.
-
-    The first coordinates are the middles of `count` equal steps, not jittered: of few rays one that falls far
-    out in the lobe's long tail spoils its pixel.
-    """
+    """Point `ray` of `count` in the unit square, turned along its second coordinate; the first is the middle
+    of one of `count` equal steps: jittered, one far out in the lobe's tail would spoil its pixel."""
     turned = mi.Float((ray * GOLDEN + turn) >> 8) * 2.0**-24
     return (mi.Float(ray) + 0.5) / mi.Float(count), turned
 
@@ -60,11 +54,9 @@ class Lobe:
         )
 
     def sample(self, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
-        """World direction of ray `ray` of `count`, and its weight: f cosθ / density, 0 below the horizon.
-
-        Visible normals by a cap of the sphere. [Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with
-        Spherical Caps"; weight F G / G₁: Heitz 2018, "Sampling the GGX Distribution of Visible Normals"]
-        """
+        """World direction of ray `ray` of `count`, and its weight f cosθ / density = F G / G₁, 0 below the
+        horizon. [Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"; weight: Heitz
+        2018]"""
         along, around = lobe_point(self.turn, ray, count)
         stretched = dr.normalize(mi.Vector3f(self.α * self.view.x, self.α * self.view.y, self.view.z))
         z = dr.fma(1 - along, 1 + stretched.z, -stretched.z)

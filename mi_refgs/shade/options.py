@@ -1,8 +1,5 @@
-"""How light becomes radiance, as data: the one declaration of every shading option.
-
-To add an option, add a field here and name it in `Reflectance.honoured` of the models that honour it. Method
-files, the plugin's properties, `scene.xml` and `model.json` read and write it from then on.
-"""
+"""How light becomes radiance, as data: the one declaration of every shading option, for method files, plugin,
+`scene.xml` and `model.json`. Name a new field in `Reflectance.honoured` of models that honour it."""
 
 from __future__ import annotations
 
@@ -27,10 +24,8 @@ def number(default: int, least: int, most: int) -> Any:
 
 @dataclass(frozen=True)
 class ShadingOptions:
-    """How light becomes radiance. All that costs extra is off by default.
-
-    Raises InputError for a value of another type or out of range; `Shading` refuses combinations.
-    """
+    """How light becomes radiance; what costs extra is off by default. Raises InputError for wrong types and
+    ranges."""
 
     at: ShadedAt = "pixel"  # deferred shading per pixel or forward shading per surfel
     reflectance: str = "split_sum"  # a name in `reflectance.MODELS`

@@ -1,7 +1,4 @@
-"""Traced mirror rays: visibility of the light, and radiance of the mesh where it blocks it.
-
-The paper traces one mirror ray for the whole lobe and leaves what it hits to the indirect attribute.
-"""
+"""Traced mirror rays: visibility of the light, and radiance of the mesh where it blocks it."""
 
 from __future__ import annotations
 
@@ -53,12 +50,9 @@ class HitSurfels:
 
 @dataclass(frozen=True)
 class MeshRadiance:
-    """Radiance of the mesh, shaded by the reflectance model with the attributes of the surfels.
-
-    The specular light of a hit requires visibility in its own mirror direction, which is traced once more.
-    What blocks it is another hit, `traced_bounces` times in all; what is blocked at the last is dark.
-    Spherical harmonics are those of the surfel nearest to the hit, other attributes means around it.
-    """
+    """Radiance of the mesh, shaded with the attributes of surfels, spherical harmonics of the nearest. What
+    blocks the mirror direction of a hit is another hit, `traced_bounces` times; what is blocked at the last
+    is dark."""
 
     occluder: Occluder
     surface: Surface
@@ -130,11 +124,9 @@ class MeshRadiance:
 
 
 def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-    """The points with visibility (mi.Float, 0 … 1, detached) and indirect light, as `options` require.
-
-    `options.traced_bounces` replaces `points.indirect` by the mean radiance of what blocked rays hit, whose
-    gradient goes to the light and to the materials around all hits; rays, hits and clamps are detached.
-    """
+    """The points with visibility (mi.Float, 0 … 1, detached) and indirect light, as `options` require: with
+    `traced_bounces` that of what blocked rays hit, with gradients of light and materials around all hits
+    only."""
     occluder, scene, bounces = context.occluder, None, options.traced_bounces
     sampled = options.visibility_rays > 1
     if occluder.empty and (sampled or bounces):
@@ -211,11 +203,8 @@ def _average(
 
 
 def _firefly_clamp(total: Color3f, largest: Color3f, free: Color3f, count: Float, α: Float) -> Color3f:
-    """Factor (0 … 1, detached) of the sum over blocked rays, per colour.
-
-    The `largest` of `count` rays counts for no more than all rays would at the mean of the others, `free`
-    ones included; this fades out with α. The more rays, the less is clamped: the limit is the true mean.
-    """
+    """Factor (0 … 1, detached) of the sum over blocked rays, per colour: the `largest` of `count` counts for
+    no more than all would at the mean of the others, `free` included. It fades with α, and with more rays."""
     others = dr.maximum(total - largest, 0)
     narrow = dr.maximum(1 - α / CLAMP_MAX_ALPHA, 0)
     excess = dr.maximum(largest - (others + free) * count / (count - 1), 0) * narrow

@@ -50,10 +50,8 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
 
 
 def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
-    """Σ coefs[i] basis_i(direction) of 1, 4, 9 or 16 colours at unit directions, without offset or clamp.
-
-    Raises InputError for another number of coefficients.
-    """
+    """Σ coefs[i] basis_i(direction) of 1, 4, 9 or 16 colours (else InputError) at unit directions, not
+    clamped."""
     degree = math.isqrt(len(coefs)) - 1
     if (degree + 1) ** 2 != len(coefs) or not 0 <= degree <= MAX_SH_DEGREE:
         raise InputError(f"{len(coefs)} colours", "eval_sh", "coefs", "give 1, 4, 9 or 16, for degree 0 … 3")

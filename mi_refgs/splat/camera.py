@@ -18,11 +18,9 @@ from mi_refgs.types import Float, Point2f, Point3f, Sensor, UInt32, Vector3f
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy).
-
-    In Mitsuba's camera frame (+x left, +y up) both focal lengths are negative. Numbers but the image size are
-    opaque Dr.Jit values: all views share kernels. If `displaced` or `attached` under AD, it has a `motion`.
-    """
+    """A pinhole camera: the point p of its frame lands on the pixel (fx·p.x/p.z + cx, fy·p.y/p.z + cy), both
+    focal lengths negative (+x left, +y up). Numbers but the image size are opaque: views share kernels. If
+    `displaced` or `attached` under AD, it has a `motion`."""
 
     width: int  # pixels
     height: int  # pixels
@@ -76,10 +74,8 @@ class Camera:
         to_world: np.ndarray,
         near: float = 0,
     ) -> Camera:
-        """Camera from a rigid (4, 4) world-from-camera matrix, signed focal lengths and centre, pixels.
-
-        near: scene units. Raises InputError if the matrix is not rigid.
-        """
+        """Camera from a rigid (4, 4) world-from-camera matrix (else InputError), signed focal lengths and
+        centre in pixels, and near in scene units."""
         matrix = np.asarray(to_world, dtype=np.float64)
         rotation = matrix[:3, :3]
         finite = np.isfinite(matrix).all()
@@ -107,11 +103,9 @@ class Camera:
         size: int | tuple[int, int] = 256,
         near: float | None = None,
     ) -> Camera:
-        """Camera at `origin` that looks at `target`, both in the world, with `up` upwards in the image.
-
-        fov: degrees across the width. size: width and height, or both as one number, pixels. near: depth,
-        scene units; 1/1000 of the distance by default. Raises InputError for values that define no view.
-        """
+        """Camera at `origin` that looks at `target`, world, `up` upwards in the image; fov: degrees across
+        the width; size: width and height, or both as one, pixels; near: scene units, by default 1/1000 of the
+        distance. Raises InputError for values that define no view."""
         width, height = (size, size) if isinstance(size, int) else size
         eye, forward, top = (np.asarray(x, dtype=np.float64) for x in (origin, target, up))
         forward = forward - eye
@@ -154,10 +148,8 @@ class Camera:
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
     def attached(self, sensor: Sensor) -> Camera:
-        """The camera with derivatives of its sensor's `to_world` and `x_fov`, where gradients are enabled.
-
-        Those of `to_world` are of the rigid matrix nearest to it: scale and shear have none.
-        """
+        """The camera with derivatives, where enabled, of its sensor's `x_fov` and of the rigid part of
+        `to_world`."""
         camera, matrix, angle = self, sensor.world_transform().matrix, mi.traverse(sensor)["x_fov"]
         if dr.grad_enabled(matrix):
             turned = mi.Matrix3f(*(matrix[i, j] for i in range(3) for j in range(3)))
@@ -254,10 +246,8 @@ class Camera:
         )
 
     def window(self, x: int, y: int, width: int, height: int) -> Camera:
-        """The part of the view from pixel (x, y), which may lie outside; tiles and random numbers stay.
-
-        Kernels do not depend on x and y if these are multiples of PATCH_EDGE.
-        """
+        """The part of the view from pixel (x, y), even outside; tiles and random numbers stay, kernels at
+        multiples of PATCH_EDGE."""
         cx, cy = self.cx - dr.opaque(mi.Float, x), self.cy - dr.opaque(mi.Float, y)
         offset = self.offset[0] + x, self.offset[1] + y
         film = self.film or (self.width, self.height)
@@ -283,10 +273,8 @@ class Camera:
 
 
 def _motion_of(turned: mi.Matrix3f, moved: Vector3f) -> Float:
-    """`Camera.motion` of a matrix that is the identity, and of a vector, under AD.
-
-    The antisymmetric part of the matrix's tangent is that of the rotation nearest to it.
-    """
+    """`Camera.motion` of a matrix that is the identity, and of a vector, under AD, by the tangent's
+    antisymmetric part, which is that of the nearest rotation."""
     angles = [0.5 * (turned[i, j] - turned[j, i]) for i, j in ((2, 1), (0, 2), (1, 0))]
     motion = dr.concat([*angles, *moved])
     return motion - dr.detach(motion)

@@ -58,10 +58,8 @@ def composite(footprints: Footprints, features: list[Float], lists: TileLists) -
 
 @phase("splat forward")
 def composite_compact(lists: TileLists, depth: bool) -> Composited:
-    """Maps of the pixels of patches that list a surfel, in the order of `pixels`, without derivatives.
-
-    Alpha is 1 - T instead of one more sum, and equal to rounding.
-    """
+    """Maps of the pixels of patches that list a surfel, in the order of `pixels`, detached; alpha is 1 -
+    T."""
     if not lists.pairs:
         return Composited.nothing(lists.features, lists.camera, depth)
     dr.eval(lists.rows.data)

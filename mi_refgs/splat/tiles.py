@@ -45,11 +45,8 @@ class TileLists:
 
 @phase("tile lists")
 def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Float] = ()) -> TileLists:
-    """List every surfel in each tile that its footprint may touch, and pack footprints and features (N,).
-
-    Both sorts are stable, so surfels of equal depth keep their order in memory. Raises InputError for more
-    than 2^MAX_PAIR_BITS pairs.
-    """
+    """List every surfel, stably, in each tile that its footprint may touch, and pack footprints and features
+    (N,). Raises InputError for more than 2^MAX_PAIR_BITS pairs."""
     tiles = camera.tiles[0] * camera.tiles[1]
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     rows = PackedRows.pack([*footprints.columns, *features])
@@ -94,11 +91,8 @@ def _sorted(pairs: UInt64, depth: Float, tiles: int) -> tuple[UInt32, UInt32]:
 
 
 def _nearest_first(depth: Float) -> UInt32:
-    """Indices that sort `depth`: a radix sort of 24 bits, where `dr.argsort` sorts 32.
-
-    Bits of positive floats are in their order. If the largest is more than four times the smallest, the last
-    digits are dropped.
-    """
+    """Indices that sort `depth` by a radix sort of 24 bits (`dr.argsort`: 32). Bits of positive floats are in
+    their order; the last digits drop if the largest is more than four times the smallest."""
     key = dr.reinterpret_array(mi.UInt32, depth)
     dr.eval(key)
     least = dr.min(key)

@@ -16,10 +16,8 @@ from mi_refgs.types import Float
 def blended_weights(
     surfels: Tables, camera: Camera, maps: Sequence[Float | float] = (1.0,)
 ) -> list[np.ndarray]:
-    """Sums Σ w m (N,) float64 of the blending weights of N surfels, for each map m (H·W,) of an image.
-
-    A map of 1 gives weights in pixels. They are the gradient of Σ m Σ w f with respect to a feature f.
-    """
+    """Sums Σ w m (N,) float64 of blending weights, for each map m (H·W,): gradients of Σ m Σ w f by f. A map
+    of 1 gives pixels."""
     features = [dr.opaque(mi.Float, 0, surfel_count(surfels)) for _ in maps]
     dr.enable_grad(features)
     blended = splat([table.detach() for table in tables_of(surfels)], features, camera).features

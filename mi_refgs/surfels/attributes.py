@@ -60,10 +60,8 @@ class Attribute:
     def start(
         self, count: int, width: int, rng: np.random.Generator, value: float | np.ndarray | None = None
     ) -> np.ndarray:  # (count, width) float64
-        """Initial raw values around the activated `value`; for SH, what the constant coefficient adds.
-
-        Raises InputError for a value that the activation cannot return.
-        """
+        """Initial raw values around the activated `value`, for SH what the constant coefficient adds;
+        InputError for one that the activation cannot return."""
         value = self.initial if value is None else value
         if self.activation == "sigmoid":
             if not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= 1)):

@@ -69,10 +69,8 @@ def from_points(
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:
-    """Root mean squared distance (N,) of each point to its 3 nearest ones, above DISTANCE_FLOOR extents.
-
-    The extent of points at one place is their distance from the origin, or 1.
-    """
+    """Root mean squared distance (N,) of each point to its 3 nearest, above DISTANCE_FLOOR of the extent; of
+    points at one place that is their distance from the origin, or 1."""
     if not len(points):
         return np.zeros(0)
     extent = float(np.ptp(points, axis=0).max()) or float(np.linalg.norm(points[0])) or 1.0

@@ -25,11 +25,8 @@ from mi_refgs.surfels.table import Surfels
 
 
 def read_ply(path: str | Path) -> Surfels:
-    """Read surfels from a binary or ASCII PLY file; unknown properties are ignored.
-
-    Raises InputError that names file, property and remedy if the file cannot be read, or a property is
-    missing or not finite.
-    """
+    """Read surfels from a binary or ASCII PLY file; unknown properties are ignored. Raises InputError that
+    names file, property and remedy if that fails, or a property is missing or not finite."""
     path = Path(path)
     try:
         with path.open("rb") as file:
@@ -86,10 +83,8 @@ def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
 
 
 def write_ply(path: str | Path, surfels: Surfels) -> None:
-    """Write surfels as binary little-endian float32 PLY, atomically; reading it gives the same bits.
-
-    Raises InputError if a value is not finite or the path cannot be written.
-    """
+    """Write surfels as binary float32 PLY, atomically and exactly. Raises InputError if a value is not finite
+    or the path cannot be written."""
     write_bytes(path, encode_ply(surfels))
 
 

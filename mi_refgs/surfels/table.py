@@ -45,19 +45,15 @@ def _exp(x: Float) -> Float:
 
 
 class Surfels:
-    """N surfels, 3D Gaussians or other primitives: raw attributes by name, which decide the `primitive`.
-
-    An attribute that a scene does not use is absent. Accessors return activated values as Dr.Jit arrays of
-    width N; gradients flow to the raw tensors in both modes.
-    """
+    """N surfels or other primitives: raw attributes by name (those that a scene uses), which decide the
+    `primitive`. Accessors return activated values as Dr.Jit arrays (N,); gradients flow to the raw tensors in
+    both modes."""
 
     raw: dict[str, TensorXf]  # (N, D) each, often leaves of the AD graph
 
     def __init__(self, raw: Mapping[str, TensorXf], screened: bool = False) -> None:
-        """Adopt raw tensors of shape (N, D); raises InputError for unknown names or wrong shapes.
-
-        `screened`: opacity is 0 where a value of a surfel is not `usable`, at 3 % of a training step.
-        """
+        """Adopt raw tensors (N, D); raises InputError for unknown names or wrong shapes. `screened`: opacity
+        is 0 where a value is not `usable`, at 3 % of a training step."""
         for name in raw:
             attribute(name)
         self.raw = {name: raw[name] for name in ATTRIBUTES if name in raw}

@@ -189,10 +189,8 @@ class FittedLight:
 
 @dataclass(frozen=True)
 class EnvironmentLight(FittedLight):
-    """A learnable lat-long light: `raw` is a tensor (h, 2h, 3), h a multiple of 4, radiance = softplus(raw).
-
-    Raises InputError for another shape.
-    """
+    """A learnable lat-long light of radiance softplus(`raw`), a tensor (h, 2h, 3), h a multiple of 4, else
+    InputError."""
 
     def __post_init__(self) -> None:
         shape = tuple(self.raw.shape)
@@ -216,10 +214,8 @@ class EnvironmentLight(FittedLight):
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
-        """Read a lat-long image (EXR, HDR) and resample it to `height` rows, keeping its energy.
-
-        Without `height`: the image's own rows, at most FINEST. Raises InputError as `read_radiance` does.
-        """
+        """Read a lat-long image (EXR, HDR) and resample it to `height` rows (default: its own, at most
+        FINEST), keeping its energy. Raises InputError as `read_radiance` does."""
         image = read_radiance(path, height or FINEST)
         rows = height if height is not None else max(MIN_HEIGHT, image.shape[0] // 4 * 4)
         return cls.from_radiance(lobe_matrices.resample(image, rows))

@@ -1,7 +1,5 @@
-"""Kinds of light: what a fit learns of a light.
-
-To add a kind, write its `FittedLight` and its `LightKind` in a file, and register the latter in LIGHTS.
-"""
+"""Kinds of light, what a fit learns of it: a new one is a `FittedLight` and a `LightKind` registered in
+LIGHTS."""
 
 from __future__ import annotations
 

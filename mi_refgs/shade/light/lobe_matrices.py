@@ -68,10 +68,8 @@ def row_areas(h: int) -> np.ndarray:
 
 
 def resampling(count: int, wanted: int, periodic: bool = False) -> csr_matrix:
-    """Matrix (wanted, count) between grids of rows, or of columns if `periodic`; its rows sum to 1.
-
-    Area-weighted hats to coarsen, linear to refine.
-    """
+    """Matrix (wanted, count) between grids of rows, or `periodic` columns, rows of sum 1: area-weighted hats
+    to coarsen, linear to refine."""
     last = 0 if periodic else 1  # rows are on both ends of their interval, columns are not
     ratio = (count - last) / (wanted - last)
     offset = 0.5 * (ratio - 1) if periodic else 0.0
@@ -100,11 +98,9 @@ def resample(radiance: np.ndarray, height: int) -> np.ndarray:
 
 
 def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
-    """Matrices (h_out, h, h+1) of the lobe from input to output rows, frequencies 0 … h of w = 2h columns.
-
-    Entry (i, k, m) multiplies Σ_j x[k, j] (cos, sin)(mφ_j); the series Σ_m (a_m cos mφ + b_m sin mφ) is then
-    the filtered radiance of row i at any azimuth.
-    """
+    """Matrices (h_out, h, h+1) of the lobe: entry (i, k, m) times Σ_j x[k, j] (cos, sin)(mφ_j), summed over
+    k, is (a_m, b_m) of Σ_m (a_m cos mφ + b_m sin mφ), the filtered radiance of row i. Frequencies 0 … h of w
+    = 2h."""
     w, texel = 2 * h, np.pi / (h - 1)
     core = 2 * roughness**2  # the lobe falls to a quarter at this angle, radians
     s = max(MIN_SUBSAMPLES, int(np.ceil(2.5 * texel / core)) + 1)

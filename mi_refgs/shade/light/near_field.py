@@ -29,11 +29,9 @@ SHORTEST = 0.05  # least length of a ray, in distances: a point may lie beyond a
 
 @dataclass(frozen=True, eq=False)
 class NearField:
-    """Distances of what an environment map shows, from a `centre` (3,) in the world, scene units.
-
-    `nearness` (h, 2h) is 1 / distance in the map's orientation, of any number of rows; 0 is infinitely far.
-    Raises InputError for another shape, and for values that are negative or not finite.
-    """
+    """Distances of what an environment map shows, from a `centre` (3,) in the world: `nearness` (h, 2h) is 1
+    / distance, 0 infinitely far, in scene units. Raises InputError for other shapes, negative or not finite
+    values."""
 
     centre: np.ndarray
     nearness: np.ndarray
@@ -78,10 +76,8 @@ class NearField:
         return interpolated(lambda i: dr.gather(mi.Float, texels, i), u, v, h, 2 * h)
 
     def seen_from(self, position: Point3f, direction: Vector3f) -> Vector3f:
-        """Unit directions from the centre to what rays from `position` in unit directions meet.
-
-        The distance is looked up, detached, in the direction of the last point that was found.
-        """
+        """Unit directions from the centre to what rays from `position` in unit directions meet. The distance
+        is looked up, detached, in the direction of the last point that was found."""
         offset = mi.Vector3f(position) - mi.Vector3f(self.on_device[1])
         with dr.suspend_grad():
             towards, nearness = mi.Vector3f(direction), mi.Float(0)
@@ -93,11 +89,8 @@ class NearField:
 
 
 def _met(offset: Vector3f, ray: Vector3f, nearness: Float) -> Vector3f:
-    """Unit direction of the point where x + t r meets a sphere of radius 1 / n around the origin.
-
-    t = τ / n with τ = √((x·r n)² + 1 - |x|² n²) - x·r n, so the point is in the direction r + x n / τ, also
-    where n is 0. Where x is outside of the sphere, t is SHORTEST radii or more.
-    """
+    """Unit direction of x + t r on the sphere of radius 1 / n: that of r + x n / τ, t = τ / n, also where n
+    is 0; τ = √((x·r n)² + 1 - |x|² n²) - x·r n. Where x is outside, t is SHORTEST radii or more."""
     along = dr.dot(offset, ray) * nearness
     inside = dr.square(along) + 1 - dr.squared_norm(offset) * dr.square(nearness)
     τ = dr.sqrt(dr.maximum(inside, SHORTEST**2)) - along

@@ -15,11 +15,9 @@ from mi_refgs.surfels.table import Surfels
 
 
 class GaussianShader(Reflectance):
-    """c = radiance + (1 - tint) E(n) + (tint A + B) L(r, roughness), with E the irradiance of the normal.
-
-    The normal is that of the surfel plus a fitted `normal_offset`, which turns round with it: the original
-    has one offset a side. The light is linear and without an upper bound; theirs is clamped to [0, 1].
-    """
+    """c = radiance + (1 - tint) E(n) + (tint A + B) L(r, roughness), with E the irradiance of the normal, to
+    which a fitted `normal_offset` is added; the light has no upper bound (theirs: [0, 1]; one offset a
+    side)."""
 
     name = "gaussian_shader"
     shaded_at = ("surfel",)

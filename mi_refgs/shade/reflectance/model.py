@@ -52,10 +52,8 @@ class TraceContext:
     pixel: UInt32 = None  # (N,) image index that seeds the random numbers; None: 0 … N - 1
 
     def start(self, normal: Vector3f) -> tuple[Point3f, Vector3f, Bool]:
-        """Where the primary rays meet the mesh, the unit normals there, and whether they do; detached.
-
-        Not the blended depth: at a silhouette that lies inside the object, which draws a dark outline.
-        """
+        """Where the primary rays meet the mesh, the unit normals there, and whether they do; detached. Not
+        the blended depth, which lies inside the object at a silhouette and draws a dark outline."""
         distance, hit = self.occluder.first_hit(self.origin, self.ray, self.covered)
         return mi.Point3f(mi.Vector3f(self.origin) + distance * self.ray), safe_normalize(normal), hit
 
@@ -81,11 +79,9 @@ class Reflectance:
         raise NotImplementedError
 
     def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
-        """Values (N,) by name (mi.Float, mi.Color3f or mi.Vector3f), under AD.
-
-        A "normal" among them replaces the surfel's own, `seen.normal`. For hits of traced rays, `surfels`
-        has only `has` and `value` of the `required_attributes`.
-        """
+        """Values (N,) by name (mi.Float, mi.Color3f, mi.Vector3f), under AD; a "normal" replaces
+        `seen.normal`. For hits of traced rays, `surfels` has only `has` and `value` of the
+        `required_attributes`."""
         raise NotImplementedError
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
@@ -107,10 +103,8 @@ class Reflectance:
         return None if lit or self.light == "none" else options
 
     def textures(self, values: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Albedo, metallic and roughness of `split_sum` that reflect as attributes `values`, both by name.
-
-        Plain arithmetic: values are Dr.Jit arrays, or images in NumPy. None: exports to meshes are refused.
-        """
+        """Albedo, metallic and roughness of `split_sum` that reflect as `values`, both by name, as Dr.Jit or
+        NumPy arrays; None: exports to meshes are refused."""
         return None
 
 

@@ -32,11 +32,8 @@ class Radiance(Reflectance):
 
 
 class Displayed(Radiance):
-    """c = linear(e), with e the mean of max(0, ½ + Σ c Y(d)) over what a pixel sees: sRGB-encoded colours.
-
-    3DGS and 2DGS blend encoded colours, A e = Σ w e_i, and show A e + (1 - A) background. Radiance with this
-    e, once it is encoded again, is shown as that. [3DGS, §4; 2DGS]
-    """
+    """c = linear(e), with e the mean of max(0, ½ + Σ c Y(d)) over what a pixel sees, since 3DGS and 2DGS
+    blend encoded colours, A e = Σ w e_i, and show A e + (1 - A) background. [3DGS, §4; 2DGS]"""
 
     name = "displayed"
     shaded_at = ("pixel",)

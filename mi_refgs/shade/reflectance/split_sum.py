@@ -36,12 +36,9 @@ def base_reflectance(points: ShadingPoints) -> mi.Color3f:
 def lookup_direction(
     normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, options: ShadingOptions
 ) -> mi.Vector3f:
-    """Unit direction in which the prefiltered light is looked up: mirrored, or dominant. Unit vectors in.
-
-    The dominant one is near the peak of the GGX lobe: with α = roughness² and s = 1 - α it lies s (√s + α) of
-    the way from the normal to the mirror direction. [Lagarde and de Rousiers 2014, "Moving Frostbite to
-    Physically Based Rendering", §4.9.3]
-    """
+    """Unit direction in which the light is looked up: mirrored, or dominant, near the peak of the GGX lobe, s
+    (√s + α) of the way from the normal, α = roughness², s = 1 - α. Unit vectors in. [Lagarde and de Rousiers
+    2014, "Moving Frostbite to Physically Based Rendering", §4.9.3]"""
     mirror = reflect(view, normal)
     if not options.dominant:
         return mirror

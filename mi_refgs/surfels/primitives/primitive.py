@@ -1,8 +1,5 @@
-"""Interface and registry of primitives: what is splatted, with attributes and a footprint of its own.
-
-The attributes of a surfel model and their widths decide its primitive: surfels have a `scale` of two columns,
-3D Gaussians one of three. A new primitive is one file with a subclass of `Primitive`, and its `register`.
-"""
+"""Primitives, what is splatted: each file has a subclass of `Primitive`, chosen by attributes and their
+widths (surfels have a `scale` of two columns, 3D Gaussians one of three), and its `register`."""
 
 from __future__ import annotations
 
@@ -110,10 +107,8 @@ class Primitive(ABC):
 
     @abstractmethod
     def start(self, spacing: np.ndarray, rotation: np.ndarray) -> dict[str, np.ndarray]:
-        """Raw attributes beside position and opacity, for points whose neighbours are `spacing` (N,) away.
-
-        rotation: (N, 4) unit quaternion (x, y, z, w) whose third axis is the surface normal.
-        """
+        """Raw attributes beside position and opacity, for points whose neighbours are `spacing` (N,) away,
+        and unit quaternions `rotation` (N, 4), (x, y, z, w), whose third axis is the surface normal."""
 
     @abstractmethod
     def extent(self, raw: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -227,10 +222,8 @@ def dot2(x: Float, y: Float, delta: Vector2f) -> Float:
 def rectangle(
     centre: Vector2f, low: Vector2f, high: Vector2f, visible: Bool, camera: Camera
 ) -> tuple[tuple[Int32, Int32], tuple[Int32, Int32]]:
-    """First and last pixel column and row of centre + `low` to centre + `high`, pixels.
-
-    The last is below the first where nothing is covered or `visible` is false.
-    """
+    """First and last pixel column and row of centre + `low` to centre + `high`, pixels; last < first if not
+    `visible`."""
     first, last = [], []
     for axis, size in enumerate((camera.width, camera.height)):
         # Clamped as floats first: a rectangle far outside must not overflow an integer.
@@ -256,10 +249,8 @@ THICKNESS = 0.1  # third standard deviation of a flat primitive as a Gaussian, o
 
 
 def sorted_frame(axes: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions (N, 4) of axes (N, A, 3), A = 2 or 3, by their deviations, longest first; all three (N, 3).
-
-    The third of two is THICKNESS long.
-    """
+    """Quaternions (N, 4) of 2 or 3 axes (N, A, 3), by deviation, longest first; all (N, 3), the third of two
+    THICKNESS."""
     order = np.argsort(-deviations, axis=1, kind="stable")
     axes = np.take_along_axis(axes, order[:, :, None], axis=1)
     s = np.take_along_axis(deviations, order, axis=1)

@@ -142,10 +142,8 @@ class Surfel(Oriented):
         return surfels.frame()[2]
 
     def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
-        """Whether u² + v² ≤ r², q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)² ≤ 0, at the rectangle's least q.
-
-        It lies at the minimum of q or on an edge that faces it. [cf. Speedy-Splat, Hanson et al. 2025, §4]
-        """
+        """Whether u² + v² ≤ r², q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)² ≤ 0, at the rectangle's least q: at
+        the minimum or on an edge that faces it. [cf. Speedy-Splat, Hanson et al. 2025, §4]"""
         a_x, a_y, b_x, b_y, c_x, c_y, _, x, y, opacity = row[: self.columns]
         r2 = cutoff_radius_squared(opacity) * 1.0005 + 1e-4  # rounding of q
         low, high = mi.Vector2f(low.x - x, low.y - y), mi.Vector2f(high.x - x, high.y - y)
@@ -175,11 +173,9 @@ class Surfel(Oriented):
         return ~ellipse | by_plane | by_screen
 
     def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
-        """Depth of the surfel's plane there, up to SORT_REACH standard deviations from its centre.
-
-        Sorted by centres, those on the camera's side of a curved surface would always come first.
-        [cf. StopThePop, Radl et al. 2024, §4: depth at the tile]
-        """
+        """Depth of the surfel's plane there, up to SORT_REACH standard deviations from its centre: sorted by
+        centres, the near side of a curved surface would always come first. [cf. StopThePop, Radl et al. 2024,
+        §4]"""
         a_x, a_y, b_x, b_y, c_x, c_y, z, x, y = row[:9]
         delta = mi.Vector2f(pixel.x - x, pixel.y - y)
         u, v = dot2(a_x, a_y, delta), dot2(b_x, b_y, delta)
