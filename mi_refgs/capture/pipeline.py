@@ -62,7 +62,6 @@ def capture(
     output.prepare(folder, [source] if masks is None else [source, masks])
     inputs = [VERSION, pycolmap.__version__, camera, [(p.name, p.digest, p.lying) for p in photographs]]
     copies = {photograph.copy: photograph for photograph in photographs}
-
     # Cameras of the largest group, transformed to an upright world.
     work, given = folder / WORK, _hash(inputs)
     mark = work / "key"
@@ -79,7 +78,6 @@ def capture(
     world = similarity.moved(solved)
     found = region or Region((0.0, 0.0, 0.0), 1.0, estimated=True)
     found = replace(found, planes=support_planes(world.points, world.origin, found))
-
     # Undistorted images and COLMAP's files, unless the last capture wrote the same.
     mask_digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in mask_files.values()]
     key, last = _hash([inputs, repr(straight), mask_digests]), folder / REPORT
@@ -91,8 +89,6 @@ def capture(
         output.write_model(model, copies, straight, similarity, folder / SPARSE)
     write_region(folder, found)
     draw(folder / PLOT, world, found)
-
-    # The report.
     registered = {copies[name].name for name in world.names}
     cameras = model.cameras.values()
     report = {

@@ -103,7 +103,6 @@ def _run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "--version"):
         print(f"mi_refgs {__version__}" if "--version" in argv else overview())
         return 0
-
     from mi_refgs.cli.command import UnusableError, finite
     from mi_refgs.runs.interrupt import TerminatedError
 

@@ -43,7 +43,6 @@ class Demo:
             folder.method()
         else:
             folder.require_none()
-
         say(f"1 of 3: tracing {VIEWS + TEST_VIEWS} views of {SCENE} into {data}")
         images: dict[str, Any] = {"views": VIEWS, "test_views": TEST_VIEWS, "size": SIZE, "spp": SAMPLES}
         make_dataset(resource_dir("scenes") / SCENE, data, environment_height=64, **images)

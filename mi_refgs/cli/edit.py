@@ -44,7 +44,6 @@ class Edit:
         assignments(options["set"])
         if self.selection.where is not None:
             parse_condition(self.selection.where)
-
         before = load(self.run_folder, write=False)
         before = replace(before, provenance=before.provenance.with_data(self.data))
         try:

@@ -51,7 +51,6 @@ class Export:
         if names and self.output is None:
             remedy = "say with -o which file or folder to write"
             raise InputError("names no file", "--to", remedy=remedy)
-
         folder = Run(self.run_folder)
         method = folder.method()
         state = folder.load_checkpoint()

@@ -56,7 +56,6 @@ class Render:
         if self.samples is not None and self.samples < 1:
             what = f"{self.samples} is out of range"
             raise InputError(what, "--samples", remedy="give a number from 1")
-
         cameras = None if self.camera is None else read_cameras(self.camera)
         scene = load_scene(scene_file(self.scene), separated(self.aov), self.object)
         own = scene.sensors()

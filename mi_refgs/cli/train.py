@@ -56,14 +56,12 @@ class Train:
             from mi_refgs.viewer.training import TrainingViewer
 
             progress = TrainingViewer(HOST, self.port)
-
         begin = time.monotonic()
         given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
         given |= {"settings": joined(self.set), "purpose": self.purpose}
         fit(self.data, self.method, progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None
-
         data: dict[str, Any] = {
             "run": str(self.output),
             "method": trainer.method.name,

@@ -88,7 +88,6 @@ def table_of(folder: Path) -> Table:
         for name, jobs_of_row in groupby(jobs_of_scene, lambda job: job.name):
             row, metrics = Row(name, name), list[dict[str, Any]]()
             for job in jobs_of_row:
-                # Sort the job into finished, failed and unfinished.
                 try:
                     if job.run.exists():
                         _describe(row, job, table)
@@ -102,8 +101,6 @@ def table_of(folder: Path) -> Table:
                     else:
                         row.unfinished.append(job.seed)
                     continue
-
-                # Collect its metrics.
                 found = read_metrics(job.run)
                 assert found is not None
                 metrics.append(found)

@@ -49,7 +49,6 @@ def fit_and_measure(job: Job) -> None:
         dr.set_thread_count(job.threads)
     mi.set_variant(job.mitsuba_variant)
     mi.set_log_level(mi.LogLevel.Warn)
-
     from mi_refgs.evaluation.evaluate import evaluate
     from mi_refgs.fitting.runner import begin, finish
     from mi_refgs.runs.views import read_views

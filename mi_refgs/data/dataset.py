@@ -232,13 +232,11 @@ def read_dataset(
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
     require_few_sizes(found.source or path, "images", sizes, remedy)
-
     # Region and offset are derived from the training cameras for every split.
     training = views
     if split != "train":
         with contextlib.suppress(InputError):  # a relit data set has none
             training = reader.read(path, "train", replace(options, truth=False)).views
-
     # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored, but not that of masks.
     if _opaque(views) and (split == "train" or _opaque(training)):
         which = f"{sum(map(_own_alpha, views))} of {len(views)} images have alpha"
@@ -249,7 +247,6 @@ def read_dataset(
     if 0 < len(without) < len(views):
         which = f"{len(without)} of {len(views)} images, such as '{without[0]}'"
         notes = (*notes, f"no alpha and no mask for {which}; give all images masks, or none")
-
     # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training)
     near, region = NEAR_EXTENTS * _extent(views, offset), read_region(path)

@@ -1,9 +1,6 @@
-"""Reader of NeRO's Glossy Synthetic: per image an `i.png`, its depth `i-depth.png` and camera `i-camera.pkl`.
-
-A camera is a pickled list of the pose (3 × 4, world to camera, OpenCV's axes) and the 3 × 3 matrix K. Depths
-along the viewing axis have 16 bits for 15 units; what is nearer than 14.5 is the object. Every eighth image
-by number is a test view, as for 3DGS-DR and Ref-Gaussian. [NeRO, Liu et al., SIGGRAPH 2023]
-"""
+"""Reader of NeRO's Glossy Synthetic: `i.png`, 16-bit depth `i-depth.png` of 15 units along the viewing axis
+(nearer than 14.5: the object), and `i-camera.pkl`, a pickled list of the pose (3 × 4, world to camera,
+OpenCV's axes) and K (3 × 3). Every eighth image by number is a test view. [Liu et al., SIGGRAPH 2023]"""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
 """Reader of LLFF's layout: `poses_bounds.npy` beside `images`, or copies such as `images_4`, and `masks`.
 
-One row per image, in the order of their names: a 3 × 5 matrix by rows, then the nearest and the farthest
-depth. The columns of the matrix are the camera's axes in the world (down, right, backwards), its position,
-and height, width and focal length in pixels. Every eighth image is a test view. [Mildenhall et al., Local
-Light Field Fusion, SIGGRAPH 2019]
-"""
+One row per image by name: a 3 × 5 matrix by rows, nearest and farthest depth. Its columns are the camera's
+axes in the world (down, right, backwards), its position, and height, width and focal length in pixels. Every
+eighth image is a test view. [Mildenhall et al., Local Light Field Fusion, SIGGRAPH 2019]"""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
-"""The region of interest of an object, from points on the surfaces that images show.
-
-The surfaces that support the object are planes with all cameras on one side; the region ends there. The
-object is the group of close points above them that most views show. Before a fit, with points of stereo or
-structure from motion, the sphere estimated from the cameras grows until it contains that group. During a fit,
-with points everywhere, a sphere and more planes enclose it.
-"""
+"""The region of interest of an object: a sphere above planes, which have all cameras on one side, around the
+group of close points that most views show. Before a fit, the sphere estimated from the cameras grows until it
+contains that group; during a fit, with points on all surfaces, a sphere and more planes enclose it."""
 
 from __future__ import annotations
 
@@ -88,7 +84,6 @@ def support_planes(
         offset = np.sum(normal * corner[:, 0], axis=1)
         upwards = np.sign(np.median(origins @ normal.T - offset, axis=0))
         normal, offset = normal * upwards[:, None], offset * upwards
-
         # The one that most points are on, of those that have little below.
         height = points @ normal.T - offset
         on, below = np.sum(abs(height) < width, axis=0), np.sum(height < -2 * width, axis=0)

@@ -1,9 +1,6 @@
 """Points on the surfaces that photographs with known cameras show, by plane sweep, and the other pixels.
-
-Each view is compared with its neighbours at a series of depths, by the normalised cross-correlation of
-patches. [Collins 1996] A pixel becomes a point if the patches at its best depth look alike, and if the best
-depths of other views agree with it.
-"""
+Patches of each view are compared with its neighbours at a series of depths [Collins 1996]; a pixel becomes a
+point if the patches at its best depth look alike, and the best depths of other views agree with it."""
 
 from __future__ import annotations
 
@@ -72,7 +69,6 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
         others = [(small[j], grey[j]) for j in near]
         swept.append(_Swept(small[i], near, *_sweep(small[i], grey[i], others, nearness)))
     tolerance = AGREEMENT * float(nearness[0] - nearness[1])
-
     # The pixels whose depth others confirm, and the rest.
     position, on, off = [], [], []
     for one in swept:
@@ -126,7 +122,6 @@ def _sweep(
         volume[:] = _correlation(grey, mean, variance, seen)
         volume[~inside] = -1
     similarity = np.sort(volumes, axis=0)[-ALIKE:].mean(axis=0)
-
     # The best depth, and the maximum of the parabola through it and its neighbours.
     best = np.argmax(similarity[1:-1], axis=0)[None] + 1
     before, there, after = (np.take_along_axis(similarity, best + k, axis=0)[0] for k in (-1, 0, 1))

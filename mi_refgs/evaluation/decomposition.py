@@ -1,9 +1,6 @@
-"""Errors of the fitted materials on the foreground, and on its concave pixels.
-
-Light and albedo share an unknown per-channel scale: twice the light on half the albedo gives the same images.
-So albedo is compared after one least-squares scale per channel, the same for all pixels of all views, and the
-light after its own (`metrics.environment`); both scales are reported.
-"""
+"""Errors of the fitted materials on the foreground, and on its concave pixels. Light and albedo share an
+unknown scale per channel: albedo is compared after one least-squares scale for all pixels of all views, the
+light after its own (`metrics.environment`); both are reported."""
 
 from __future__ import annotations
 

@@ -72,7 +72,6 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     renders = render_names(views.views)
     fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
     per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
-
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
     errors, budget = Decomposition(), ErrorBudget()
@@ -90,14 +89,11 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
         scores.append(_scores(rendered, view, views, scores[0] if scores else {}))
         gain, gained = with_gain(frame, view, views)
         scores[-1] |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
-
         # Errors of materials, of concave pixels and per class of pixels.
         concave = None if surface is None else surface.concave(view)
         rendered = replace(rendered, maps=maps_of(view.camera(), rendered))
         errors.add(rendered, view, concave)
         budget.add(rendered, view, classify(view, surface))
-
-        # Images.
         write_png(run.path / renders[index], rendered.image)
         if index in in_sheet:
             more: dict[str, np.ndarray] = {}
@@ -108,8 +104,6 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
             shown.append((rendered, view, more))
     if corrected := bool(run.cameras()):
         _register(scores, fitted, views, samples, progress)
-
-    # The numbers.
     light_scores, footer = _light(fitted, views)
     cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
     size = [views.views[0].width, views.views[0].height]
@@ -134,8 +128,6 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
         "machine": machine(),
         "views": [{k: v for k, v in view.items() if not k.endswith("_reason")} for view in scores],
     }
-
-    # The sheet.
     rows = [panels(rendered, view, errors.scale()) | more for rendered, view, more in shown]
     write_png(run.path / SHEET, contact_sheet(rows, footer))
     run.write_json(METRICS, result)

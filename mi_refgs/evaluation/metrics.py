@@ -1,9 +1,6 @@
-"""Metrics of images, normals and fitted environment maps, in NumPy; and the time of a frame.
-
-Images are (H, W, 3) display-encoded floats, clamped to [0, 1] and never quantised; a data set's value is the
-mean over its images. Normals are (H, W, 3) world vectors. Environment maps are (h, w, 3) linear lat-long
-radiance in Mitsuba's orientation.
-"""
+"""Metrics of images, normals and fitted environment maps, in NumPy. Images are (H, W, 3) display-encoded
+floats, clamped to [0, 1] and never quantised; normals (H, W, 3) world vectors; environment maps (h, w, 3)
+linear lat-long radiance in Mitsuba's orientation. A data set's value is the mean over its images."""
 
 from __future__ import annotations
 

@@ -102,15 +102,13 @@ def surface_scores(mesh: Mesh | None, truth: TrueSurface | None, views: Sequence
 
 
 def surface_distance(mesh: Mesh, truth: TrueSurface, views: Sequence[View]) -> dict[str, float]:
-    """Compute the distance between a mesh and the true surface in percent of the true size.
+    """Compute distances between a mesh and the true surface in percent of the diameter of its bounding
+    sphere.
 
-    The size is the diameter of the true surface's bounding sphere, centred on its bounding box. Keys:
-    `surface_accuracy`, mean distance from points of the mesh to the true surface; `surface_completeness`,
-    from points of the true surface to the mesh; `surface_distance`, the mean of both (Chamfer distance); and
-    each with `_concave`, of points whose (nearest) point on the true surface is concave, if there are any.
-    Points are spread evenly over the area of each surface that some view sees. In an open scene (views
-    without alpha) the mesh near the true surface counts, in pixels that show the object.
-    """
+    `surface_accuracy`: mean distance from points of the mesh to the true surface; `surface_completeness`: the
+    reverse; `surface_distance`: the mean of both (Chamfer distance); each with `_concave`, of points whose
+    nearest true point is concave, if any. Points are spread evenly over the area that some view sees. In an
+    open scene (views without alpha) the mesh near the true surface counts, in pixels that show the object."""
     corners = np.asarray(truth.mesh.vertices, np.float64)
     centre = (corners.min(0) + corners.max(0)) / 2
     radius = np.linalg.norm(corners - centre, axis=1).max()

@@ -77,7 +77,6 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
         remedy = "export `scene.xml`, or another model"
         raise SceneError(f"{model.name} has no textures", "reflectance", remedy=remedy)
-
     # Views that show the object's materials.
     plain = replace(scene, shading=scene.shading.untraced())
     views = [shots[i].camera.resized(VIEW_SIZE) for i in evenly_spread(len(shots), VIEWS)]
@@ -118,8 +117,7 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     trimesh.smoothing.filter_taubin(made, iterations=SMOOTHING)
     if len(made.faces) > faces:
         made = made.simplify_quadric_decimation(face_count=faces)
-    # In a unit box `open_` keeps every part that is large; without, a part that the box of an object has cut
-    # open could count as the wall of a cavity.
+    # A part that the box of an object has cut open could count as the wall of a cavity.
     whole = clean(np.asarray(made.vertices), np.asarray(made.faces), mesh.voxel, open_=True)
     return Mesh((whole.vertices * size + low).astype(np.float32), whole.faces, mesh.voxel)
 

@@ -1,10 +1,8 @@
 """PLY files of 3D Gaussian Splatting and 2DGS: read as a scene, and written.
 
-Files of other programs are blended in display-encoded colours (`shade.reflectance.radiance`). A 3DGS file is
-rendered by its own formula. A 2DGS file is not in two respects: its screen filter has a variance of 1/2
-pixel², here 1/12, which matters for surfels below a pixel and for those seen edge-on; and it sorts surfels by
-the depth of their centres, where we sort them by their depth per tile.
-"""
+Colours of other programs are blended display-encoded (`shade.reflectance.radiance`). Two differences to 2DGS:
+its screen filter has a variance of 1/2 pixel², ours 1/12; and it sorts surfels by the depth of their
+centres."""
 
 from __future__ import annotations
 

@@ -60,21 +60,18 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     tables = [table for table in tables if table.count]
     if not tables:
         raise InputError("there are none", "surfels", remedy="nothing can be exported")
-
     # Training cameras, spread evenly over all of them, of at most PIXELS.
     chosen = [shot.camera for shot in shots if shot.split == "train"] or [shot.camera for shot in shots]
     cameras = []
     for camera in (chosen[i] for i in evenly_spread(len(chosen), VIEWS)):
         factor, side = (camera.width * camera.height / PIXELS) ** 0.5, max(camera.width, camera.height)
         cameras.append(camera if factor <= 1 else camera.resized(round(side / factor)))
-
     # Geometry: surfels get a thin third axis, and move inwards.
     parts = [_geometry(table) for table in tables]
     raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     flat = np.repeat([_is_flat(table) for table in tables], [table.count for table in tables])
     if flat.any():
         raw["position"] = np.where(flat[:, None], _inset(tables, cameras), raw["position"])
-
     # Colours: those of an imported file are encoded already.
     if trained.shading.model.encoded and around is None:
         own = trained.surfels.to_numpy()["radiance_sh"]

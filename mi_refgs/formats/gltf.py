@@ -66,7 +66,6 @@ def write_gaussians(
     Colours are display-encoded (srgb_rec709_display). glTF has +y up: a node turns the scene, whose +z is up.
     """
     columns = _attributes(gaussians(trained, shots, degree, object).to_numpy())
-
     # Accessors and views of one buffer, in the order of the attributes.
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
@@ -80,8 +79,6 @@ def write_gaussians(
         accessors.append(accessor)
         views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": data.nbytes, "target": VERTICES})
         buffer += data.tobytes()
-
-    # The scene.
     extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     attributes = {name: i for i, name in enumerate(columns)}
@@ -97,7 +94,6 @@ def write_gaussians(
         "bufferViews": views,
         "buffers": [{"byteLength": len(buffer)}],
     }
-
     # Chunks: JSON padded by blanks, then the buffer.
     text = json.dumps(content, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

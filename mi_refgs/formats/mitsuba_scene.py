@@ -39,7 +39,6 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     The parameters of `principled` are those of a run: its specular 0.5 reflects 0.04 at normal incidence.
     Only the base colour of dielectrics is lower by 4 to 8 %, because `principled` has another diffuse base.
     """
-    # Mesh, textures and light
     made = bake(trained, shots, faces, texture)
     make_folder(target)
     mesh = trimesh.Trimesh(made.vertices, made.faces, vertex_normals=made.normals, process=False)
@@ -50,8 +49,6 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     for name in ("roughness", "metallic"):
         write_png(target / TEXTURES[name], getattr(made, name))
     made.light.write(target / LIGHT)
-
-    # The scene file
     scene = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(scene, "default", name="spp", value=str(SAMPLES))
     integrator = ElementTree.SubElement(scene, "integrator", type="path")

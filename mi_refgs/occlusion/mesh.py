@@ -69,8 +69,9 @@ def extract_mesh(tsdf: TSDF) -> Mesh:
     return clean(vertices, faces, tsdf.voxel)
 
 
-def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> Mesh:
-    """Keep the large closed components, without inner walls, degenerate triangles and unused vertices."""
+def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = False) -> Mesh:
+    """Keep the large closed components, without inner walls, degenerate triangles and unused vertices; with
+    `open_` all that are large."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.update_faces(mesh.area_faces > 0)
     if not len(mesh.faces):
@@ -79,7 +80,8 @@ def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> Mesh:
     area = np.bincount(label, weights=mesh.area_faces)
     corners = mesh.triangles - mesh.vertices.mean(axis=0)
     volume = np.bincount(label, weights=np.linalg.det(corners))
-    keep = (area >= COMPONENT_KEEP * area[volume > 0].max(initial=0)) & (volume > 0)
+    solid = (volume > 0) | open_
+    keep = (area >= COMPONENT_KEEP * area[solid].max(initial=0)) & solid
     mesh.update_faces(keep[label])
     mesh.remove_unreferenced_vertices()
     return Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), voxel)

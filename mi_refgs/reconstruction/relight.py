@@ -62,17 +62,12 @@ def relight(
 ) -> dict[str, Any]:
     """Render the scene of a run under another light into a folder; return the content of relight.json.
 
-    `out` is RUN/relight/NAME by default, with the rotation and the exposure in its name if they are set.
-
-    Only materials of the scene stay (`runs.relightable`): diffuse light is the new light's irradiance, with
-    the mesh's shadows and bounces; reflections are traced. The views are the test views of the run's data
-    set, or of `data`; with `turntable`, so many cameras on a circle around the object instead. Without a data
-    set both are around the object (`Provenance.shots`). If the data set has ground truth under this light
-    (`truth_under`), the test views are compared with it.
-
-    Raises InputError for a run without light or materials, a light or a data set that cannot be read, and a
-    folder that cannot be written or has other files.
-    """
+    `out` is RUN/relight/NAME by default. Only materials stay (`runs.relightable`): diffuse light is the new
+    light's irradiance with the mesh's shadows and bounces; reflections are traced. The views are the test
+    views of the run's data set, or of `data`; with `turntable`, so many cameras on a circle instead; without
+    data both are around the object. Test views are compared with ground truth under this light
+    (`truth_under`), if any. Raises InputError for a run without light or materials, a light or a data set
+    that cannot be read, and a folder that cannot be written or has other files."""
     # The views, and the ground truth under this light.
     fitted = load(run.path)
     fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
@@ -85,8 +80,6 @@ def relight(
         relit = fitted.relight(light)
     except InputError as error:
         raise error.at(run.path) from None
-
-    # The folder.
     name = light.path.stem if true_views is None else light.path.parent.name
     name += f"_r{light.rotate:g}" if light.rotate % 360 else ""
     name += f"_e{light.exposure:+g}" if light.exposure else ""
@@ -98,8 +91,6 @@ def relight(
     images = [f"{kind}_{i:03d}.png" for i in range(len(cameras))]
     for stale in folder.glob(f"{kind}_*.*"):  # of more views, or another data set
         stale.unlink()
-
-    # Files of the scene and its images.
     export(relit.trained, folder, cameras[0])
     ours = []
     jobs = list(zip(images, cameras, strict=True))
@@ -107,8 +98,6 @@ def relight(
         ours.append(relit.render(camera, samples=samples))
         write_exr((folder / image).with_suffix(".exr"), ours[-1])
         write_png(folder / image, straight_srgb(ours[-1]))
-
-    # The score, and the sheet.
     colour = BACKGROUNDS[provenance.method.data.background]
     background = np.full(3, colour, np.float32) if views is None else views.background
     reason = NO_DATA if views is None else "a turntable has no ground truth" if turntable else NO_TRUTH

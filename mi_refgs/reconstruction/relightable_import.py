@@ -48,16 +48,11 @@ def import_relightable(
 ) -> Reconstruction:
     """Fit materials, normals and an environment map to views of a PLY file of 3DGS or 2DGS.
 
-    Views from all around are rendered by the formulas of the file and written as a data set, the folder
-    `data` of the run folder `output`; training views and test views are different ones.
-
-    linear, box: as in `import_splats`. cameras: of the views, in place of those around the object; every
-    eighth is a test view. method: as in `fit`, by default the method for relighting. preset, resume,
-    progress: as in `fit`; the preset also chooses the size of the views.
-
-    Raises InputError for a file that `import_splats` refuses or that shows no free object, for a folder with
-    another run or foreign files, and as `fit` does.
-    """
+    Views from all around, rendered by the formulas of the file, become a data set, the folder `data` of the
+    run folder `output`. linear, box: as in `import_splats`. cameras: of the views; every eighth is a test
+    view. method: as in `fit`, by default that for relighting. preset, resume, progress: as in `fit`; the
+    preset also chooses the size of the views. Raises InputError for a file that `import_splats` refuses or
+    that shows no free object, for a folder with another run or foreign files, and as `fit` does."""
     path, run = Path(path), Run(output)
     if method is None and not (resume and run.exists()):
         method = methods.for_purpose(PURPOSE)

@@ -1,10 +1,8 @@
-"""Ground truth from a Mitsuba scene: materials of its BSDFs at surface points, and its surface as a mesh.
+"""Ground truth from a Mitsuba scene: materials of its BSDFs at surface points (RULES), its surface as a mesh.
 
-Which of them a BSDF defines follows from the names of its parameters, see RULES. Albedo is the reflectance of
-the diffuse base, or F0 of a metal; the base of a nonlinear plastic multiplies the light inside by
-ρ (1 - Fᵢ) / (1 - ρ Fᵢ). Roughness is √α, for an anisotropic metal of the geometric mean of both; that of
-`diffuse` is undefined. Everything else (glass, hair, measured, a `principled` that transmits) is unknown.
-"""
+Albedo is the reflectance of the diffuse base, or F0 of a metal; the base of a nonlinear plastic multiplies
+the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). Roughness is √α, for an anisotropic metal of the geometric mean;
+that of `diffuse`, and all of glass, hair, measured and transmitting `principled` BSDFs, is unknown."""
 
 from __future__ import annotations
 

@@ -65,15 +65,11 @@ def make_dataset(
     """Path-trace a data set of a Mitsuba scene into the folder `out`, which is returned.
 
     Cameras are on a sphere around the scene's bounding sphere and look at its centre, z up, evenly spread
-    over the band of elevations. The pixel filter is a box, and emitters are hidden from the camera (alpha 0).
-
-    `options`: those of `DatasetOptions`, such as `views`, `size`, `spp`.
+    over the band of elevations. `options`: those of `DatasetOptions`, such as `views`, `size`, `spp`.
     `relight`: maps (or one) under which the test views are traced again, each in a folder of its name.
-    `overwrite`: remove the views in the folder.
-
-    A folder that the same settings left unfinished is continued. A Dr.Jit variant must be set. Raises
-    InputError for options, scenes and lights that cannot be used, and for a folder with other files.
-    """
+    `overwrite`: remove the views in the folder; else one that the same settings left unfinished is continued.
+    A Dr.Jit variant must be set. Raises InputError for options, scenes and lights that cannot be used, and
+    for foreign files."""
     # Settings.
     scene, out = Path(scene), Path(out)
     known = [field.name for field in fields(DatasetOptions)]
@@ -83,7 +79,6 @@ def make_dataset(
     given.check(scene)
     lights = [relight] if isinstance(relight, str | Path) else relight
     settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
-
     # The scene under each light, and its surface.
     loaded = load_scene(scene, whole=bool(given.objects))
     named = {shape.id(): shape for shape in loaded.shapes() if shape.id()}
@@ -98,8 +93,6 @@ def make_dataset(
     except InputError as error:
         raise error.at(file=scene) from error
     relit = [under_light(loaded, other.path, about) for other in others]
-
-    # Cameras.
     centre, radius = bounding_sphere(shapes)
     cameras = Cameras(given, centre, radius, reach(loaded.shapes(), centre) if about else radius, about)
     x, y, z = (float(c) for c in centre)
@@ -107,8 +100,6 @@ def make_dataset(
     if about and cameras.distance[0] <= region.radius:
         what = f"{cameras.distance[0]:.4g} is inside of the region around the object"
         raise InputError(f"{what}, whose radius is {region.radius:.4g}", scene, "--distance", "give more")
-
-    # Output.
     prepare_folder(out, settings, overwrite, others)
     if about:
         write_region(out, region)

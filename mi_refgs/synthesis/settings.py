@@ -96,7 +96,6 @@ def prepare_folder(
         found = content if "scene_sha256" in content else {}  # runs also have a dataset.json
     if not found and out.is_dir() and any(out.iterdir()):
         raise InputError("not empty, and no data set of this command", out, "output", "choose another folder")
-
     # Files that do not match the settings or a light, and the options that say so.
     changed = [*dict.fromkeys(_option(name) for name in wanted if found and found.get(name) != wanted[name])]
     stale = [*FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in FILES)] if changed else []
@@ -108,8 +107,6 @@ def prepare_folder(
     if changed and not overwrite:
         remedy = "give another folder, the same settings, or --overwrite"
         raise InputError("the folder contains another data set", record, ", ".join(changed), remedy)
-
-    # Remove them, make the folders, and record the settings.
     lights |= {light.name: light.sha256 for light in relight}
     for file in (path for pattern in stale for path in out.glob(pattern)):
         file.unlink()

@@ -145,12 +145,9 @@ class RenderLoop:
             pose, window, look = client.pose, client.window, self.look
         assert pose is not None
         begin = self.clock()
-
-        # Resolution level, and progress after this sample.
         still = resolution.still_side(*window, look.largest)
         side = min(client.side, still) if before == NOTHING else still
         progress = before + 1 if before >= LARGE else LARGE if side >= still else COARSE
-
         # One sample per pixel, added to those before.
         width, height = resolution.size_of(side, resolution.shape_of(*window))
         offset = resolution.offset_of(progress - LARGE) if progress >= LARGE else (0.0, 0.0)
@@ -158,7 +155,6 @@ class RenderLoop:
         planes, distance = self.scene.draw(camera, look, progress >= LARGE)
         sums = [a + b for a, b in zip(sums, planes, strict=True)] if sums else planes
         dr.eval(sums)
-
         shown = None  # the mean as an image
         if progress in SHOWN_AT:
             share = dr.opaque(type(sums[0]), 1 / max(progress - COARSE, 1))

@@ -81,7 +81,6 @@ class Page:
         self.status: Callable[[str], None] = lambda text: None  # set by a panel
         self._overlays: set[str] = set()  # that are displayed and need depth
         self._told = 0.0  # time of the last status
-
         # An image for a page that has been closed meanwhile is no problem.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         with guarded(host), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner

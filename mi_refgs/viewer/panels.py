@@ -199,7 +199,6 @@ def write_view(
         shown = image_array(displayed_planes(planes, look, scene.depths(pose)), height, width)
         alpha = image_array(planes[-1], height, width)[..., None]
         values = np.concatenate([values, alpha], axis=-1)
-
     make_folder(folder)
     stems = (f"view_{number:03d}" for number in itertools.count())
     stem = next(stem for stem in stems if not any(folder.glob(f"{stem}.*")))
