@@ -32,9 +32,14 @@ BOUNDED = {
 
 @pytest.mark.parametrize("name", BOUNDED)
 def test_a_command_without_memory_is_refused_in_one_sentence(
-    name: str, data: Path, finished: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    data: Path,
+    finished: Path,
+    method: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.setattr(memory, "available", lambda: 0.0)
     monkeypatch.setattr(memory, "resident", lambda: 1e3)
     places = {"DATA": data, "RUN": finished, "OUT": tmp_path, "SCENE": resource_dir("scenes") / "diffuse.xml"}

@@ -71,9 +71,13 @@ def covering_array(
 
 
 def _candidate(
-    first: Combination, dimensions: Dimensions, rules: Sequence[Rule], strength: int,
-    missing: Mapping[Combination, None], rng: random.Random,
-) -> tuple[Case, list[Combination]]:  # fmt: skip
+    first: Combination,
+    dimensions: Dimensions,
+    rules: Sequence[Rule],
+    strength: int,
+    missing: Mapping[Combination, None],
+    rng: random.Random,
+) -> tuple[Case, list[Combination]]:
     """A case with `first`, and the missing combinations that it covers."""
     partial, place = dict(first), {name: i for i, name in enumerate(dimensions)}
 

@@ -28,7 +28,7 @@ from tests.laws.law_scenes import (
     Scene,
     random_scene,
     rotated,
-)  # fmt: skip
+)
 from tests.scenes.integrator import plane_mesh, sky
 
 SETTINGS: dict[str, dict[str, Any]] = {

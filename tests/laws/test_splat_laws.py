@@ -23,7 +23,7 @@ from tests.laws.law_scenes import (
     draw,
     gradients,
     random_scene,
-)  # fmt: skip
+)
 
 EXACT = 2e-6  # between images of the same float32 arithmetic, but for fused operations and equal sums' order
 GRADIENT = 1e-4  # relative L2 between gradients: sums by scatter come in any order

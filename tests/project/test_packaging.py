@@ -35,8 +35,11 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the sdist, and the wheel that was built of the sdist; without a network, from a copy."""
     source = tmp_path_factory.mktemp("source") / "checkout"
     made = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*_cache", ".hypothesis")
-    shutil.copytree(ROOT, source, ignore=lambda folder, names: made(folder, names)
-                    | (LEFT_OUT if Path(folder) == ROOT else set()))  # fmt: skip
+    shutil.copytree(
+        ROOT,
+        source,
+        ignore=lambda folder, names: made(folder, names) | (LEFT_OUT if Path(folder) == ROOT else set()),
+    )
     target = tmp_path_factory.mktemp("dist")
     done = run_process("-m", "build", "--no-isolation", "-o", target, ".", folder=source, package=source)
     assert done.returncode == 0, done.stdout + done.stderr

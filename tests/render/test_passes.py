@@ -34,7 +34,7 @@ from tests.scenes.integrator import (
     scene,
     sensor,
     sky,
-)  # fmt: skip
+)
 
 FEW = 512  # samples of a pass in these tests: two rows of pixels or more of 4 × 4 samples
 SHADINGS = {

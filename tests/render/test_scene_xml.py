@@ -33,7 +33,7 @@ from tests.scenes.integrator import (
     raw_channels,
     sensor,
     sky,
-)  # fmt: skip
+)
 
 
 def shading_with(option: str) -> Shading:

@@ -32,9 +32,13 @@ def model_of(shots: list[Shot], camera: str, values: tuple[float, ...]) -> Model
 
 
 def _write(
-    contents: Callable[[Model], dict[str, bytes]], ending: str, model: Path, shots: list[Shot],
-    camera: str = MODEL, values: tuple[float, ...] = VALUES,
-) -> None:  # fmt: skip
+    contents: Callable[[Model], dict[str, bytes]],
+    ending: str,
+    model: Path,
+    shots: list[Shot],
+    camera: str = MODEL,
+    values: tuple[float, ...] = VALUES,
+) -> None:
     model.mkdir(parents=True, exist_ok=True)
     for name, content in contents(model_of(shots, camera, values)).items():
         (model / f"{name}.{ending}").write_bytes(content)

@@ -31,7 +31,7 @@ from tests.scenes.splats import (
     loss_weights,
     make_gaussians,
     make_scene,
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
