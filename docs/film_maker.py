@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from gallery_maker import write_turntable
 
-from benchmarks.viewer import choose, first_picture, opened
+from benchmarks.viewer import first_picture, opened
 
 WINDOW = "1000x640"  # pixels of the page
 STEP_SECONDS = 0.12  # of the film, per frame
@@ -51,6 +51,13 @@ def scenes(page: Any) -> Iterator[None]:
     yield from typed(page, "Turn", np.arange(20, 241, 20))
     yield from typed(page, "Roughness", np.linspace(0.2, 0.6, 5))
     yield from orbited(page, 6)
+
+
+def choose(page: Any, label: str, value: str) -> None:
+    """Choose in a drop-down."""
+    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]")
+    row.locator("input").first.click()
+    page.get_by_role("option", name=value, exact=True).click()
 
 
 def orbited(page: Any, count: int) -> Iterator[None]:

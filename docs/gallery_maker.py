@@ -122,7 +122,6 @@ EXHIBITS: dict[str, Exhibit] = {
         {
             "red": {"set": ["albedo=0.6,0.05,0.04"]},
             "gold": {"set": ["metallic=1", "albedo=1.0,0.77,0.34", "roughness=0.15"]},
-            "two": {"duplicate": [0.0, 0.0, 0.7]},
         },
     ),
 }

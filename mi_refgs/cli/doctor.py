@@ -6,7 +6,7 @@ import importlib.metadata
 import platform
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -56,7 +56,7 @@ def examine() -> dict[str, Any]:
         "cuda": cuda,
         "threads": int(dr.thread_count()),
         "extras": {name: _version(distribution) for name, distribution in EXTRAS.items()},
-        "problems": [] if problem is None else [asdict(problem)],
+        "problems": [] if problem is None else [problem._asdict()],
     }
 
 

@@ -27,6 +27,12 @@ class Statistic:
     sd: float | None
     values: tuple[float, ...]
 
+    @staticmethod
+    def of(values: Sequence[float]) -> Statistic:
+        """Return the statistic of at least one value."""
+        sd = statistics.stdev(values) if len(values) > 1 else None
+        return Statistic(statistics.fmean(values), sd, tuple(map(float, values)))
+
 
 @dataclass
 class Row:
@@ -131,8 +137,7 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
     for column in COLUMNS:
         values = [m[column.key] for m in found]
         if values and all(value is not None for value in values):
-            sd = statistics.stdev(values) if len(values) > 1 else None
-            row.numbers[column.key] = Statistic(statistics.fmean(values), sd, tuple(map(float, values)))
+            row.numbers[column.key] = Statistic.of(values)
             continue
         row.numbers[column.key] = None
         reasons = [m.get(f"{column.reason}_reason") for m in found if m[column.key] is None]

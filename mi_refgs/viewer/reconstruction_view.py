@@ -14,7 +14,7 @@ from mi_refgs.data.region import Region
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.render.samples import supersampled
+from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import update_occluder_caches
@@ -25,7 +25,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.viewer.resolution import GRID, SAMPLES
+from mi_refgs.viewer.resolution import SAMPLES
 from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, ViewerScene, backdrops_of
 
 Change = Callable[[TrainedScene], TrainedScene]
@@ -127,11 +127,12 @@ class ReconstructionView(ViewerScene):
             rendered = SurfelScene(scene.surfels, shading, *given)
             return render(rendered, camera, Request(look.aovs, forward_only=True))
 
-    def fine(self, camera: Camera, look: DisplayOptions) -> Frame:
+    def fine(self, camera: Camera, look: DisplayOptions, samples: int = SAMPLES) -> Frame:
         """Render an image to save as `refgs render` does, in passes that fit into memory."""
 
         def averaged(view: Camera) -> Frame:
-            return supersampled(lambda fine: self.frame(fine, look, True), view, SAMPLES)
+            return supersampled(lambda fine: self.frame(fine, look, True), view, samples)
 
+        factor = samples_per_axis(samples)
         with dr.suspend_grad():
-            return in_passes(averaged, camera, GRID, self.scene.shading.neighbours, self.scene.count)
+            return in_passes(averaged, camera, factor, self.scene.shading.neighbours, self.scene.count)

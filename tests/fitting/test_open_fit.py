@@ -465,7 +465,12 @@ def test_images_without_alpha_have_a_method_of_their_own(
     said: list[str] = []
     monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("an image was decoded"))
     reads, read = list[str](), READERS.values
-    monkeypatch.setattr(READERS, "values", lambda: reads.append("") or read())
+
+    def counted() -> object:
+        reads.append("")
+        return read()
+
+    monkeypatch.setattr(READERS, "values", counted)
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
     assert method.name == without and bool(said) == (without != purpose)
     assert len(reads) == 1 and views.split == "train"

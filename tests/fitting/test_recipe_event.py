@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -83,7 +84,7 @@ def test_a_registered_event_happens(file: str, tmp_path: Path, one_thread: None)
     assert again.fit.occluder.vertex_surfels is None
     for parent in (rows + 1, rows[:-1]):
         wrong = TableEdit(again.surfels, parent, np.zeros(115, bool))
-        refused(lambda edit=wrong: table.apply(edit), "115 surfels", "parent")
+        refused(partial(table.apply, wrong), "115 surfels", "parent")
 
 
 def test_other_tables_are_refused(file: str) -> None:

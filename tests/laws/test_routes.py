@@ -24,7 +24,7 @@ from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import FORMATS, Shot
 from mi_refgs.io.exr import read_exr
 from mi_refgs.methods import read
-from mi_refgs.plugins.aovs import suffixes
+from mi_refgs.plugins.aovs import suffixes, values_of_planes
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.scene_xml import put
@@ -41,7 +41,7 @@ from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.viewer_scene import BACKGROUND, IMAGE, DisplayOptions, planes_of, values_of
+from mi_refgs.viewer.viewer_scene import BACKGROUND, IMAGE, DisplayOptions, planes_of
 from tests.laws.covering import covering_array, marked
 from tests.scenes.integrator import (
     OTHER_OPTIONS,
@@ -197,7 +197,8 @@ def by_viewer_of_a_run(case: Case) -> Maps:
             planes, _ = drawable.draw(camera, look, True)
         else:
             planes = planes_of(drawable.fine(camera, look, case.samples), camera, look, None)
-        found[what] = image_array(values_of(planes, what), HEIGHT, WIDTH)
+        values = planes if what == IMAGE else values_of_planes(what, planes)
+        found[what] = image_array(values, HEIGHT, WIDTH)
     return case.of_whole(found)
 
 

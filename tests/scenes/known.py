@@ -53,7 +53,7 @@ def write_known_data(folder: Path, spp: int = 64) -> Path:
         '<transform name="to_world"><rotate x="1" angle="90"/></transform></emitter>'
         f"{''.join(balls)}</scene>"
     )
-    spec = {"views": 2, "test_views": 3, "size": SIZE, "spp": spp, "environment_height": 32}
+    spec: dict[str, Any] = {"views": 2, "test_views": 3, "size": SIZE, "spp": spp, "environment_height": 32}
     lights = [folder / "dusk.exr"]
     return make_dataset(folder / "balls.xml", folder / "data", relight=lights, progress=False, **spec)
 

@@ -40,7 +40,7 @@ class Primitive:
 
     name: str
     make: Callable[[int], Scene]
-    exact: type
+    exact: Any
     image: float  # tolerance
     gradient: float  # relative L2
 
