@@ -1,7 +1,6 @@
 """Choice of a libLLVM that Dr.Jit can use, before Dr.Jit loads one by itself.
 
-LLVM 15 and 16 load, but abort the process at the first kernel that takes a minimum. `select` names the
-newest usable library in DRJIT_LIBLLVM_PATH, `problem` checks what Dr.Jit loaded. Only the standard library is
+LLVM 15 and 16 abort the process at the first kernel that takes a minimum. Only the standard library is
 imported at the top: the set-up script runs `python -P mi_refgs/llvm.py` before anything is installed.
 """
 
@@ -16,8 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-MINIMUM_MAJOR = 17
-"""Oldest LLVM whose x86-64 back end compiles llvm.minimum and maximum (llvm-project issues 53353, 67301)."""
+MINIMUM_MAJOR = 17  # oldest with llvm.minimum on x86-64 (llvm-project issues 53353, 67301)
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _SUDO = "sudo " if sys.platform == "linux" and os.geteuid() != 0 else ""

@@ -14,8 +14,7 @@ from mi_refgs.io.files import check_size, replace_file, require_file
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"  # first bytes of every EXR file
 SAMPLE_BYTES = 2  # bytes per sample at least: those of half floats; integers and floats have 4
-SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
-"""x, y of red, green, blue and white (ITU-R BT.709); the default of EXR files."""
+SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of R, G, B, white (BT.709)
 CHROMATICITY_TOLERANCE = 1e-3  # half the last digit in standards
 MITSUBA_EXR_THREADS = 2  # Mitsuba 3.9 uses a worker thread for EXR files: with one in all, it never returns
 

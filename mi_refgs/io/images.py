@@ -18,7 +18,6 @@ from mi_refgs.io.files import check_size, is_file, replace_file, require_file
 SRGB_LINEAR_LIMIT = 0.0031308  # linear value below which the sRGB curve is a straight line (IEC 61966-2-1)
 SRGB_ENCODED_LIMIT = 0.04045  # the same point after encoding
 ALPHA_FLOOR = 1e-8  # alpha by which radiance is divided at least
-
 ENDINGS = (".png", ".jpg", ".jpeg")  # of 8-bit images, in the order in which they are tried
 EXIF_IFD = 0x8769  # tag of the table of camera settings (EXIF 2.3)
 PSNR_MAX = 100.0  # dB, of identical images: JSON has no infinity

@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 
-TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0
-"""Seconds between refreshes of a bar, in a terminal and in a file."""
+TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0  # seconds between refreshes of a bar: in a terminal, in a file
 
 
 def say(message: str) -> None:

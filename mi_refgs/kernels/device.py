@@ -18,8 +18,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 
-LOOK_AHEAD = 64
-"""Elements that kernels read beyond the end of an array, at most: a SIMD vector of the widest machine."""
+LOOK_AHEAD = 64  # elements that kernels read beyond an array's end, at most: the widest SIMD vector
 ALIGNMENT = 64  # bytes of the widest SIMD vector
 
 

@@ -16,18 +16,9 @@ from mi_refgs.io.files import is_file, write_bytes
 from mi_refgs.io.ply import Header, read_header
 from mi_refgs.occlusion.tsdf import TSDF
 
-COMPONENT_KEEP = 0.1
-"""Area, relative to the largest connected component, from which a component is an object and not a floater.
-The released Ref-Gaussian code keeps the largest only, and loses one of two objects."""
-
-ZERO_NUDGE = 1e-3
-"""Distances closer to 0 than this (truncation units; 1/200 voxel) are moved away from it: a corner exactly on
-the surface makes triangles without area."""
-
-FOREIGN_RESOLUTION = 256
-"""Voxels along the bounding box's diagonal that a mesh made elsewhere counts as, about those of a fit: rays
-start 0.8 % of the diagonal off the surface, and walls closer to each other do not occlude."""
-
+COMPONENT_KEEP = 0.1  # area, relative to the largest component's, of an object rather than a floater
+ZERO_NUDGE = 1e-3  # least |distance| (truncations): corners on the surface make triangles without area
+FOREIGN_RESOLUTION = 256  # voxels along the diagonal of a mesh made elsewhere, about those of a fit
 FORMATS = ("ply", "obj", "stl", "off")  # file endings that `read_mesh` accepts
 VOXEL_COMMENT = "voxel_size"  # key of the PLY comment with the voxel size of the extraction
 

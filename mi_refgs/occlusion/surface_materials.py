@@ -19,10 +19,7 @@ from mi_refgs.types import Array, Bool, Color3f, Float, Point2f, UInt32, Vector3
 
 NEIGHBOURS = 4  # surfels per vertex: those that overlap at a point of a fitted surface with visible weight
 WEIGHT_FLOOR = 1e-6  # sum of weights below which a vertex takes the nearest surfel only
-NORMAL_AGREEMENT = 0.5
-"""Cosine between the neighbours' mean normal and the mesh's from which the neighbours' is used, which the fit
-has smoothed: at a rim they belong to another face."""
-
+NORMAL_AGREEMENT = 0.5  # cosine to the mesh's normal from which the neighbours' is used
 GROUP = 4  # columns that one access reads
 
 

@@ -24,15 +24,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Bool, Float, Int32, TensorXf
 
-ALPHA_SOLID = 0.5
-"""Opacity from which a pixel has a surface: half coverage, where a box filter has its silhouette."""
-
+ALPHA_SOLID = 0.5  # opacity from which a pixel has a surface: a box filter's silhouette
 TRUNCATION_VOXELS = 5.0  # of the signed distance. [Ref-Gaussian's released extraction; 2DGS, §6]
-
-UNSEEN_VOTE = 0.1
-"""A voxel is inside while it has at most this many sightings per view with a surface before it: pixels that
-leak through thin places drill no tunnels; 9 % of the views keep a cavity open."""
-
+UNSEEN_VOTE = 0.1  # sightings per view before a surface up to which a voxel stays inside: no tunnels
 RESOLUTION_MAX = 1023  # most voxels along one axis: three coordinates share one 32-bit word
 BOX_QUANTILE = 0.02  # fraction of the points per side and axis that may be floaters
 BOX_REACH = 0.25  # part of the quantiles' distance by which the box may grow beyond them: thin ends
@@ -75,10 +69,9 @@ def fuse(
     """Fuse depth maps into a signed distance field over `bounds`. [Curless and Levoy 1996; weights behind the
     surface: Bylow et al. 2013]
 
-    `resolution`: voxels along the longest side. Depths (expected camera z, scene units; not premultiplied)
-    and alphas are `mi.Float` or `mi.TensorXf` in raster order, read once: with generators only one view is in
-    memory. Pixels of alpha < ALPHA_SOLID are free space. Detached. Raises InputError for an empty box or a
-    resolution that does not fit.
+    `resolution`: voxels along the longest side. Depths (expected camera z, scene units) and alphas are
+    `mi.Float` or `mi.TensorXf` in raster order, read once; alpha < ALPHA_SOLID is free space. Detached.
+    Raises InputError for an empty box or a resolution that does not fit.
     """
     lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
     extent = hi - lo

@@ -16,9 +16,7 @@ from mi_refgs.occlusion.surface_materials import Surface, VertexColours, VertexS
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Array, Bool, Float, Point2f, Point3f, Scene, UInt32, Vector3f
 
-OFFSET_VOXELS = 2.0
-"""Voxels by which a ray's origin leaves the surface along the normal: more than the errors of the mesh (0.4
-voxel) and of the depth. At 1 voxel, a quarter of the rays of points 1 voxel too deep is falsely occluded."""
+OFFSET_VOXELS = 2.0  # of a ray's origin off the surface: above the mesh's error (0.4) and the depth's
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,7 @@
 """The Mitsuba plugins, and how they follow Mitsuba from variant to variant.
 
-Each variant has base classes of its own. A module that defines and registers a plugin at module scope is
-therefore imported, or reloaded, whenever the variant changes: by `load`, which `import mi_refgs` connects to
-Mitsuba's variant callback, and from Mitsuba 3.10 on also through the entry point in pyproject.toml. Being
-loaded twice is harmless. Never import such a module before a variant is set, nor classes from it.
+Each variant has base classes of its own, so a plugin's module is imported or reloaded whenever it changes, by
+`load` (and Mitsuba 3.10's entry point). Never import it before a variant is set, nor classes from it.
 """
 
 from __future__ import annotations

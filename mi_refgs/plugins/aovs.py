@@ -78,8 +78,7 @@ def values_of_planes(kind: str, planes: list[Float]) -> list[Float]:
     return _finished(kind, values, weight)
 
 
-PREMULTIPLIED = (*TERMS, "alpha", "normal")
-"""Types that are premultiplied in a frame. All others are divided by alpha or the opacity of the object."""
+PREMULTIPLIED = (*TERMS, "alpha", "normal")  # in a frame; others are divided by alpha or the object's
 
 
 def _weighted(kind: str, frame: Frame, camera: Camera) -> tuple[list[Float], Float]:

@@ -16,9 +16,7 @@ from mi_refgs.shade.brdf import device_table, split_sum
 from mi_refgs.shade.reflectance.split_sum import DIELECTRIC_F0
 from mi_refgs.types import Color3f, Float
 
-ROUGHNESS_FLOOR = 0.01
-"""Least roughness: α = 1e-4 is the smallest that Mitsuba samples; below it, reflectance changes by < 3e-5."""
-
+ROUGHNESS_FLOOR = 0.01  # α = 1e-4, Mitsuba's smallest; below, reflectance changes by < 3e-5
 SPECULAR, DIFFUSE = 0, 1  # indices of the components
 
 LOBES = mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DiffuseReflection

@@ -30,8 +30,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 
-CHECK_SECONDS = 1.0
-"""Least time between two checks for unusable values, each of which waits for the device."""
+CHECK_SECONDS = 1.0  # least time between checks for unusable values: each waits for the device
 
 
 class RefGSIntegrator(mi.SamplingIntegrator):

@@ -15,10 +15,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.types import Float
 
-NODE = 0.5 / math.sqrt(3)
-"""Distance of the points from the pixel's centre along each axis, pixels: nodes of the Gauss-Legendre rule,
-exact for radiance that is cubic in the position."""
-
+NODE = 0.5 / math.sqrt(3)  # pixels from the centre, per axis: Gauss-Legendre, exact for cubic radiance
 NODES = [(x, y) for y in (-1, 1) for x in (-1, 1)]  # quadrant of each point
 AROUND = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # steps to the neighbours
 

@@ -13,8 +13,7 @@ from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Bool, Float, Vector3f
 
-DEPTH_EDGE_COSINE = 0.2
-"""Cosine to the viewing ray below which a depth difference is a step between two surfaces, not a slope."""
+DEPTH_EDGE_COSINE = 0.2  # to the viewing ray; below, a depth difference is a step, not a slope
 
 
 def normals_from_depth(depth: Float, alpha: Float, camera: Camera) -> tuple[Vector3f, Bool]:

@@ -18,9 +18,7 @@ from mi_refgs.surfels.table import Surfels
 
 MARGIN = 2  # pixels of a cube face beyond its edges, so that interpolation never leaves an image
 SURFACE = 0.5  # opacity from which a pixel shows a surface
-LARGEST = 0.2
-"""Standard deviation over distance from the centre above which a Gaussian is left out: its projection would
-cover whole faces of the cube. Fits to rooms have few, 0.1 % of all."""
+LARGEST = 0.2  # deviation over distance above which a Gaussian is left out: it would cover cube faces
 
 
 @dataclass(frozen=True)

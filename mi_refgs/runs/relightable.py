@@ -27,8 +27,7 @@ from mi_refgs.shade.shading import RELIT_RAYS
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
-COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)
-"""Mean over a hemisphere, cosine-weighted, by SH degree. [Ramamoorthi and Hanrahan 2001, eq. 8, over π]"""
+COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)  # by SH degree. [Ramamoorthi and Hanrahan 2001, eq. 8, over π]
 IRRADIANCE_FLOOR = 1e-4  # of the brightest irradiance; darker surfels are dark whatever their albedo
 
 

@@ -41,8 +41,7 @@ CAMERAS = "cameras.json"  # the decision about camera corrections, and the corre
 LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
 LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
-CHECKPOINTS_KEPT = 2
-"""One could be enough, since checkpoints are written atomically; two survive a disk that loses writes."""
+CHECKPOINTS_KEPT = 2  # writes are atomic: two survive a disk that loses writes
 
 
 class Run:

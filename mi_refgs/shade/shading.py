@@ -19,8 +19,7 @@ from mi_refgs.shade.reflection import reflection
 UNTRACED: dict[str, Any] = {name: getattr(ShadingOptions, name) for name in ("occlusion", *TRACED)}
 
 RELIT_RAYS = {"visibility_rays": 16, "traced_bounces": 2, "ambient_rays": 128}
-"""Rays under another light. PSNR of two balls against path tracing: 33.6 dB with one ray, 34.4 with 16, 34.5
-with 64. In a self-reflecting bowl one bounce misses 27 % of the light, two 9 %, four 3 %."""
+"""Under another light: PSNR of two balls 33.6 dB with 1, 34.4 with 16; two bounces miss 9 % of a bowl."""
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,7 @@ class Camera:
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film; tiles are those of the film
     film: tuple[int, int] | None = None  # pixels, size of the film; None: the camera has all of it
     motion: Float | None = None
-    """(6,) zeros whose gradient is that of rotating the camera about its origin (3, radians about the world's
-    axes) and of moving it (3, scene units); None: without derivatives."""
+    """(6,) zeros under AD: rotation about the origin (radians, world axes), translation (scene units)."""
 
     @property
     def tile(self) -> tuple[int, int]:

@@ -11,8 +11,7 @@ import mitsuba as mi
 from mi_refgs.kernels.rows import ACCESS
 from mi_refgs.types import Bool, Float, UInt32
 
-COPIES_BYTES = 1 << 30
-"""Largest memory of the copies per thread that `PackedRows.add` makes; above it, additions are atomic."""
+COPIES_BYTES = 1 << 30  # most memory for copies per thread in `PackedRows.add`; above, additions are atomic
 
 
 @dataclass(frozen=True)

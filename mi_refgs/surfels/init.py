@@ -15,7 +15,6 @@ from mi_refgs.surfels.table import Surfels
 
 DISTANCE_FLOOR = 1e-4  # least distance of neighbours, in extents of the points: keeps the log scale finite
 NEIGHBOURS = 3  # their mean squared distance gives the scale [3DGS]
-
 MORTON_BITS = 10  # log₂ of the cells along an axis: they are smaller than the distance of surfels
 MORTON_OUTLIERS = 0.01  # fraction of points at either end of an axis that are put into the outermost cells
 

@@ -31,6 +31,5 @@ class LightKind:
 
 
 LIGHTS: Registry[type[LightKind]] = Registry("light")
-"""Every kind of light by name."""
 register = LIGHTS.register
 """Add a kind of light, which method files can name from then on."""

@@ -16,10 +16,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 LEVEL_ROUGHNESS = (0.1, 0.15, 0.22, 0.32, 0.45, 0.65, 1.0)
-"""Roughness of the filtered levels (level 0 is the map): a mixture of two neighbours is within 6 % (L1)
-of the lobe between them."""
-LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)
-"""Rows of each level, at most: lookups of a point light are off by 1.4 % (L1) from the third level on."""
+"""Of the filtered levels (level 0 is the map): mixtures of two are within 6 % (L1) of the lobe between."""
+LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)  # rows at most: 1.4 % (L1)
 DROP_BELOW = 1e-5  # of a level's largest entry; smaller ones are dropped: 0.05 % of a lobe (L1)
 HORIZON_CUTS = 0.5  # roughness from which a lobe ends at the horizon rather than before it
 MIN_SUBSAMPLES = 2  # quadrature points per texel side where the lobe is wider than a texel

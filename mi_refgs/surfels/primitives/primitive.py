@@ -160,7 +160,6 @@ def _check(primitive: Primitive) -> None:
 
 
 PRIMITIVES: Registry[Primitive] = Registry("primitive", _check)
-"""Every primitive by name."""
 
 
 def register(primitive: Primitive) -> Primitive:
