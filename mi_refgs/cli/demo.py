@@ -11,8 +11,7 @@ from mi_refgs.io.progress import say
 from mi_refgs.io.resources import resource_dir
 
 SCENE = "glossy_demo.xml"
-VIEWS, TEST_VIEWS, SIZE, SAMPLES = 60, 8, 112, 64
-"""Chosen for less than 8 minutes on two cores."""
+VIEWS, TEST_VIEWS, SIZE, SAMPLES = 60, 8, 112, 64  # chosen for less than 8 minutes on two cores
 
 
 @dataclass(frozen=True, kw_only=True)

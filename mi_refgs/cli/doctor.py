@@ -15,8 +15,7 @@ from tyro.conf import Positional
 from mi_refgs import llvm
 from mi_refgs.cli.command import Common, Result, optional
 
-PROBE_TIMEOUT = 60.0
-"""Time limit of the trial kernel in seconds; it usually takes half a second."""
+PROBE_TIMEOUT = 60.0  # time limit of the trial kernel in seconds; it usually takes half a second
 
 EXTRAS = {
     "lpips": "lpips",

@@ -18,8 +18,7 @@ from mi_refgs.cli.command import (
 from mi_refgs.errors import InputError, SceneError
 from mi_refgs.io.progress import say
 
-MOST_LISTED = 12
-"""Files that are named one by one; the default export writes 10."""
+MOST_LISTED = 12  # files that are named one by one; the default export writes 10
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -213,8 +213,7 @@ def read_dataset(
 
     Images are decoded by `View.load`. The region of interest is that of region.json, or without alpha the one
     that the training cameras look at. Positions far from the world's origin, as in UTM coordinates, are
-    relative to `Dataset.offset`. Raises InputError for anything missing, unreadable or inconsistent.
-    """
+    relative to `Dataset.offset`. Raises InputError for anything missing, unreadable or inconsistent."""
     path = Path(path)
     if background not in BACKGROUNDS:
         raise InputError(f"unknown value '{background}'", path, "background", "give white or black")

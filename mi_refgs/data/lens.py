@@ -6,8 +6,7 @@ With (x, y) = direction / depth and r² = x² + y², a lens distorts the image o
                   y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p2 x y + p1 (r² + 2 y²)
     fisheye       (x', y') = (x, y) θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) / r,  θ = atan r
 
-and to the pixel (fx x' + cx, fy y' + cy), where the centre of the first pixel is (½, ½).
-"""
+and to the pixel (fx x' + cx, fy y' + cy), where the centre of the first pixel is (½, ½)."""
 
 from __future__ import annotations
 

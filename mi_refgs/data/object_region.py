@@ -57,8 +57,7 @@ SPARSE = Scatter(0.01, 0.15)  # structure from motion: holds 98 % of the points 
 DENSE = Scatter(0.02, 0.08, 0.1)  # stereo: widths from 0.015, links to 0.1, lifts to 0.15 find the same
 FITTED = Scatter(0.1, 0.08)  # halfway through a fit, a varnished table is off by 0.1; 0.06 to 0.15 find it
 
-Seen = Callable[[np.ndarray], np.ndarray]
-"""Fraction (N,) of the views that show points (N, 3)."""
+Seen = Callable[[np.ndarray], np.ndarray]  # fraction (N,) of the views that show points (N, 3)
 
 
 def support_planes(

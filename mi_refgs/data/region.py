@@ -39,8 +39,7 @@ class Region:
     @staticmethod
     def of(content: object, source: Path | str) -> Region:
         """The region {"centre": [x, y, z], "radius": r, "planes": [[a, b, c, d], …]} of a JSON file or an
-        option, `source`; planes are optional. Raises InputError for anything else.
-        """
+        option, `source`; planes are optional. Raises InputError for anything else."""
         given: dict[str, Any] = content if isinstance(content, dict) else {}
         centre, remedy = _numbers(given.get("centre"), 3), "correct or remove them"
         radius = _numbers([given.get("radius")], 1)

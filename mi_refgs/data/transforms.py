@@ -6,8 +6,7 @@ Keys, per frame or for the whole file: `camera_angle_x` (radians) or `fl_x`, `ca
 `exr_path`, `normal_path` (X, Y, Z, world), `depth_path` (along the viewing axis), `albedo_path` (R, G, B, A),
 `roughness_path`, `metallic_path` (Y, A; A: defined there), and `mask_path` (bright: object). Without it and
 without alpha, the file of the image's name in `masks` is the mask. `ply_file_path` names points in the frame
-of the poses; `train_filenames` and `test_filenames` (or `val_filenames`) list the images of a split.
-"""
+of the poses; `train_filenames` and `test_filenames` (or `val_filenames`) list the images of a split."""
 
 from __future__ import annotations
 

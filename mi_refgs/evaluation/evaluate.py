@@ -64,8 +64,7 @@ def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples
     `caption`             scale, mask and frame of these numbers
 
     Renders have `samples` per pixel, box filtered (`render.samples`). Raises InputError for a folder that is
-    no run or contains neither a scene nor a checkpoint, and for data that is gone.
-    """
+    no run or contains neither a scene nor a checkpoint, and for data that is gone."""
     # The scene, its test views, and the files to write.
     method = run.method()
     views = views_of_run(run, method, "test", data)

@@ -28,8 +28,7 @@ projection. `rest`: all that no other covers."""
 
 WARM_UP = 4
 """Steps with barriers before the first measured one: a kernel that ends at a barrier is compiled anew."""
-NEAR_END = 100
-"""Steps before the end of a stage, where every SH degree is in use."""
+NEAR_END = 100  # steps before the end of a stage, where every SH degree is in use
 
 
 class PhaseClock:

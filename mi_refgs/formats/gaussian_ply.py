@@ -31,8 +31,7 @@ def write(
         x y z  nx ny nz  f_dc_0..2  f_rest_0..  opacity  scale_0..2  rot_0..3      little-endian float32
 
     Logits, logarithms and display-encoded colours, as in `surfels.ply`. The colours are fitted to renders of
-    the training views.
-    """
+    the training views."""
     write_ply(target, gaussians(trained, shots, degree, object))
     return [target]
 

@@ -11,8 +11,7 @@ direction d_iv from the camera to the Gaussian, the coefficients c minimise
     Σ_v Σ_p |Σ_i w_ip (½ + Y(d_iv)·c_i) - A_p e_p|²  +  Σ_i λ W_i Σ_lm l² |c_i,lm|²
 
 by conjugate gradients; W_i is the weight of a Gaussian in all views, l the degree of a coefficient. The
-preconditioner, whose solution is the first step, is the least-squares problem of each Gaussian by itself.
-"""
+preconditioner, whose solution is the first step, is the least-squares problem of each Gaussian by itself."""
 
 from __future__ import annotations
 

@@ -46,8 +46,7 @@ CameraLike: TypeAlias = "Camera | View | int | Any"
 class Reconstruction:
     """Surfels with materials, an environment map and a mesh, and how they were fitted.
 
-    Returned by `mi_refgs.fit`, `mi_refgs.load` and `mi_refgs.import_splats`.
-    """
+    Returned by `mi_refgs.fit`, `mi_refgs.load` and `mi_refgs.import_splats`."""
 
     trained: TrainedScene
     provenance: Provenance
@@ -119,8 +118,7 @@ class Reconstruction:
         """Render a camera (H, W, 4): linear RGB, premultiplied by alpha, and alpha.
 
         samples: samples per pixel; 4 are 2 × 2, box filtered, 1 is the pixel centre, as in training.
-        object_only: render without the background Gaussians; alpha is 1 everywhere with them.
-        """
+        object_only: render without the background Gaussians; alpha is 1 everywhere with them."""
         seen = self.camera(camera, size)
         frame = self._frame(seen, samples, object_only, aovs=False)
         radiance, alpha = composited(frame)
@@ -140,8 +138,7 @@ class Reconstruction:
         albedo, roughness, metallic (0 … 1) and unit normals (world, towards the camera) are those of the
         visible surface; depth is the distance along the ray from the near plane, scene units; diffuse,
         specular and indirect are premultiplied and sum to the image of the object over black. Raises
-        InputError for a name that is unknown or that the surfels do not have.
-        """
+        InputError for a name that is unknown or that the surfels do not have."""
         kinds = suffixes()
         for name in names:
             if name not in kinds:
@@ -177,8 +174,7 @@ class Reconstruction:
         `mi.traverse` of it lists the raw attributes (N, D) of the surfels, such as "refgs.roughness", and the
         raw environment map, "refgs.light": `mi.render(scene, params)` differentiates all of them. aovs:
         types, or name:type, appended to the image. Raises InputError for a camera that no Mitsuba sensor
-        represents, and unknown AOVs.
-        """
+        represents, and unknown AOVs."""
         several = cameras if isinstance(cameras, list | tuple) else [cameras]
         first, *more = map(self.camera, several)
         with tempfile.TemporaryDirectory(prefix="refgs_") as folder:
@@ -188,8 +184,7 @@ class Reconstruction:
     def save(self, folder: str | Path) -> Reconstruction:
         """Write a run folder without checkpoints, which every command reads, and load it.
 
-        It renders the same images, bit for bit. Raises InputError for a folder that has other files.
-        """
+        It renders the same images, bit for bit. Raises InputError for a folder that has other files."""
         source, camera = self.provenance, self.cameras()[0]
         records = source.records | ({EDITS: {"edits": source.edits}} if source.edits else {})
         options: dict[str, Any] = {"data": source.data, "region": source.region, "records": records}
@@ -201,8 +196,7 @@ class Reconstruction:
 
         `mi_refgs.formats.FORMATS` lists the formats and their options, as `refgs export --help` does. Raises
         InputError for an unknown format or option, a scene that the format cannot represent, a missing
-        package, and a path that cannot be written.
-        """
+        package, and a path that cannot be written."""
         shots = self.provenance.shots(self.trained, "test", "train")
         return formats.write(self.trained, [form], Path(path), shots, options, self.folder)[form]
 
@@ -217,8 +211,7 @@ class Reconstruction:
         row is straight up, along +z, unless it is in `world` directions already, as an `EnvironmentLight`,
         environment.exr and envmap.exr are. rotate: degrees about +z, counter-clockwise seen from above.
         exposure: stops. Raises InputError for a reconstruction without light or materials
-        (`runs.relightable`), a light that cannot be used, and options of a `NewLight`, which has its own.
-        """
+        (`runs.relightable`), a light that cannot be used, and options of a `NewLight`, which has its own."""
         scene = replace(relightable(self.trained), light=any_light(light, world, rotate, exposure))
         return self.changed(scene)
 
@@ -226,8 +219,7 @@ class Reconstruction:
         """Change some surfels, as `refgs edit` does; `provenance.edits[-1]` then records how many.
 
         options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}. Raises InputError for
-        options that cannot be used.
-        """
+        options that cannot be used."""
         edited = editing.edit(self.trained, **options)
         record = {"run": self.folder and str(self.folder), **edited.record}
         provenance = replace(self.provenance, edits=(*self.provenance.edits, record))
@@ -242,8 +234,7 @@ class Reconstruction:
     ) -> dict[str, Any]:
         """Measure the run on its test views, or on those of `data`, as `refgs eval` does.
 
-        Raises InputError for a reconstruction in memory, and as `evaluation.evaluate.evaluate` does.
-        """
+        Raises InputError for a reconstruction in memory, and as `evaluation.evaluate.evaluate` does."""
         if self.folder is None:
             raise InputError("only in memory", "evaluate", "folder", "measure what save(folder) returns")
         data = None if data is None else Path(data)
@@ -272,8 +263,7 @@ def import_splats(
     linear: its colours are linear radiance, as this package fits them; otherwise they are display-encoded, as
     3DGS and 2DGS write them. box: two corners (6,); surfels whose centre is outside are left out. It has
     neither light nor mesh, and its cameras are around the object, z up. Raises InputError for any other file,
-    a box without surfels, and without a supported Mitsuba variant.
-    """
+    a box without surfels, and without a supported Mitsuba variant."""
     require_supported_variant("mi_refgs.import_splats")
     trained = read_splats(Path(path), linear)
     if box is not None:

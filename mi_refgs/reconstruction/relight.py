@@ -5,8 +5,7 @@ turntable/t_000.png     or these, of cameras around the object
 scene.xml, surfels.ply, envmap.exr, mesh.ply, model.json    from which `mi.load_file` renders the same
 relight.json            the settings, and the score where the data set has ground truth under this light
 sheet.png               relit images and the ground truth; and the environment map
-turntable/relight.json, sheet.png    the same of a turntable, with the frames
-"""
+turntable/relight.json, sheet.png    the same of a turntable, with the frames"""
 
 from __future__ import annotations
 

@@ -16,8 +16,7 @@ A data set folder contains
     dataset.json       the settings, which decide whether a folder may be resumed; and other environment maps
 
 An open scene is an object in its surroundings: images are RGB without alpha, maps and surface are those of
-the object only, and so are relit views, which have alpha.
-"""
+the object only, and so are relit views, which have alpha."""
 
 from __future__ import annotations
 

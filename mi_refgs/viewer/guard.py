@@ -15,10 +15,8 @@ from urllib.parse import urlsplit
 from websockets.asyncio import server as websockets_server
 from websockets.datastructures import Headers
 
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
-"""Names of this machine that only it can use."""
-MESSAGE_BYTES = 2**20
-"""Largest message: viser's script sends files in parts of half of it."""
+LOOPBACK = ("localhost", "127.0.0.1", "::1")  # names of this machine that only it can use
+MESSAGE_BYTES = 2**20  # largest message: viser's script sends files in parts of half of it
 
 
 def refusal(headers: Headers, own: str) -> str | None:

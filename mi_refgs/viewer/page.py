@@ -25,8 +25,7 @@ from mi_refgs.viewer.viewer_scene import ViewerScene
 
 MOVING_JPEG, STILL_JPEG = 70, 92
 """JPEG qualities during motion, and at rest until the supersampled image, a PNG."""
-STATUS_INTERVAL = 0.5
-"""Seconds between updates of the status line."""
+STATUS_INTERVAL = 0.5  # seconds between updates of the status line
 START_DISTANCE, START_FOV = 2.5, math.radians(40)
 """Of the first camera without a data set: in radii of the object, vertical field of view."""
 

@@ -28,12 +28,10 @@ from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import FINEST, SAMPLES, SIDES
 from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, displayed_planes, planes_of
 
-STOPS = 6.0
-"""Largest exposure either way."""
+STOPS = 6.0  # largest exposure either way
 FRUSTUM, THICKNESS = 0.08, 1.5
 """Size of a camera's frustum, in radii of the object, and thickness of its lines, pixels."""
-COLOURS = {"train": (90, 160, 255), "test": (255, 160, 60)}
-"""Colours of the frusta by split."""
+COLOURS = {"train": (90, 160, 255), "test": (255, 160, 60)}  # colours of the frusta by split
 
 
 def add_display(page: Page) -> None:

@@ -18,8 +18,7 @@ from mi_refgs.viewer.page import Page
 
 RADII, STEPS = (0.1, 3.0), 100
 """Smallest and largest radius of the slider, in the first radius, and steps of a slider per radius."""
-OPPOSITE = 1e-6
-"""Difference of unit normals up to which planes are opposite sides of a box."""
+OPPOSITE = 1e-6  # difference of unit normals up to which planes are opposite sides of a box
 
 
 class RegionPanel:

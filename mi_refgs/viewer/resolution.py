@@ -11,14 +11,12 @@ COARSEST, FINEST = SIDES[0], SIDES[6]
 """The coarsest level, and the finest unless the user chooses a finer one: 1.28 million pixels."""
 SHAPES = (0.625, 1.0, 1.6, 2.5)
 """Aspect ratios, width over height. Between two of them pixels are oblong by up to 1.26."""
-MULTIPLE = 4
-"""Width and height are multiples of this, the smallest tile."""
+MULTIPLE = 4  # width and height are multiples of this, the smallest tile
 
 STILL_AFTER, SMOOTH_AFTER = 0.15, 0.4
 """Seconds without a change after which an image is drawn large, and after which it is supersampled."""
 GRID = 4
-SAMPLES = GRID * GRID
-"""Of a supersampled image: a raster of GRID × GRID per pixel, as in `render.samples`."""
+SAMPLES = GRID * GRID  # of a supersampled image: a raster of GRID × GRID per pixel, as in `render.samples`
 SLOW, FAST = 1 / 22, 1 / 60
 """Seconds per image during motion above and below which the next image is a level coarser, or finer."""
 

@@ -21,12 +21,9 @@ from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, ViewerScene, bac
 if TYPE_CHECKING:
     from mi_refgs.fitting.train import Trainer
 
-SHARE = 0.25
-"""Part of the time that images may take while a page is open."""
-REFRESH = 2.0
-"""Seconds between displays of the present state of the fit."""
-LARGEST = 400
-"""Finest resolution level: a usual fit has smaller images."""
+SHARE = 0.25  # part of the time that images may take while a page is open
+REFRESH = 2.0  # seconds between displays of the present state of the fit
+LARGEST = 400  # finest resolution level: a usual fit has smaller images
 CURVES = {"loss": "#4dabf7", "psnr": "#ffa94d"}
 """Numbers of the log that are plotted, and their colours."""
 

@@ -19,8 +19,7 @@ from mi_refgs.types import Float
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import FINEST
 
-IMAGE = "image"
-"""What is displayed unless an AOV is chosen."""
+IMAGE = "image"  # what is displayed unless an AOV is chosen
 BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
 """Display-encoded brightness behind the object, by name."""
 ENVIRONMENT, BACKGROUND = "environment map", "background"
