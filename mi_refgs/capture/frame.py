@@ -40,9 +40,8 @@ class Similarity:
 
 def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
     """The direction (3,) against gravity; `up` (V, 2): (right, down) of the upward direction in each image.
-    Cameras are mostly held level: it is orthogonal to the right-hand directions of all images, by least
-    absolute values, which is robust to rolled ones. If all cameras look the same way, it is the mean upward
-    direction, orthogonal to the mean right."""
+    It is orthogonal to the right-hand directions of all images, by least absolute values, which is robust to
+    rolled ones; if all look the same way, it is the mean upward direction."""
     right = np.stack([-up[:, 1], up[:, 0]], axis=1)
     to_world = solved.rotation.transpose(0, 2, 1)[:, :, :2]
     rights, ups = np.einsum("vij,vj->vi", to_world, right), np.einsum("vij,vj->vi", to_world, up)
@@ -84,8 +83,7 @@ def seen_share(solved: Solved, points: np.ndarray) -> np.ndarray:
 
 def region_of_interest(solved: Solved) -> Region:
     """A sphere around the point at which most cameras look, above what supports the object. Its radius is
-    that of `region_radius`, or smaller if the points that half of the cameras see are closer, or larger if
-    the object is (`object_region`)."""
+    that of `region_radius`, smaller or larger if points that half of the cameras see say so."""
     focus = focus_of(solved)
     distance = np.linalg.norm(solved.origin - focus, axis=1)
     radius = region_radius(distance, solved.half_angle)

@@ -77,8 +77,7 @@ def straighten(model: colmap.Reconstruction, photographs: dict[str, Photograph])
 
 
 def prepare(folder: Path, sources: Sequence[Path]) -> None:
-    """Make the folder of a data set; `sources` are the folders that are read. Raises InputError for a folder
-    that is or contains a source, or anything but a capture."""
+    """Make the folder; InputError if it is or contains one of `sources`, or anything but a capture."""
     real = folder.resolve()
     for source in sources:
         if real in (source.resolve(), *source.resolve().parents):

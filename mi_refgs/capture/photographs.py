@@ -104,9 +104,8 @@ class Photograph:
 
 
 def find_photographs(folder: Path) -> list[Photograph]:
-    """The photographs of a folder by name, oriented as most of them are. Portraits among landscapes of one
-    camera, and the reverse, are rotated by 90°: so all have one size and one lens. Raises InputError for a
-    missing folder, too few images, many sizes, and unreadable files."""
+    """The photographs of a folder by name, rotated as most of them are: so all have one size and one lens.
+    Raises InputError for a missing folder, too few images, many sizes, and unreadable files."""
     if not folder.is_dir():
         raise InputError("no such folder", folder, "photographs", "give one with JPEG or PNG files")
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
@@ -147,8 +146,7 @@ def _positive(value: object) -> float | None:
 
 
 def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
-    """The mask of each photograph by the photograph's name; empty without a folder. Masks are named as in
-    `data.images.mask_in`, and have the stored or displayed size."""
+    """The mask of each photograph by its name, as in `data.images.mask_in`; empty without a folder."""
     masks: dict[str, Path] = {}
     if folder is None:
         return masks
@@ -165,8 +163,7 @@ def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[s
 
 
 def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
-    """The mask as oriented in the data set, (H, W, 1) uint8, 255 on the object. A mask of the stored size is
-    rotated like the photograph, unless that is also the displayed size."""
+    """The mask (H, W, 1) uint8, 255 on the object, rotated like the photograph if it has the stored size."""
     from PIL import Image
 
     mask = Image.fromarray(to_8_bits(read_mask(path)))

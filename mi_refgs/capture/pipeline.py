@@ -48,10 +48,9 @@ def capture(
     region: Region | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`. `masks`:
-    a folder as in `find_masks`. `camera`: COLMAP's name of the lens model, or None for the simplest of three
-    that fits. `region`: of interest, in the data set's world, instead of the estimated one. Returns the
-    content of capture.json. Raises InputError for unusable input, and without pycolmap."""
+    """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`.
+    `camera`: COLMAP's lens model, or None for the simplest of three that fits. `region`: in the data set's
+    world. Returns the content of capture.json. Raises InputError for unusable input, and without pycolmap."""
     # Photographs and options.
     pycolmap = colmap.load()
     if camera not in (None, *MODELS):

@@ -35,8 +35,7 @@ assert dr.minimum(dr.arange(mi.Float, 64), dr.opaque(mi.Float, 2))[63] == 2
 
 
 def examine() -> dict[str, Any]:
-    """Examine the installation; runs one small kernel in a separate process (about 0.5 s). Versions are None
-    for missing parts. Each of `problems` says `what` it is, and a `remedy`."""
+    """Examine the installation, with one small kernel in another process; versions are None if missing."""
     import drjit as dr
 
     cuda, version = bool(dr.has_backend(dr.JitBackend.CUDA)), dr.detail.llvm_version()

@@ -27,9 +27,8 @@ CONNECT = "20s"  # time limit for the connection to a scheduler
 
 
 def execute(job: Job, stop: threading.Event | None = None) -> str | None:
-    """Run a job; returns None if it is done, else the reason, which is also written to failed.json. A process
-    that a signal ended (a crash) is restarted from its checkpoint at most RETRIES times. When `stop` is set,
-    the process saves its state and ends; the result is then None."""
+    """Run a job; returns None if it is done or `stop` is set, else the reason, also written to failed.json.
+    After a crash it continues from its checkpoint, at most RETRIES times."""
     if stop is not None and stop.is_set():
         return None
     job.write()
@@ -111,10 +110,9 @@ def threads_each(workers: int, threads: int | None) -> int | None:
 
 
 def run_on_cluster(jobs: Sequence[Job], address: str, report: Report) -> None:
-    """Run jobs on the scheduler at `address`; a signal cancels them. Workers must see the data sets and the
-    comparison's folder under the same paths. A job whose worker died is restarted from its checkpoint on
-    another one, at most RETRIES times. Raises InputError without dask.distributed and for a scheduler that
-    does not answer."""
+    """Run jobs on the scheduler at `address`, whose workers see the same paths; a signal cancels them. A job
+    whose worker died continues on another one, at most RETRIES times. Raises InputError without
+    dask.distributed and for a scheduler that does not answer."""
     try:
         import dask
         import distributed

@@ -88,9 +88,8 @@ class Shared:
 def plan(
     folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], shared: Shared
 ) -> list[Job]:
-    """Plan and check the jobs of a comparison; seeds vary slowest, so that each method is fitted once early.
-    Raises InputError for a data set without test views, a method that does not load, two data sets or methods
-    of one name, and existing runs with other settings."""
+    """Plan and check the jobs of a comparison; seeds vary slowest. Raises InputError for data without test
+    views, methods that do not load, equal names, and existing runs with other settings."""
     _unique((absolute(path).name for path in data), "DATA", "give the folders different names")
     _unique((Path(method).stem for method in methods), "--methods", "name each once")
     _unique((str(seed) for seed in seeds), "--seeds", "give each once")

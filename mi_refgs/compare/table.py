@@ -76,8 +76,7 @@ class Table:
 
 
 def table_of(folder: Path) -> Table:
-    """Tabulate all jobs in the folder of a comparison; a run that cannot be read counts as failed. Raises
-    InputError for runs on one data set that were measured on images of different sizes."""
+    """Tabulate all jobs of a comparison, unreadable ones as failed; InputError for different image sizes."""
     about = settings_of(folder)
 
     def order(job: Job) -> tuple[Any, ...]:

@@ -114,8 +114,7 @@ def _model(folder: Path) -> tuple[Path, str] | None:
 
 
 def _intrinsics(camera: Camera, image: ImageFile) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels of the file, which may be a smaller copy of the reconstructed image. Raises
-    InputError for another aspect ratio."""
+    """fx, fy, cx, cy in pixels of the file, perhaps a smaller copy; InputError for another aspect ratio."""
     across, down = image.width / camera.width, image.height / camera.height
     # Width and height of a copy are rounded by up to a pixel each.
     if abs(image.height - across * camera.height) > 1 + image.height / image.width:

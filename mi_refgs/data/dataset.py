@@ -116,8 +116,7 @@ def reader_of(folder: Path) -> Reader:
 
 
 def held_out(ordered: Sequence[Item], split: str, source: Path | None = None) -> list[Item]:
-    """The items of a split of one list: every eighth, from the first, is a test view. Raises InputError that
-    names the `source`, if it is given, where there are none."""
+    """The items of a split, every eighth from the first being a test view; InputError names the `source`."""
     items = [item for i, item in enumerate(ordered) if (i % HOLDOUT == 0) == (split == "test")]
     if source is not None and not items:
         raise InputError(f"zero {split} views", file=source, remedy="add images")

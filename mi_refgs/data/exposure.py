@@ -18,10 +18,9 @@ def fitted_gain(
     background: np.ndarray,  # (3,) of the view
     where: np.ndarray | None = None,  # (H, W) bool; pixels that count, by default all
 ) -> np.ndarray:
-    """Gains (3,) that fit a render to the image of a view. Per channel the least squares of g L - T over
-    pixels, L and T the linear colours of the object in render and image, weighted by coverage and by the
-    slope of the sRGB curve, so that errors count as displayed. Clipped pixels of 8-bit images are left out.
-    The gain of a black channel is 1."""
+    """Gains (3,) that fit a render to the image of a view; 1 for a black channel. Per channel the least
+    squares over pixels of linear object colours, weighted by coverage and the slope of the sRGB curve, so
+    that errors count as displayed. Clipped pixels are left out."""
     view = view.load()
     covered = alpha if view.alpha is None else np.minimum(alpha, view.alpha)
     rendered = np.maximum(radiance, 0) / np.maximum(alpha, 1e-6)[..., None]

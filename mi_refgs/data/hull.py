@@ -29,8 +29,7 @@ def axis_projectors(axes: np.ndarray) -> np.ndarray | None:
 
 
 def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """The point nearest to the axes of all cameras (3,), and the distance of each camera from it (V,). Raises
-    InputError for one view and for parallel axes."""
+    """The point nearest to all cameras' axes (3,), and their distances (V,); InputError for parallel axes."""
     origins = np.array([view.to_world[:3, 3] for view in views], dtype=np.float64).reshape(-1, 3)
     axes = np.array([view.to_world[:3, 2] for view in views], dtype=np.float64).reshape(-1, 3)
     projectors = axis_projectors(axes)
@@ -98,9 +97,8 @@ class Hull:
 
 
 def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | None = None) -> Hull:
-    """The set of points inside every mask (alpha > 0.5, blurred by half a voxel). `resolution`: voxels per
-    edge. Only views that see a point carve it, and a quarter of the views must see it. Raises InputError if
-    it is empty."""
+    """The set of points inside every mask (alpha > 0.5, blurred by half a voxel), which a quarter of the
+    views must see. `resolution`: voxels per edge. Raises InputError if it is empty."""
     low, high = np.asarray(bounds, dtype=np.float64)
     if resolution is None:
         edge = max(max(view.width, view.height) for view in views)
@@ -135,9 +133,8 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
 def median_colours(
     points: np.ndarray, views: Sequence[View], background: np.ndarray, normals: np.ndarray | None = None
 ) -> np.ndarray:
-    """Median linear colour (N, 3) of the points over at most 32 views that show them with alpha > 0.5. Points
-    that no view shows are 0.5 grey. With `normals`, only views in front of a point count. There is no
-    occlusion test: the median is robust to it."""
+    """Median linear colour (N, 3) of the points over at most 32 views with alpha > 0.5 there, else 0.5 grey.
+    With `normals`, only views in front count. The median is robust to occlusion, which is not tested."""
     if not views or not len(points):
         return np.full((len(points), 3), 0.5)
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, COLOUR_VIEWS).astype(int))]

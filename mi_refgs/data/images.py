@@ -82,8 +82,7 @@ class ImageFile:
         return self.mask is not None or header(self.path)
 
     def decode(self) -> np.ndarray:
-        """Decode the file for `compose`, (H, W, 3 or 4): uint8 where the view shows the numbers of the file,
-        else float32, averaged and premultiplied."""
+        """(H, W, 3 or 4): uint8 as in the file, else float32, averaged and premultiplied."""
         linear, factor = self.is_linear_radiance, 1
         if linear:
             pixels = read_exr_image(self.path)

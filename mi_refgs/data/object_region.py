@@ -67,8 +67,7 @@ def support_planes(
     width: float = SPARSE.width,  # half the thickness of a plane, radii
     most: int = PLANE_COUNT,
 ) -> tuple[Plane, ...]:
-    """The planes that support an object in a sphere, at most so many, each a PLANE_MARGIN above the surface.
-    Enough points must be on a plane, and nearly all cameras above it."""
+    """Planes PLANE_MARGIN above surfaces that support an object, with nearly all cameras above them."""
     rng = np.random.default_rng(0)
     radius, width = region.radius, width * region.radius
     points = points[np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * radius]
@@ -130,9 +129,8 @@ def shown_whole(views: Sequence[View], region: Region, points: np.ndarray, scatt
 
 
 def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region | None:
-    """The region of an object from points (N, 3) on all surfaces of a fit; None without a group of points. It
-    is a ball and a box around the object, above the planes of `region`, or, if it has none, above one of
-    these points: a table without texture has no sparse points."""
+    """The region of an object from points (N, 3) on all surfaces of a fit; None without a group of points: a
+    ball and a box around it, above the planes of `region`, or, if it has none, above one of these points."""
     if not region.planes:
         region = replace(region, planes=support_planes(points, origins, region, FITTED.width, most=1))
     group = object_points(region, points, seen, FITTED)
@@ -150,9 +148,8 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
 
 
 def _ball_beside_cameras(group: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) inside of a group (N, 3) around which the ball that cameras allow contains most of it; and
-    the radius that would contain all: an object that cameras approach, such as a head on a wall, does not fit
-    into a ball around its middle."""
+    """Centre (3,) in a group (N, 3) around which a ball free of cameras has most of it; radius for all of
+    it."""
     middle = group.mean(axis=0)
     outwards = group[evenly_spread(len(group), BALL_CENTRES)] - middle
     centres = np.concatenate([middle + share * outwards for share in BALL_SHARES])

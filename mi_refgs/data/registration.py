@@ -23,8 +23,7 @@ Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a vi
 
 
 def registered(view: View, render: Render, distance: float) -> View:
-    """The view with the pose whose render differs least from its image. `distance`: of what the camera looks
-    at, scene units."""
+    """The view with the pose of the least difference; `distance` of what it looks at, scene units."""
     view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
     while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
         blocks.insert(0, 2 * blocks[0])

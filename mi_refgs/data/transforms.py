@@ -184,8 +184,7 @@ def _inside(transforms: Path, field: str, name: object) -> Path:
 
 
 def read_points(path: Path) -> PointCloud | None:
-    """Read points of a PLY file: x, y, z and red, green, blue of 8 bits or 0 … 1, sRGB-encoded. Points
-    without usable numbers are left out; None without any."""
+    """Read x, y, z and red, green, blue (8 bits or 0 … 1, sRGB) of a PLY file; None without usable points."""
     require_file(path)
     with path.open("rb") as file:
         vertices = read_vertices(path, file)
@@ -306,9 +305,8 @@ def _shiny_blender_maps(
     downscale: int,
     straight: Undistortion | None,
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """World normals (h, w, 3) and depths (h, w, 1) beside an image of Shiny Blender, None without a file.
-    Normals n are stored as (n + 1) / 2 in 8 bits; depths z along the viewing axis as 1 / (1 + z), and 0 off
-    the object. [Ref-NeRF, Verbin et al. 2022]"""
+    """World normals n (h, w, 3) in 8 bits as (n + 1) / 2, and depths z (h, w, 1) as 1 / (1 + z), 0 off the
+    object, beside an image of Shiny Blender; None without a file. [Ref-NeRF, Verbin et al. 2022]"""
     normal = depth = None
     if file := _beside(image, NORMALS):
         pixels = 2 * _of_shape(file, read_png(file)[..., :3], shape) - 1

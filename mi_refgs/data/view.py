@@ -33,8 +33,7 @@ class FileCamera:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One image and its camera. Readers return views that are not loaded: call `load` before `image`, `alpha`
-    and what depends on them."""
+    """One image and its camera; `load` it before `image`, `alpha` and what depends on them."""
 
     name: str
     width: int  # pixels
@@ -108,8 +107,7 @@ class View:
         return np.ones((self.height, self.width), np.float32)
 
     def averaged(self, block: int) -> View:
-        """The loaded view averaged over `block` × `block` pixels, without ground-truth maps. Raises
-        InputError for an image smaller than one block."""
+        """The loaded view averaged over `block`² pixels, without maps; InputError if it is smaller."""
         if min(self.width, self.height) < block:
             what = f"{self.width} × {self.height} pixels are less than a block of {block}²"
             raise InputError(what, self.name, "data.coarse", "give a smaller one")

@@ -23,9 +23,7 @@ CLASSES = tuple(PIXEL_CLASSES)
 
 
 def classify(view: View, surface: TrueSurface | None) -> np.ndarray | None:
-    """Return the index in CLASSES (H, W) of each pixel of a loaded view; None without true depth and normals.
-    At a depth edge, the line between the points of neighbouring pixels leaves the tangent plane of either by
-    more than CREASE_DEGREES."""
+    """Index in CLASSES (H, W) of each pixel of a loaded view; None without true depth and normals."""
     if view.depth is None or view.normal is None:
         return None
     camera, covered, shape = view.camera(), view.covered(), view.depth.shape

@@ -119,8 +119,7 @@ def over_colour(image: np.ndarray, alpha: np.ndarray, colour: np.ndarray | float
 
 
 def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """Tone-map a fitted environment map (h, w, 3), linear, and the ground truth at one exposure, by title.
-    The fitted one is first scaled per channel to the ground truth by least squares."""
+    """Tone-map a fitted map (h, w, 3), scaled per channel, and the ground truth at one exposure, by title."""
     if truth is None:
         return {"fitted environment": light_image(light)}
     fitted = light_image(light * np.array(environment(light, truth)["env_scale"]), truth)
@@ -128,9 +127,8 @@ def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str
 
 
 def light_image(radiance: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """Map a lat-long map (h, 2h, 3) of any range to an image with +z at the top. The curve is x / (1 + x)
-    [Reinhard et al. 2002, eq. 3]. The exposure maps the average luminance of `reference`, or of the map
-    itself, over the sphere to LIGHT_KEY."""
+    """Map a lat-long map (h, 2h, 3) to an image, +z at the top, by x / (1 + x) [Reinhard et al. 2002, eq. 3]
+    at the exposure that maps the mean luminance of `reference`, or of the map, to LIGHT_KEY."""
     reference = radiance if reference is None else reference
     rows = np.sin((np.arange(len(reference)) + 0.5) / len(reference) * np.pi)
     mean = float(np.average((reference @ LUMINANCE).mean(axis=1), weights=rows))

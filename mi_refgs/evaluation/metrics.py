@@ -36,8 +36,7 @@ def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | EllipsisType 
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, where: np.ndarray | EllipsisType = ...) -> float:
-    """Compute the structural similarity that the loss uses (`fitting.ssim`); `where` as in `psnr`. Outside of
-    the image the window reads zeros, as in 3DGS and Ref-Gaussian; means are over every pixel."""
+    """Compute the SSIM of the loss (`fitting.ssim`), zeros outside of the image; `where` as in `psnr`."""
     r = WINDOW_RADIUS
     x, y = (np.pad(array, ((r, r), (r, r), (0, 0))) for array in _pair(image, truth))
     options = {"gaussian_weights": True, "sigma": WINDOW_SIGMA, "use_sample_covariance": False, "full": True}
@@ -86,10 +85,9 @@ def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
-    """Compute the mean angle in degrees between normal maps, over the foreground and over the whole image.
-    `normal` is rendered, of any length; `truth` (H, W, 3) is 0 where nothing is hit; `alpha` (H, W) is true.
-    A missing rendered normal counts 90° on the foreground (`foreground`). `normal_mae_deg_full` divides the
-    same sum by all pixels, so the background counts as 0°, as in most papers."""
+    """Compute the mean angle in degrees between normal maps on the foreground, and over the whole image,
+    where the background counts as 0°. `normal` is rendered, of any length; `truth` (H, W, 3) is 0 where
+    nothing is hit; `alpha` (H, W) is true. A missing rendered normal counts 90° on the foreground."""
     scored = foreground(truth, alpha)
     total = float(np.sum(angle_deg(normal, truth)[scored]))
     count = max(int(scored.sum()), 1)
@@ -111,10 +109,9 @@ def angle_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Compare a fitted environment map with the ground truth after a least-squares scale per channel. Pixels
-    are weighted by solid angle. The true map is averaged to the fitted one's grid (`shade.lobe_matrices`:
-    first and last row on the poles). Keys: `env_scale` (three numbers), `env_mae` (linear), `env_psnr` (dB,
-    of sRGB-encoded values in [0, 1]) and `env_correlation` (Pearson, of the same)."""
+    """Compare a fitted environment map with the ground truth after a least-squares scale per channel,
+    weighted by solid angle, on the fitted one's grid. Keys: `env_scale` (three numbers), `env_mae` (linear),
+    `env_psnr` (dB, sRGB-encoded in [0, 1]) and `env_correlation` (Pearson, of the same)."""
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
     if not np.all(np.isfinite(truth)):
         raise InputError("need finite values; write the map again", "metrics", "ground-truth environment")

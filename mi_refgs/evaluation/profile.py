@@ -112,8 +112,7 @@ class Phase:
 
 
 def phases_of(step: Callable[[], Any], steps: int) -> list[Phase]:
-    """Measure the phases of a step, in the order of PHASES. The sum exceeds the time of a step if kernels
-    fuse across phases, since there are barriers in between."""
+    """Measure PHASES of a step in order; barriers between them undo fusion, so the sum is longer."""
     clocks = [PhaseClock() for _ in range(WARM_UP + steps)]
     for clock in clocks:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory), listening(clock):

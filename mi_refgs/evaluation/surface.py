@@ -55,8 +55,7 @@ class TrueSurface:
         return TrueSurface(mesh, Occluder(mesh)) if len(mesh.faces) else None
 
     def concave(self, view: View) -> np.ndarray | None:
-        """Find pixels (H, W) whose point on the true surface has an ambient visibility below CONCAVE_BELOW.
-        Pixels beside the object are False. None where the view has no true depth and normals."""
+        """Pixels (H, W) of the true surface with visibility below CONCAVE_BELOW; None without truth."""
         if view.depth is None or view.normal is None:
             return None
         camera = view.camera()

@@ -191,8 +191,7 @@ def _columns(model: Reflectance, values: Mapping[str, Array]) -> list[Float]:
 def _points(
     mesh: Mesh, scene: TrainedScene, triangle: UInt32, barycentric: Point2f
 ) -> tuple[Point3f, list[Float]]:
-    """Return the mesh's vertices, then T points on its triangles: positions (V + T,) and their COLUMNS.
-    Materials are those of the surfels around the vertices, normals those of the mesh."""
+    """Positions (V + T,) of the mesh's vertices and T points, their COLUMNS by surfels and mesh normals."""
     nearby = VertexSurfels.of(mesh, scene.surfels)
     vertices = dr.arange(mi.UInt32, len(mesh.vertices))
     corners = [dr.gather(mi.UInt32, nearby.faces, 3 * triangle + i) for i in range(3)]
@@ -216,9 +215,8 @@ def _mean_of_views(
     start: list[Float],  # COLUMNS × (P,)
     reach: float,  # scene units
 ) -> np.ndarray:
-    """Average COLUMNS over the views that see each point: (P, COLUMNS) float32, from those at `start`. A view
-    weighs by its alpha and the squared cosine at which it sees the point; it sees points that are less than
-    `reach` in front of or behind its expected depth."""
+    """COLUMNS (P, COLUMNS) float32 averaged over the views, from those at `start`. A view sees points less
+    than `reach` off its expected depth, and weighs by its alpha and the squared cosine."""
     outward = mi.Vector3f(*start[5:])
     weight = dr.full(mi.Float, UNSEEN, dr.width(points))
     total = [UNSEEN * column for column in start]

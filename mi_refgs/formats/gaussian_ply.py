@@ -37,8 +37,7 @@ def write(
 
 
 def read_splats(path: Path, linear: bool = False) -> TrainedScene:
-    """Read a PLY file of 3D Gaussians or surfels: positions, rotations, scales, opacities and colours.
-    `linear`: its colours are linear radiance, as this package writes them."""
+    """Read a PLY file of 3D Gaussians or surfels; `linear`: its colours are linear radiance, as ours."""
     try:
         with path.open("rb") as file:
             header = read_header(path, file, EXPECTED)

@@ -47,8 +47,7 @@ DAMPING = 0.1  # λ, over the 1/4π that Y² is on average
 
 @remember_last
 def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_only: bool) -> Surfels:
-    """Return the scene as 3D Gaussians whose radiance_sh of `degree` are display-encoded. `object_only`:
-    without the background Gaussians; the environment is never included."""
+    """The scene as 3D Gaussians with display-encoded radiance_sh; `object_only`: without background ones."""
     if not 0 <= degree <= MAX_SH_DEGREE:
         raise InputError(f"{degree} is out of range", "--degree", remedy=f"give 0 to {MAX_SH_DEGREE}")
     if object_only:

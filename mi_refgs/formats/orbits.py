@@ -56,9 +56,8 @@ def shots_around(
 def turntable_cameras(
     scene: TrainedScene, cameras: Sequence[Camera], count: int, region: Region | None = None
 ) -> list[Camera]:
-    """Return cameras on a circle around the object, z up, with the median distance and height of `cameras`.
-    They have the first one's lens. The object is what lies in the `region`; without one, all of the scene but
-    strays: the box of INSIDE of the surfels by opacity, or of the mesh's vertices."""
+    """Cameras on a circle around the object, z up, with the median distance and height of `cameras`, and the
+    first one's lens. Without a `region`, the object is the box of INSIDE of the surfels, or of the mesh."""
     position, weight = _weighted(scene.surfels)
     if scene.mesh is not None:
         position, weight = scene.mesh.vertices.astype(np.float64), np.ones(len(scene.mesh.vertices))

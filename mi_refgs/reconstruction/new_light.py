@@ -97,10 +97,9 @@ def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> E
 
 
 def truth_under(light: NewLight, data: Path) -> tuple[Path, NewLight] | None:
-    """Find the data set with test views under this light; return it and the light of its renders, or None.
-    The light must be the map that `refgs dataset --relight` was given, by the content of the file, or an
-    environment.exr of the data set itself, which requires `world`, unless its images show an object in a
-    room; a rotated light has no ground truth."""
+    """Find the data set with test views under this light; return it and the light of its renders, or None. It
+    must be the map of `refgs dataset --relight` by content, or in `world` environment.exr of a data set
+    without a room; a rotated light has no ground truth."""
     content = light.path.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     lights = recorded_lights(data / "dataset.json")

@@ -91,8 +91,7 @@ class Provenance:
         return self.shots(trained, "test")[0].camera
 
     def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
-        """Return cameras on a circle around the object, z up, at the distance and height of the test views.
-        Raises InputError as `shots` does, and for a number below 1."""
+        """Cameras on a circle around the object at the test views' distance; InputError below 1."""
         if count < 1:
             remedy = "give a number of cameras from 1"
             raise InputError(f"{count} is out of range", "turntable", remedy=remedy)

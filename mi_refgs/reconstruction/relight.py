@@ -152,9 +152,8 @@ def _rows(
 
 
 def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
-    """Fit the scale of radiance per channel (3,) that minimises the error of displayed images. Light and
-    albedo of a fit share an unknown scale. It is one for all images, by least squares of displayed colours
-    inside the object: of radiance, lamps alone would be fitted. 1 for a channel that is black in either."""
+    """Fit the scale of radiance per channel (3,), which light and albedo of a fit share, by least squares of
+    displayed colours inside the object over all images; 1 for a channel that is black in either."""
     a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))
     inside = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
     a, b = (x[inside[:: max(1, len(inside) // SCALE_PIXELS)]] for x in (a, b))

@@ -58,9 +58,8 @@ def camera_poses(
     rng: np.random.Generator,
     azimuth: tuple[float, float] = (0.0, 360.0),
 ) -> np.ndarray:
-    """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up. A spherical
-    Fibonacci lattice over the band of elevations (degrees), rotated by a random azimuth, jittered by a third
-    of its spacing, and compressed into the range of azimuths (degrees)."""
+    """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up: a jittered
+    spherical Fibonacci lattice over the ranges of elevations and azimuths (degrees)."""
     low, high = (math.sin(math.radians(e)) for e in elevation)
     jitter = rng.uniform(-1 / 3, 1 / 3, (count, 2))
     z = low + (high - low) * (np.arange(count) + 0.5 + jitter[:, 0]) / count

@@ -185,8 +185,7 @@ def add_saving(page: Page, scene: ReconstructionView) -> None:
 def write_view(
     scene: ReconstructionView, pose: Pose, size: tuple[int, int], look: DisplayOptions, folder: Path
 ) -> Path:
-    """Write a view of width × height pixels as PNG, EXR and camera, with the next free number of a folder.
-    Returns the path of the PNG; raises InputError if it cannot be written."""
+    """Write a view as PNG, EXR and camera with the next free number; returns the path of the PNG."""
     (width, height), camera = size, pose.camera(*size)
     planes = planes_of(scene.fine(camera, look), camera, look, scene.light)
     channels = planes if look.what == IMAGE else values_of_planes(look.what, planes)

@@ -91,8 +91,7 @@ def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light |
 
 
 def displayed_planes(planes: list[Float], look: DisplayOptions, depths: tuple[float, float]) -> list[Float]:
-    """Return display-encoded RGB planes, not clipped, of the mean of `planes_of`. The first of the two
-    `depths` is displayed as white, the second as black."""
+    """Display-encoded RGB planes, not clipped, of the mean of `planes_of`; `depths` are white and black."""
     what, alpha, behind = look.what, planes[-1], BACKDROPS.get(look.backdrop, 1.0)
     values = planes if what == IMAGE else values_of_planes(what, planes)
     if what == IMAGE or what in TERMS:
