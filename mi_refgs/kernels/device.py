@@ -62,9 +62,8 @@ def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
 
 
 def upload(values: np.ndarray, kind: Any = None) -> Any:
-    """A flat mi.Float (or another `kind`) with the values, in memory of Dr.Jit. `mi.Float(values)` wraps
-    NumPy's on the CPU, beyond whose end kernels read. Raises InputError under a variant that is not
-    supported."""
+    """A flat mi.Float (or another `kind`) in memory of Dr.Jit: kernels read beyond the end of what
+    `mi.Float(values)` wraps on the CPU. Raises InputError under a variant that is not supported."""
     require_supported_variant("mi_refgs")
     kind = mi.Float if kind is None else kind
     dtypes = {mi.Float: np.float32, mi.UInt32: np.uint32, mi.Int32: np.int32, mi.Bool: np.bool_}

@@ -158,8 +158,7 @@ def _sample(
     surface: Float, px: Float, py: Float, width: Int32, height: Int32, apart: Float, active: Bool
 ) -> tuple[Float, Bool, Bool]:
     """Depth at a pixel position, whether it is a surface, and certainly background (not a silhouette).
-    Bilinear where the four texels differ by less than `apart`, else the nearest: no mean across a depth
-    edge."""
+    Bilinear where the four texels differ by less than `apart`, else the nearest."""
     fx, fy = dr.floor(px), dr.floor(py)
     wx, wy = px - fx, py - fy
     x0, y0 = mi.Int32(fx), mi.Int32(fy)

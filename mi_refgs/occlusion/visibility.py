@@ -84,9 +84,8 @@ class Occluder:
     def visible(
         self, origin: Point3f, direction: Vector3f, normal: Vector3f = None, active: Bool = True
     ) -> Float:
-        """1 where the ray, of any length, leaves the scene freely, is not `active` or not finite; 0 where it
-        is blocked. The origin (world) first moves OFFSET_VOXELS along the normal, or along the ray without
-        one."""
+        """1 where the ray, of any length, leaves freely, is not `active` or not finite; 0 where it is
+        blocked. It starts (world) OFFSET_VOXELS off along the normal, or along itself without one."""
         if self.empty:
             return dr.full(mi.Float, 1, max(dr.width(origin), dr.width(direction)))
         with dr.suspend_grad():

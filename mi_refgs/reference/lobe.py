@@ -154,9 +154,8 @@ def chain(hit: Hit, outgoing: Outgoing, origin: Array, direction: Array, bounces
 
 
 def blocked_mean(radiance: Array, weight: Array, blocked: Array, free: Array, fading: float) -> Array:
-    """Weighted mean (3,) of the radiance (k, 3) of those of k ≥ 2 rays that are `blocked` (k,), `free` (3,)
-    that of others. Per colour, the largest product loses `fading` of what exceeds k times the mean of the
-    others."""
+    """Weighted mean (3,) of radiance (k, 3) of k ≥ 2 rays that are `blocked` (k,), and `free` (3,) of others.
+    Per colour, the largest product loses `fading` of what exceeds k times the mean of the others."""
     count, products = len(weight), weight[:, None] * np.where(blocked[:, None], radiance, free)
     for channel in range(3):
         first = int(np.argmax(np.where(blocked, products[:, channel], -1)))

@@ -37,9 +37,8 @@ class Band:
 
 
 def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = None) -> list[Band]:
-    """Divide an image into bands of at most `most` samples (default: PASS_SAMPLES), factor² per pixel,
-    PATCH_EDGE rows at least. `margin`: pixels of neighbours; without one, the last band may reach below the
-    image."""
+    """Divide an image into bands of at most `most` samples (default: PASS_SAMPLES), factor² per pixel, and at
+    least PATCH_EDGE rows; without a `margin` of pixels, the last may reach below the image."""
     most = PASS_SAMPLES if most is None else most
     width, height = camera.width, camera.height
     film, offset = camera.film or (width, height), camera.offset if camera.film else (0, 0)
@@ -64,9 +63,8 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
 def in_passes(
     draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0, surfels: int = 0
 ) -> Result:
-    """Call `draw` (factor² samples per pixel) for each band and join its arrays, of one value per pixel or in
-    all, in lists, dictionaries and dataclasses; detached. Raises InputError if the image does not fit into
-    memory."""
+    """Call `draw` (factor² samples per pixel) per band and join its arrays, of one value per pixel or in all,
+    in lists, dictionaries and dataclasses; detached. Raises InputError for an image above the memory."""
     require_image((camera.width, camera.height), factor**2, surfels, channels=24)  # with all maps, about
     found = bands(camera, factor, margin)
     if found[0].camera is camera:

@@ -28,9 +28,8 @@ def samples_per_axis(samples: int) -> int:
 def supersampled(
     view: Callable[[Camera], Frame], camera: Camera, samples: int, details: bool = True
 ) -> Frame:
-    """Render a frame with k × k samples per pixel (`samples_per_axis`), box filtered, under AD, as
-    `aov_values` weighs them; without `details` neither terms nor maps. Compositing it equals the mean of
-    composited samples."""
+    """Render a frame with k × k box-filtered samples per pixel (`samples_per_axis`), under AD; without
+    `details` neither terms nor maps. Compositing it equals the mean of composited samples."""
     factor = samples_per_axis(samples)
     fine_camera = camera.supersampled(factor)
     fine = view(fine_camera)

@@ -45,9 +45,8 @@ def lacking(scene: TrainedScene) -> str:
 
 def relightable(scene: TrainedScene) -> TrainedScene:
     """Reduce a scene to attributes without light (`albedo_from_radiance` for an SH colour of `split_sum`):
-    radiance, indirect and background are removed; interreflection is traced if there is a mesh; the light
-    stays, infinitely far. Raises SceneError for a scene without light, or whose model has no such
-    attributes."""
+    radiance, indirect and background go; interreflection is traced if there is a mesh; the light stays,
+    infinitely far. Raises SceneError for a scene without light, or whose model has no such attributes."""
     if why := lacking(scene):
         raise SceneError(why, remedy="fit one with materials and a light, as `--for relighting` does")
     shading = scene.shading.relit(scene.mesh is not None)

@@ -20,9 +20,8 @@ from mi_refgs.runs.run import DATASET, Run
 
 
 def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> tuple[Method, Dataset]:
-    """The method with its image size decided, and training views without ground truth: its own
-    `data.downscale`, or the smallest with its preset's pixels, which calls `tell`. Raises InputError as
-    `read_dataset` does."""
+    """The method with its image size decided, and training views without ground truth: `data.downscale`, or
+    the least for its preset's pixels, which calls `tell`. Raises InputError as `read_dataset` does."""
     pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
     views = read_views(method, path, "train", truth=False, pixels=pixels)
     if method.data.downscale is None and views.downscale > 1:

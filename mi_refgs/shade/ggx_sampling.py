@@ -55,8 +55,7 @@ class Lobe:
 
     def sample(self, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
         """World direction of ray `ray` of `count`, and its weight f cosθ / density = F G / G₁, 0 below the
-        horizon. [Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"; weight: Heitz
-        2018]"""
+        horizon. [Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"; Heitz 2018]"""
         along, around = lobe_point(self.turn, ray, count)
         stretched = dr.normalize(mi.Vector3f(self.α * self.view.x, self.α * self.view.y, self.view.z))
         z = dr.fma(1 - along, 1 + stretched.z, -stretched.z)

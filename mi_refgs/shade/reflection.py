@@ -50,9 +50,8 @@ class HitSurfels:
 
 @dataclass(frozen=True)
 class MeshRadiance:
-    """Radiance of the mesh, shaded with the attributes of surfels, spherical harmonics of the nearest. What
-    blocks the mirror direction of a hit is another hit, `traced_bounces` times; what is blocked at the last
-    is dark."""
+    """Radiance of the mesh, shaded with the attributes of surfels, harmonics of the nearest. What blocks a
+    hit's mirror direction is another hit, `traced_bounces` times; what is blocked at last is dark."""
 
     occluder: Occluder
     surface: Surface
@@ -124,9 +123,8 @@ class MeshRadiance:
 
 
 def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-    """The points with visibility (mi.Float, 0 … 1, detached) and indirect light, as `options` require: with
-    `traced_bounces` that of what blocked rays hit, with gradients of light and materials around all hits
-    only."""
+    """The points with visibility (mi.Float, 0 … 1, detached) and indirect light, as `options` require: of
+    what blocked rays hit with `traced_bounces`, with gradients of light and materials around hits only."""
     occluder, scene, bounces = context.occluder, None, options.traced_bounces
     sampled = options.visibility_rays > 1
     if occluder.empty and (sampled or bounces):

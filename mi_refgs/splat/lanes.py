@@ -196,9 +196,8 @@ def advance(sample: FootprintSample, active: Bool, transmittance: Float) -> tupl
 def walk(
     lists: TileLists, lanes: Lanes, step: Callable[..., Any], start: list[tuple[Any, ...]], label: str
 ) -> list[Any]:
-    """Visit the surfels of each lane's tile until its last pixel has ended. `start` has states of each pixel,
-    first whether it goes on; `step` maps surfel, whether the lane goes on, and states to such states, lists
-    per quantity."""
+    """Visit the surfels of each lane's tile until its last pixel has ended. `start` is lists of states per
+    pixel, first whether it goes on; `step` maps surfel, whether the lane goes on, and states to such."""
 
     def surfel_at(pair: UInt32, some: Bool) -> UInt32:
         return dr.gather(mi.UInt32, lists.surfel_from_pair, pair, some & (pair < lanes.end))

@@ -45,9 +45,8 @@ def _exp(x: Float) -> Float:
 
 
 class Surfels:
-    """N surfels or other primitives: raw attributes by name (those that a scene uses), which decide the
-    `primitive`. Accessors return activated values as Dr.Jit arrays (N,); gradients flow to the raw tensors in
-    both modes."""
+    """N surfels or other primitives: raw attributes by name, those in use, which decide the `primitive`.
+    Accessors return activated Dr.Jit arrays (N,); gradients flow to the raw tensors in both modes."""
 
     raw: dict[str, TensorXf]  # (N, D) each, often leaves of the AD graph
 

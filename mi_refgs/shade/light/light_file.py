@@ -17,9 +17,8 @@ MAX_ROWS = 4096  # most rows that are kept of a map: 400 MB of float32
 
 
 def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndarray:
-    """Linear radiance (h, w, 3) float32, at least 0, of a lat-long EXR, HDR, PNG or JPEG file, averaged to at
-    most `rows` rows and 2 · `rows` columns. Raises InputError for another image or over
-    `files.MAX_PIXELS`."""
+    """Linear radiance (h, w, 3) float32 ≥ 0 of a lat-long EXR, HDR, PNG or JPEG file, averaged to at most
+    `rows` rows and 2 · `rows` columns. Raises InputError for other images and above `files.MAX_PIXELS`."""
     path = Path(path)
     image = np.maximum(_read(path), 0)
     height, width, _ = image.shape

@@ -97,8 +97,7 @@ def resample(radiance: np.ndarray, height: int) -> np.ndarray:
 
 def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     """Matrices (h_out, h, h+1) of the lobe: entry (i, k, m) times Σ_j x[k, j] (cos, sin)(mφ_j), summed over
-    k, is (a_m, b_m) of Σ_m (a_m cos mφ + b_m sin mφ), the filtered radiance of row i. Frequencies 0 … h of w
-    = 2h."""
+    k, is (a_m, b_m) of Σ_m (a_m cos mφ + b_m sin mφ), the filtered radiance of row i; m = 0 … h, w = 2h."""
     w, texel = 2 * h, np.pi / (h - 1)
     core = 2 * roughness**2  # the lobe falls to a quarter at this angle, radians
     s = max(MIN_SUBSAMPLES, int(np.ceil(2.5 * texel / core)) + 1)

@@ -29,9 +29,8 @@ SHORTEST = 0.05  # least length of a ray, in distances: a point may lie beyond a
 
 @dataclass(frozen=True, eq=False)
 class NearField:
-    """Distances of what an environment map shows, from a `centre` (3,) in the world: `nearness` (h, 2h) is 1
-    / distance, 0 infinitely far, in scene units. Raises InputError for other shapes, negative or not finite
-    values."""
+    """Distances of what a map shows from a `centre` (3,) in the world: `nearness` (h, 2h) is 1 / distance,
+    scene units, 0 infinitely far. Raises InputError for other shapes and negative or not finite values."""
 
     centre: np.ndarray
     nearness: np.ndarray

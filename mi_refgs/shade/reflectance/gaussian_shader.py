@@ -16,8 +16,7 @@ from mi_refgs.surfels.table import Surfels
 
 class GaussianShader(Reflectance):
     """c = radiance + (1 - tint) E(n) + (tint A + B) L(r, roughness), with E the irradiance of the normal, to
-    which a fitted `normal_offset` is added; the light has no upper bound (theirs: [0, 1]; one offset a
-    side)."""
+    which a fitted `normal_offset` is added (theirs: one a side, and a light in [0, 1])."""
 
     name = "gaussian_shader"
     shaded_at = ("surfel",)

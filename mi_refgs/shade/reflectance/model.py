@@ -59,12 +59,10 @@ class TraceContext:
 
 
 class Reflectance:
-    """A reflectance model: declares its inputs and shades points, as separate radiance terms.
-
-    Register one object per subclass. In forward shading ("surfel") the `values` per surfel are shaded and
-    radiance is blended; in deferred shading ("pixel") they are blended, divided by alpha, and shaded. Where
-    traced rays hit the mesh, the model shades the attributes of the surfels around the hit.
-    """
+    """A reflectance model: declares its inputs and shades points, as separate terms. Register one object per
+    subclass. In forward shading ("surfel"), `values` per surfel are shaded and radiance is blended; in
+    deferred shading ("pixel") they are blended and shaded; hits of traced rays have attributes of the surfels
+    around."""
 
     name: str = ""
     shaded_at: tuple[ShadedAt, ...] = ("pixel", "surfel")  # where it may be shaded, the default first
@@ -80,8 +78,7 @@ class Reflectance:
 
     def values(self, surfels: Surfels, seen: SurfelView, options: ShadingOptions) -> dict[str, Any]:
         """Values (N,) by name (mi.Float, mi.Color3f, mi.Vector3f), under AD; a "normal" replaces
-        `seen.normal`. For hits of traced rays, `surfels` has only `has` and `value` of the
-        `required_attributes`."""
+        `seen.normal`. For hits of traced rays, `surfels` has only `has` and `value`."""
         raise NotImplementedError
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
