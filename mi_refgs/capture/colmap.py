@@ -185,8 +185,7 @@ def pairs_to_match(features: dict[str, np.ndarray]) -> list[tuple[str, str]]:
 
 
 def image_similarity(descriptors: Sequence[np.ndarray]) -> np.ndarray:
-    """Cosine similarities (N, N) of VLAD vectors of the images' features, with signed square roots. [Jégou et
-    al. 2010; Arandjelović and Zisserman 2013]"""
+    """Cosine similarities (N, N) of VLAD vectors, signed square roots. [Arandjelović and Zisserman 2013]"""
     rng = np.random.default_rng(0)
     drawn = [rng.permutation(d)[:WORD_SAMPLES].astype(np.float32) for d in descriptors]
     everything = np.concatenate(drawn)

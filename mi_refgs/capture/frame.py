@@ -101,8 +101,7 @@ def region_of_interest(solved: Solved) -> Region:
 
 
 def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
-    """The similarity to a world with +z up in which the region of interest is the unit ball around 0. The
-    first camera looks along +y when seen from above. `up` as in `up_direction`."""
+    """The similarity to +z up and the region as the unit ball around 0; the first camera looks along +y."""
     z = up_direction(solved, up)
     forward = solved.axis[0] - (solved.axis[0] @ z) * z
     if np.linalg.norm(forward) < 1e-3:  # it looks straight down

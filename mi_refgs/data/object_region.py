@@ -170,8 +170,7 @@ def _room(centres: np.ndarray, origins: np.ndarray) -> np.ndarray:
 
 
 def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatter) -> np.ndarray:
-    """The group (M, 3) of points (N, 3) above the region's planes that most views show, and that has the most
-    points in its sphere."""
+    """The group (M, 3) of points (N, 3) above the planes that most views show, with most in the sphere."""
     near = np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * region.radius
     points = points[near & region.above(points, scatter.lift * region.radius)]
     points = np.random.default_rng(0).permutation(points)[: 2 * MOST_POINTS]

@@ -35,8 +35,7 @@ def registered(view: View, render: Render, distance: float) -> View:
 
 
 def _difference(view: View, render: Render, block: int) -> np.ndarray:
-    """Render minus image, both averaged over block × block pixels as displayed, flat. Renders are averaged,
-    too: a smaller render would show other details, and fit best at another pose."""
+    """Render minus image, flat, both averaged over block² pixels: smaller renders differ in details."""
     shown, truth = (box_downscale(np.clip(image, 0, 1), block) for image in (render(view), view.displayed))
     return np.asarray(shown - truth, np.float64).ravel()
 

@@ -32,8 +32,7 @@ FLOAT, POINTS, VERTICES = 5126, 0, 34962
 def write_mesh(
     trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int
 ) -> list[Path]:
-    """glTF 2.0 in one file: a mesh with metallic-roughness textures. glTF is in metres with +y up, our world
-    has +z up: (x, y, z) becomes (x, z, −y). It has no environment light."""
+    """glTF 2.0 in one file, metres, +y up: (x, y, z) becomes (x, z, −y); without an environment light."""
     made = bake(trained, shots, faces, texture)
     # By the specification, roughness is green and metallic is blue.
     surface = np.stack([np.zeros_like(made.roughness), made.roughness, made.metallic], axis=-1)

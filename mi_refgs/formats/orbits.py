@@ -29,8 +29,7 @@ def shots_around(
     size: int = SIZE,  # pixels per side
     elevation: tuple[float, float] = ELEVATION,  # degrees
 ) -> list[Shot]:
-    """Return cameras on a sphere around the surfels, z up, evenly spread within each split. The images show
-    everything but strays (INSIDE). The first camera of a split is at middle height."""
+    """Cameras on a sphere around the surfels without strays (INSIDE), z up, spread within each split."""
     position, weight = _weighted(surfels)
     middle = _middle(position, weight)
     deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)

@@ -84,8 +84,7 @@ def _scene_of(parts: Sequence[Any]) -> Any:
 def prepare_folder(
     out: Path, wanted: dict[str, Any], overwrite: bool, relight: Sequence[LightFile] = ()
 ) -> None:
-    """Make the folders and record the settings `wanted`. Raises InputError for a folder with other files, or
-    of other settings, which `overwrite` removes."""
+    """Make the folders and record the settings; InputError if others are there, unless `overwrite`."""
     names = [light.name for light in relight]
     if len({*names}) < len(names):
         files = ", ".join(str(light.path) for light in relight)

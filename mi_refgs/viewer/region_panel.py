@@ -93,8 +93,7 @@ def support_planes(planes: Sequence[Plane]) -> Sequence[Plane]:
 
 
 def adjusted(region: Region, centre: np.ndarray, radius: float, heights: Sequence[float]) -> Region:
-    """Return a region with another centre (3,) and radius, and each support plane raised by scene units. The
-    box around a fitted object moves and grows with the sphere."""
+    """A region with another centre (3,) and radius, its support planes raised by scene units."""
     planes = [(a, b, c, d + up) for (a, b, c, d), up in zip(region.planes, heights, strict=False)]
     for a, b, c, d in region.planes[len(heights) :]:
         inward = d - float(np.dot((a, b, c), region.centre))

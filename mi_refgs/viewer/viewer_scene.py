@@ -78,8 +78,7 @@ class ViewerScene(ABC):
 
 
 def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Float]:
-    """Return what is averaged over samples, (H*W,) each: the premultiplied image or AOV, and alpha. An image
-    with background or environment map includes it; its alpha is 1."""
+    """Planes (H*W,) to average over samples: premultiplied image with what is behind, or AOV; alpha."""
     if look.what != IMAGE:
         return aov_planes(look.what, frame, camera)
     behind = frame.background
