@@ -341,4 +341,4 @@ def test_a_bad_command_writes_nothing(
 def test_an_existing_output_is_refused(finished: Path, tmp_path: Path) -> None:
     (tmp_path / "something").touch()
     for taken in (finished, tmp_path):
-        refused(["edit", finished, "-o", taken, "--keep"], "exists already; choose another -o")
+        refused(["edit", finished, "-o", taken, "--keep"], "choose an empty folder")

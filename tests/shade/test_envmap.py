@@ -74,7 +74,7 @@ def test_bad_input(tmp_path: Path) -> None:
     for shape in ((8, 8, 3), (10, 20, 3), (4, 8, 3), (8, 16, 1)):
         refused(partial(EnvironmentLight, dr.zeros(mi.TensorXf, shape)), "shape")
     (tmp_path / "file").write_text("")
-    refused(lambda: EnvironmentLight.constant(1, 8).write(tmp_path / "file" / "a.exr"), "cannot be written")
+    refused(lambda: EnvironmentLight.constant(1, 8).write(tmp_path / "file" / "a.exr"), "cannot be created")
 
 
 # ---------------- activation ----------------

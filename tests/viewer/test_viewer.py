@@ -23,6 +23,7 @@ from mi_refgs.editing.options import Change, Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
+from mi_refgs.fitting.state import FitState
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import to_8_bits
@@ -406,7 +407,7 @@ def test_a_fit_is_displayed_with_or_without_background(
     drawable = Training(trainer)
     assert "background" not in drawable.backdrops
     before = shown(drawable)
-    monkeypatch.setattr(Trainer, "surroundings", photographed.surroundings)
+    monkeypatch.setattr(FitState, "surroundings", photographed.surroundings)
     assert Training(trainer).backdrops == ("background", "white", "grey", "black")
     assert np.array_equal(shown(drawable), before)
     assert np.abs(shown(drawable, backdrop="background") - before).max() > 50
