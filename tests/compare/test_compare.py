@@ -192,6 +192,7 @@ def test_worker_ends_with_its_parent(ball: Path, variants: tuple[Path, Path]) ->
     assert process.wait(30) == -15
 
 
+@pytest.mark.slow
 def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Path], tmp_path: Path) -> None:
     """Another worker goes on from the checkpoint; the log has each iteration once."""
     distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
