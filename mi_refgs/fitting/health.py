@@ -43,10 +43,8 @@ class Health:
         background = None if state.surroundings is None else state.surroundings.background
         for name, light in ((LIGHT, state.light), (BACKGROUND, background)):
             if light is not None and light.unusable():  # its texel renders black, and no longer learns
-                raise InputError(
-                    f"{name}: a texel is not finite or too large; go on from a checkpoint with a lower "
-                    "rates.light"
-                )
+                remedy = "go on from a checkpoint with a lower rates.light"
+                raise InputError("a texel is not finite or too large", field=name, remedy=remedy)
         found = [(table, culprits(table.surfels, skipped, table.prefix)) for table in state.tables]
         rows = {table.prefix + name: at for table, names in found for name, at in names.items()}
         if not rows and not skipped.count:

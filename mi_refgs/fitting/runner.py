@@ -57,7 +57,8 @@ class Choice:
 
     def __post_init__(self) -> None:
         if isinstance(self.method, Method) and (self.preset or self.settings):
-            raise InputError("method: preset, settings: a Method has its own; change it, or name one")
+            what, remedy = "a Method has its own", "change it, or name one"
+            raise InputError(what, "method", "preset, settings", remedy)
         if self.purpose is not None and self.method is not None:
             what = f"{self.purpose}: --method {self.method} is given"
             raise InputError(what, "--for", remedy="give one of the two")
@@ -99,7 +100,8 @@ def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Pro
     TerminatedError with a message that says how to continue.
     """
     run = Run(output)
-    if resume and run.exists():
+    resumed = resume and run.exists()
+    if resumed:
         method = run.method()
         views = read_views(method, data, "train", truth=False)
         _require_same(run, method, choice, views)
@@ -112,7 +114,7 @@ def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Pro
     if not views.has_alpha and (method.surroundings is None or views.region is None):
         progress.warn(f"{data}: images without alpha: surfels start at random, and model the background too")
     with run.alone():
-        if not resume:  # asked again: another process may have begun a run while the data was read
+        if not resumed:  # asked again: another process may have begun a run while the data was read
             run.require_none()
         return _fit(method, views, run, progress)
 
@@ -129,9 +131,10 @@ def chosen(data: Path, choice: Choice, say: Tell = lambda _: None) -> tuple[Meth
         return sized(load_method(choice.method, choice.preset, choice.settings), data, say)
     # Settings of anything but images may be those of the other method.
     of_images = [text for text in methods.assignments(choice.settings) if text.startswith("data.")]
-    reads, views = sized(load_method(choice.named(), choice.preset, of_images), data, say)
-    name = _for_images(choice.named(), reads, views)
-    if name != choice.named():
+    named = choice.named()
+    reads, views = sized(load_method(named, choice.preset, of_images), data, say)
+    name = _for_images(named, reads, views)
+    if name != named:
         say(f"{data}: images without alpha: fitted with their background, by --method {name}")
     method = load_method(name, choice.preset, choice.settings)
     return method.downscaled(views.downscale), views
@@ -190,10 +193,8 @@ def begin(
     views = with_region(views, run.region(), tell)
     state = run.load_checkpoint() if resumed else None
     if resumed and state is None and (run.path / MODEL).is_file():
-        raise InputError(
-            f"{run.path}: checkpoints: none, but a scene that was edited, imported or copied, which a fit "
-            "would replace; choose another -o"
-        )
+        what = "none, but a scene that was edited, imported or copied, which a fit would replace"
+        raise InputError(what, run.path, "checkpoints", "choose another -o")
     if state is not None:
         method = as_decided(method, decisions_of(state))
     else:
@@ -247,8 +248,8 @@ def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn
             warn(f"{views.path}: no image shows the whole object; add some from farther away")
         region = found
     if not any(region_pixels(view, region).any() for view in views.views):
-        where = f"{views.path / REGION_FILE}: centre, radius, planes"
-        raise InputError(f"{where}: no view shows the region; correct or remove them")
+        file, fields = views.path / REGION_FILE, "centre, radius, planes"
+        raise InputError("no view shows the region", file, fields, "correct or remove them")
     return replace(views, region=region)
 
 

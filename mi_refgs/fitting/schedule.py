@@ -164,11 +164,10 @@ class FitSetup:
         wanted |= {name: shape for name, shape in per_view.items() if name in found}
         for name in wanted | found:
             if found.get(name) != wanted.get(name):
-                raise InputError(
-                    f"{run or 'checkpoint'}: {name}: it has {found.get(name, 'none')}, a fit of this method "
-                    f"to {self.data.path} {wanted.get(name, 'none')}; resume with the method and the data "
-                    "set that the run began with, or choose another -o"
-                )
+                has, wants = found.get(name, "none"), wanted.get(name, "none")
+                what = f"it has {has}, a fit of this method to {self.data.path} {wants}"
+                remedy = "resume with the method and the data set that the run began with"
+                raise InputError(what, run or "checkpoint", name, f"{remedy}, or choose another -o")
 
 
 GATHERED = "light_gradient"  # name of the gradient of the levels in a checkpoint

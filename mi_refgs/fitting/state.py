@@ -77,11 +77,6 @@ class ParameterTable:
         """The surfels, attached to the leaves that the optimiser owns."""
         return Surfels(channels_of(self.params, self.prefix))
 
-    @property
-    def count(self) -> int:
-        """Number of surfels."""
-        return int(self.params[f"{self.prefix}position"].shape[0])
-
     def clear(self) -> None:
         """Set the errors to zero."""
         self.error_sum = dr.opaque(mi.Float, 0, self.surfels.count)
@@ -96,9 +91,10 @@ class ParameterTable:
 
         Raises InputError for an edit whose arrays have other lengths than its surfels, or unknown parents.
         """
-        count, parents = edit.surfels.count, edit.parent
-        if not len(parents) == len(edit.fresh) == count or not np.isin(parents, np.arange(self.count)).all():
-            what = f"an edit to {count} surfels with {len(parents)} parents among {self.count} rows"
+        before, count, parents = self.surfels.count, edit.surfels.count, edit.parent
+        known = (parents >= 0) & (parents < before)
+        if not len(parents) == len(edit.fresh) == count or not known.all():
+            what = f"an edit to {count} surfels with {len(parents)} parents among {before} rows"
             raise InputError(what, "event", remedy="give each new row its old one in `parent` and `fresh`")
         order = morton_order(edit.surfels.raw["position"].numpy())
         parent, fresh = upload(edit.parent[order], mi.UInt32), upload(edit.fresh[order], mi.Bool)
