@@ -1,1 +1,1 @@
-"""Edits of a trained scene: selection, changes, union of two scenes."""
+"""Edits of a trained scene: selection and changes of its surfels."""

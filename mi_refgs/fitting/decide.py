@@ -70,6 +70,12 @@ def validates(trainer: Trainer) -> bool:
     return len(trainer.whole.views) >= HOLDOUT and bool(waiting(trainer))
 
 
+def per_view_begins(trainer: Trainer, after: int, parameter: str) -> bool:
+    """Whether a parameter with a row per training view begins to learn: once, when the views are final."""
+    waits = trainer.iteration < after or validates(trainer)
+    return not waits and parameter not in trainer.fit.params
+
+
 def hold_out(trainer: Trainer) -> None:
     """Fit all but the validation views as long as a decision needs them, then all views."""
     wanted = validates(trainer)

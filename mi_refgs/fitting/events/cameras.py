@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mi_refgs.fitting.decide import validates
+from mi_refgs.fitting.decide import per_view_begins
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.event import Event, register
@@ -28,8 +28,7 @@ class Cameras(Event[Trainer]):
     after: int = field(default=1_200, metadata=ITERATIONS | at_least(0))  # iterations before cameras learn
 
     def due(self, trainer: Trainer) -> bool:
-        waits = trainer.iteration < self.after or validates(trainer)
-        return not waits and POSE not in trainer.fit.params
+        return per_view_begins(trainer, self.after, POSE)
 
     def apply(self, trainer: Trainer) -> None:
         rows = np.zeros((len(trainer.data.views), 6), np.float32)

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mi_refgs.fitting.decide import validates
+from mi_refgs.fitting.decide import per_view_begins
 from mi_refgs.fitting.image_error import with_gain
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload_tensor
@@ -33,8 +33,7 @@ class Exposure(Event[Trainer]):
     after: int = field(default=1_200, metadata=ITERATIONS | at_least(0))  # iterations before gains learn
 
     def due(self, trainer: Trainer) -> bool:
-        waits = trainer.iteration < self.after or validates(trainer)  # decisions change the views
-        return not waits and GAIN not in trainer.fit.params
+        return per_view_begins(trainer, self.after, GAIN)
 
     def apply(self, trainer: Trainer) -> None:
         fit, data = trainer.fit, trainer.data
