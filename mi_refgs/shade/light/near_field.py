@@ -76,15 +76,14 @@ class NearField:
 
     def seen_from(self, position: Point3f, direction: Vector3f) -> Vector3f:
         """Unit directions from the centre to what rays from `position` in unit directions meet. The distance
-        is looked up, detached, in the direction of the last point that was found."""
+        is looked up in the direction of the last point that was found, under AD."""
         offset = mi.Vector3f(position) - mi.Vector3f(self.on_device[1])
-        with dr.suspend_grad():
-            towards, nearness = mi.Vector3f(direction), mi.Float(0)
-            for index in range(LOOKUPS):
-                found = self.at(towards)
-                nearness = dr.lerp(found, nearness, DAMPING) if index else found
-                towards = _met(offset, direction, nearness)
-        return _met(offset, direction, nearness)
+        towards, nearness = mi.Vector3f(direction), mi.Float(0)
+        for index in range(LOOKUPS):
+            found = self.at(towards)
+            nearness = dr.lerp(found, nearness, DAMPING) if index else found
+            towards = _met(offset, direction, nearness)
+        return towards
 
 
 def _met(offset: Vector3f, ray: Vector3f, nearness: Float) -> Vector3f:
