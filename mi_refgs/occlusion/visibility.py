@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+import trimesh
 
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload, upload_tensor
@@ -152,6 +155,15 @@ def _mitsuba_mesh(name: str, mesh: Mesh) -> Any:
     made = mi.Mesh(name, len(mesh.vertices), len(mesh.faces))
     _set_mesh(mi.traverse(made), "", mesh)
     return made
+
+
+def mesh_arrays(shape: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64, world, and faces (F, 3) int64 of a mesh of a scene, by its PLY file: Mitsuba
+    3.10 renamed the methods that return them."""
+    stream = mi.MemoryStream()
+    shape.write_ply(stream)
+    mesh: Any = trimesh.load(io.BytesIO(stream.raw_buffer()), "ply", process=False)
+    return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
 
 
 def _set_mesh(params: Any, prefix: str, mesh: Mesh) -> None:

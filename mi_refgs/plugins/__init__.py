@@ -6,8 +6,11 @@ Each variant has base classes of its own, so a plugin's module is imported or re
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import importlib
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 
@@ -30,3 +33,14 @@ def load() -> None:
             importlib.reload(sys.modules[module])
         else:
             importlib.import_module(module)
+
+
+def _quiet_conversions() -> None:
+    """Mitsuba tries each tensor of a dictionary as a vector and as colours; for one with three rows, nanobind
+    prints a line for each failure. Only its C++ function can switch that off."""
+    with contextlib.suppress(StopIteration, OSError, AttributeError):  # elsewhere, the lines stay
+        library = ctypes.CDLL(str(next(Path(mi.__file__).parent.glob("libnanobind*"))))
+        library._ZN8nanobind6detail26set_implicit_cast_warningsEb(False)
+
+
+_quiet_conversions()

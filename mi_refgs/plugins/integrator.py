@@ -18,7 +18,7 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.plugins import properties
 from mi_refgs.plugins.aovs import aov_values
 from mi_refgs.plugins.film import FilmImage
-from mi_refgs.plugins.light import light_of
+from mi_refgs.plugins.light import light_of, used_emitters, warn_of_ignored
 from mi_refgs.plugins.properties import BackgroundProperties
 from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
@@ -42,8 +42,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * filename (string): PLY file with surfels or 3D Gaussians: raw values (before the activation) of 2DGS or
        3DGS and of the attributes below. In Python, tensors may add or replace attributes.
      * light *or any name* (emitter): An ``envmap`` or ``constant`` emitter, copied into the integrator's own
-       light; in Python also the raw tensor of an ``EnvironmentLight``. (Default: the scene's environment
-       emitter of these types)
+       light; in Python also the raw tensor of an ``EnvironmentLight``. (Default: the scene's emitter of these
+       types and, unless the model samples its light, its ``directional`` ones)
      * near_field (string): File (.npz) with ``nearness`` (h, 2h), 1 / distance of what an unrotated
        ``envmap`` shows, seen from the point ``centre`` (3,). (Default: infinitely far)
      * mesh (string): PLY file of the mesh that occludes mirror reflections. (Default: none)
@@ -79,11 +79,13 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     Keys of ``mi.traverse`` start with the integrator's id: ``params['refgs.roughness']`` without another one.
 
-    The scene's shapes are not rendered, and the environment is visible in reflections only. Images have no
-    noise. A sample count n (of ``mi.render``, else of the sampler) gives ⌈√n⌉² regular samples per pixel, box
-    filtered; n = 1 takes pixel centres. The film's ``rfilter`` is not used. Derivatives in both modes reach
-    the parameters above, ``data``, ``scale`` or ``radiance.value`` of the scene's environment, and
-    ``to_world`` (rigid changes) and ``x_fov`` of sensors, but neither a background colour nor the mesh.
+    The scene's shapes are not rendered, and lights are visible in reflections only; directional light casts
+    no shadows on diffuse surfaces. One warning each names emitters and shapes that are not used. Images have
+    no noise. A sample count n (of ``mi.render``, else of the sampler) gives ⌈√n⌉² regular samples per pixel,
+    box filtered; n = 1 takes pixel centres. The film's ``rfilter`` is not used. Derivatives in both modes
+    reach the parameters above, ``data``, ``scale``, ``radiance.value`` or ``irradiance.value`` of the scene's
+    lights, and ``to_world`` (rigid changes) and ``x_fov`` of sensors, but neither a background colour nor the
+    mesh.
 
     A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 covers no
     pixel and gets zero gradient; such a value of the light is black. One warning names the attribute.
@@ -98,6 +100,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.surfels = properties.read_surfels(props)
         self.light, self.light_rotation = properties.read_light(props)
         self.near = properties.read_near_field(props)
+        self.seen = 0  # id of the scene whose ignored emitters and shapes were named
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
         self.shading, self.occluder = properties.read_shading(props, self.surfels)
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
@@ -168,6 +171,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self._warn_of_unusable()
         with dr.suspend_grad():
             image = self._image(scene, sensor, spp, forward_only=True).image()
+        if id(scene) != self.seen:
+            self.seen = id(scene)
+            warn_of_ignored(scene, [] if self.light else used_emitters(self.shading, scene))
         if evaluate:
             dr.eval(image)
         return image if develop else mi.TensorXf()

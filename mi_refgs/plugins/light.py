@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -24,8 +26,11 @@ from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.light.prefilter import prefilter
 from mi_refgs.shade.shading import Shading
+from mi_refgs.types import Color3f, Float, Vector3f
 
 MAX_HEIGHT = 512  # rows above which a map is downscaled: filtering 512 takes 45 ms on two cores
+LOBES = 0.05, 0.99  # roughnesses of directional light: the closed integral loses its digits beyond them
+NAMED = 8  # objects that a warning lists
 
 
 def own_light(emitter: Any) -> tuple[Any, Any]:
@@ -40,8 +45,12 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
 
 def emitter_light(emitter: Any, filtered: bool = True) -> Light:
     """The light of an emitter, `filtered` or with `radiance` only, under AD: gradients flow to `scale` and
-    `data`, or `radiance.value`. Raises InputError for resampled `data` with gradients, and other emitters."""
+    `data`, `radiance.value` or `irradiance.value`. Raises InputError for resampled `data` with gradients, and
+    other emitters."""
     params = mi.traverse(emitter)
+    if "irradiance.value" in params:
+        towards = -mi.Vector3f(params["to_world"] @ mi.Vector3f(0, 0, 1))
+        return DirectionalLight(dr.normalize(towards), mi.Color3f(params["irradiance.value"]))
     if "data" not in params:
         return ConstantLight(_constant_radiance(params, emitter))
     radiance, resampled = _map_radiance(params, emitter)
@@ -56,15 +65,78 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
     return rotated(light, _light_from_world(params))
 
 
+@dataclass(frozen=True)
+class DirectionalLight:
+    """Light from one direction, which has highlights and diffuse reflection, but cannot be seen itself."""
+
+    towards: Vector3f  # unit, world, to the light
+    arriving: Color3f  # irradiance on a surface that faces it, under AD
+
+    def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
+        """Value of the normalised lobe of `lobe_matrices.lobe`, whose integral is closed."""
+        α2 = dr.power(dr.clip(roughness, *LOBES), 4)
+        a, b = 0.5 * (1 + α2), 0.5 * (1 - α2)
+        whole = (a / α2 - 1 + dr.log(α2 / a)) / dr.square(b) * (2 * dr.pi)
+        cosine = dr.dot(direction, self.towards)
+        return self.arriving * (dr.maximum(cosine, 0) / (whole * dr.square(a - b * cosine)))
+
+    def irradiance(self, normal: Vector3f) -> Color3f:
+        return self.arriving * (dr.maximum(dr.dot(normal, self.towards), 0) / dr.pi)
+
+    def radiance(self, direction: Vector3f) -> Color3f:
+        return mi.Color3f(0)
+
+
+@dataclass(frozen=True)
+class SumOfLights:
+    """Several lights at once."""
+
+    lights: list[Light]
+
+    def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
+        return sum((light.specular(direction, roughness) for light in self.lights), mi.Color3f(0))
+
+    def irradiance(self, normal: Vector3f) -> Color3f:
+        return sum((light.irradiance(normal) for light in self.lights), mi.Color3f(0))
+
+    def radiance(self, direction: Vector3f) -> Color3f:
+        return sum((light.radiance(direction) for light in self.lights), mi.Color3f(0))
+
+
 def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scene: Any) -> Light | None:
-    """The integrator's light, else the scene's (InputError without one); None if the model uses none."""
+    """The integrator's light, else the sum of the scene's; None if the model uses none. Raises InputError
+    without one."""
     if shading.model.light == "none":
         return None
     if (light := shading.light_of(own)) is not None:
         return rotated(light, rotation)
-    if (emitter := scene.environment()) is None:
-        raise InputError("there is none", "refgs", "light", "nest an `envmap` in integrator or scene")
-    return emitter_light(emitter, shading.model.light == "filtered")
+    lights = [emitter_light(one, shading.model.light == "filtered") for one in used_emitters(shading, scene)]
+    if not lights:
+        what = f"refgs takes none of {_named(scene.emitters())}" if scene.emitters() else "there is none"
+        raise InputError(what, "refgs", "light", "nest an `envmap` in integrator or scene")
+    return lights[0] if len(lights) == 1 else SumOfLights(lights)
+
+
+def used_emitters(shading: Shading, scene: Any) -> list[Any]:
+    """The emitters of a scene that light its surfels, unless the integrator has a light of its own."""
+    directional = ["DirectionalEmitter"] if shading.model.light == "filtered" else []
+    return [one for one in scene.emitters() if one.is_environment() or one.class_name() in directional]
+
+
+def warn_of_ignored(scene: Any, used: list[Any]) -> None:
+    """One warning that names the emitters that are not `used`, and one that names the scene's shapes."""
+    if unused := [emitter for emitter in scene.emitters() if not any(emitter is one for one in used)]:
+        what = f"refgs does not use the scene's emitters {_named(unused)}"
+        warnings.warn(f"{what}: its light is `light`, or an environment", RuntimeWarning, stacklevel=3)
+    if scene.shapes():
+        what = f"refgs does not render the scene's shapes {_named(scene.shapes())}"
+        warnings.warn(f"{what}: it renders surfels, which its `mesh` occludes", RuntimeWarning, stacklevel=3)
+
+
+def _named(objects: list[Any]) -> str:
+    names = [f"{one.class_name()} '{one.id()}'".removesuffix(" ''") for one in objects]
+    more = [f"{len(objects) - NAMED} more"] if len(objects) > NAMED else []
+    return ", ".join(sorted(names)[:NAMED] + more)
 
 
 def rotated(light: Light, light_from_world: Any) -> Light:

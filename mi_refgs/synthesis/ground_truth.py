@@ -14,6 +14,7 @@ import trimesh
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError
+from mi_refgs.occlusion.visibility import mesh_arrays
 from mi_refgs.types import Bool, Color3f, Float, Scene
 
 OPAQUE = 1e-3  # fraction of transmitted light, or weight of the other BSDF of a blend, that is neglected
@@ -190,8 +191,7 @@ def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     import mitsuba as mi
 
     if shape.is_mesh():
-        points = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
-        return points, np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+        return mesh_arrays(shape)
     name = shape.class_name()
     params = mi.traverse(shape)
     if name not in UNIT_SHAPES or "to_world" not in params:

@@ -12,6 +12,7 @@ import numpy as np
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
+from mi_refgs.occlusion.visibility import mesh_arrays
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.synthesis.ground_truth import materials_at
 from mi_refgs.synthesis.options import DatasetOptions
@@ -43,7 +44,7 @@ def reach(shapes: Sequence[Any], centre: np.ndarray) -> float:
     radius = 0.0
     for shape in shapes:
         if shape.is_mesh():
-            points = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+            points, _ = mesh_arrays(shape)
         else:
             points = np.array(shape.sample_position(0.0, mi.Point2f(x, y)).p, dtype=np.float64).T
         radius = max(radius, float(np.linalg.norm(points - centre, axis=1).max()))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -138,3 +140,18 @@ def test_detached_and_total_on_degenerate_rays() -> None:
     assert np.array(answer)[[0, 1, 2, 5]].all()
     normal = dr.zeros(mi.Vector3f, 1)
     assert np.array(occluder.visible(mi.Point3f(-5, 0, 0), mi.Vector3f(1, 0, 0), normal)).tolist() == [0]
+
+
+def test_meshes_are_made_and_read_as_mitsuba_3_10_has_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made of tensors, by keyword, and read without the methods that it renamed. [mitsuba3, #1933]"""
+    box = trimesh.creation.box((1, 2, 3))
+    vertices, faces = box.vertices.astype(np.float32), box.faces.astype(np.uint32)
+    made = visibility._mitsuba_mesh("box", Mesh(vertices, faces, 0.1))
+    read = visibility.mesh_arrays(SimpleNamespace(write_ply=made.write_ply))
+    for found, expected in zip(read, (vertices, faces), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    later = SimpleNamespace(Mesh=lambda name, **given: given, TensorXf=mi.TensorXf, TensorXu=mi.TensorXu)
+    monkeypatch.setattr(visibility, "mi", later)
+    given = visibility._mitsuba_mesh("box", Mesh(vertices, faces, 0.1))
+    np.testing.assert_array_equal(given["positions"].numpy(), vertices)
+    np.testing.assert_array_equal(given["faces"].numpy(), faces)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.constants import TILE_SIZES, tile_size
+from mi_refgs.plugins.light import LOBES, DirectionalLight
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
@@ -77,6 +79,53 @@ def test_terms_add_up_and_radiance_needs_no_light() -> None:
     np.testing.assert_allclose(parts.sum(2), shown[..., :3], atol=1e-5)
     assert parts[..., 0, :].max() > 0.1 and parts[..., 1, :].max() > 0.01
     assert image(lit_scene(None, reflectance="radiance")).max() > 0.1
+
+
+def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
+    """A directional light and a constant one; the derivative of a colour is the image of its light."""
+    sky = {"type": "constant", "radiance": 0.3}
+    sun = {
+        "type": "directional",
+        "direction": [-1, -1, -0.5],
+        "irradiance": {"type": "rgb", "value": [3, 2, 1]},
+    }
+
+    def lit(**emitters: dict) -> mi.Scene:
+        inner = integrator(diffuse="irradiance")
+        del inner["light"]
+        return mi.load_dict({"type": "scene", "i": inner, "s": sensor(), **emitters})
+
+    alone = image(lit(sun=sun))
+    assert alone.max() > 0.1
+    both = lit(sky=sky, sun=sun)
+    np.testing.assert_allclose(image(both), image(lit(sky=sky)) + alone, atol=1e-6)
+    params, t = mi.traverse(both), mi.Float(1)
+    dr.enable_grad(t)
+    params["sun.irradiance.value"] = mi.Color3f(3, 2, 1) * t
+    params.update()
+    rendered = mi.render(both, params)
+    dr.set_grad(t, 1)
+    tangent = dr.forward_to(rendered)
+    np.testing.assert_allclose(tangent.numpy(), alone, atol=1e-6)
+
+    lamp = {"type": "rectangle", "bulb": {"type": "area"}}
+    more = lit(sky=sky, spot={"type": "spot"}, lamp=lamp, floor={"type": "disk"})
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        image(more), image(more)
+    emitters, shapes = (str(warning.message) for warning in told)
+    assert "AreaLight 'bulb', SpotLight 'spot'" in emitters and "'sky'" not in emitters
+    assert "Disk 'floor', Rectangle 'lamp'" in shapes
+    refused(lambda: image(lit(spot={"type": "spot"})), "refgs takes none of SpotLight 'spot'")
+
+
+def test_the_lobe_of_a_directional_light_is_normalised() -> None:
+    w = np.linspace(0, np.pi, 100_001)[1:]
+    towards = mi.Vector3f(*(mi.Float(x.astype(np.float32)) for x in (np.sin(w), 0 * w, np.cos(w))))
+    light = DirectionalLight(mi.Vector3f(0, 0, 1), mi.Color3f(1))
+    for roughness in (*LOBES, 0.3, 0.7):
+        values = np.array(light.specular(towards, mi.Float(roughness)))[0]
+        assert np.sum(values * np.sin(w)) * 2 * np.pi * w[0] == pytest.approx(1, abs=1e-2), roughness
 
 
 # ---------------- parameters ----------------
