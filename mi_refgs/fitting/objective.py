@@ -1,4 +1,4 @@
-"""The loss of one rendered view: image losses, and registered losses with the weights of the method."""
+"""The loss of one rendered view: the sum of registered losses, with the weights of the method."""
 
 from __future__ import annotations
 
@@ -24,18 +24,24 @@ from mi_refgs.types import Float
 
 MATERIALS = ("roughness", "metallic")  # maps that neighbouring pixels of similar colour share
 MATERIAL_EDGE = 10.0  # steepness of edges that are kept: a step of 0.1 between pixels counts a third
-GAIN_PRIOR = 1e-3  # weight of the squared log gains: two stops cost as much as 0.6 % of brightness
 
 
 @dataclass(frozen=True)
 class LossInputs:
-    """What a loss may read of a step."""
+    """What a loss may read of a step: an image of H rows of W pixels, as planes (H·W,) in raster order."""
 
-    frame: Frame  # with derivatives
-    image: list[Float]  # three planes (H*W,), display-encoded as the target
+    frame: Frame
+    """With derivatives: linear radiance (premultiplied by alpha), alpha 0 … 1, depth in scene units, blended
+    world normals, materials 0 … 1 in `maps`; see `Frame` for where each is defined."""
+    image: list[Float]
+    """R, G, B with derivatives: display-encoded (sRGB), over the background, clipped where the target is."""
     target: Target
-    light: Light | None  # with derivatives; without it, losses on it are left out
-    log_gain: list[Float] | None = None  # log exposure of the image, three of width 1; by default 0
+    """The training view, without derivatives: `image` as above, `alpha` 0 … 1 or None, and its `camera`, of
+    `width` W and `height` H."""
+    light: Light | None
+    """With derivatives, linear radiance by world direction: `light.irradiance(normal)` is the cosine-weighted
+    mean. None without a light, where a loss on it returns None."""
+    log_gain: list[Float] | None = None  # natural log of the exposure of R, G, B, width 1 each; None: 0
     photographed: PhotographedLight | None = None  # what photographs show of the light, if there is any
 
     @staticmethod
@@ -57,7 +63,7 @@ class LossInputs:
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss beside the image losses."""
+    """A loss, which a method weighs by its name; the same for all of a fit, photometric or not."""
 
     name: str  # of its weight in `[loss]` of a method file
     value: Callable[[LossInputs], Float | None]  # width 1; None: not defined for these inputs
@@ -69,9 +75,9 @@ class Loss:
 
 def _check_name(loss: Loss) -> None:
     """Raise InputError for a name that a method file cannot weigh."""
-    if not re.fullmatch("[A-Za-z0-9_-]+", loss.name) or loss.name == "ssim":
+    if not re.fullmatch("[A-Za-z0-9_-]+", loss.name):
         raise InputError(
-            f"'{loss.name}' is in use in [loss], or has characters besides letters, digits, _ and -",
+            f"'{loss.name}' has characters besides letters, digits, _ and -",
             "loss",
             remedy="choose another name",
         )
@@ -79,6 +85,20 @@ def _check_name(loss: Loss) -> None:
 
 LOSSES = Registry[Loss]("loss", _check_name)  # in the order in which they are summed
 register = LOSSES.register
+
+
+def _l1(inputs: LossInputs) -> Float:
+    return losses.l1(inputs.image, inputs.target.image)
+
+
+def _gain(inputs: LossInputs) -> Float | None:
+    squares = [dr.square(value) for value in inputs.log_gain or ()]
+    return squares[0] + squares[1] + squares[2] if squares else None
+
+
+def _ssim(inputs: LossInputs) -> Float:
+    camera = inputs.target.camera
+    return losses.d_ssim(inputs.image, inputs.target.image, camera.width, camera.height)
 
 
 def _normal(inputs: LossInputs) -> Float:
@@ -121,6 +141,9 @@ def _photographed(inputs: LossInputs) -> Float | None:
     return inputs.photographed.difference(inputs.light)
 
 
+register(Loss("l1", _l1))
+register(Loss("gain", _gain))
+register(Loss("ssim", _ssim))
 register(Loss("normal", _normal, normals=True))
 register(Loss("smooth", _smooth, normals=True))
 register(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
@@ -131,10 +154,10 @@ register(Loss("alpha", _alpha))
 
 
 def require_losses(method: Method) -> None:
-    """Raise InputError for a loss that is not registered, or whose inputs the method lacks."""
+    """Raise InputError for a loss that is not registered or whose inputs the method lacks."""
     attributes = method.surfels.names
     deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())
-    for name in method.loss.keys() - {"ssim"}:
+    for name in method.loss:
         loss = LOSSES.find(name, f"loss.{name}")
         absent = [f"the attribute {one}" for one in loss.attributes if one not in attributes]
         absent += ["a stage at = pixel"] * (loss.maps and not deferred)
@@ -159,19 +182,16 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
         for name, window in weights.items()
         if (weight := window.at(iteration))
     }
-    ssim = factors.get("ssim", 0)
-    loss = (1 - ssim) * losses.l1(image, target.image)
-    if inputs.log_gain is not None:
-        loss += GAIN_PRIOR * sum((dr.square(value) for value in inputs.log_gain), mi.Float(0))
-    if "ssim" in factors:
-        width, height = target.camera.width, target.camera.height
-        loss += ssim * losses.d_ssim(image, target.image, width, height)
+    loss = None
     for name, registered in LOSSES.items():
         if name in factors and (value := registered.value(inputs)) is not None:
             if dr.width(value) != 1:
                 raise InputError(
                     f"has {dr.width(value)} values", f"loss.{name}", remedy="reduce it, as with dr.mean"
                 )
-            loss += factors[name] * value
+            value = factors[name] * value
+            loss = value if loss is None else loss + value
+    if loss is None:
+        raise InputError(f"none in iteration {iteration}", "loss", remedy="give one a weight, as l1 = 0.8")
     squares = (dr.square(dr.detach(a) - b) for a, b in zip(image, target.image, strict=True))
     return loss, sum(squares, mi.Float(0)) / 3

@@ -150,10 +150,10 @@ class Rates:
 @dataclass(frozen=True)
 class LossWeight:
     """Weight of the loss NAME over the iterations; a number in `[loss]`, `NAME = 0.1`, is its `weight` alone.
-    L = (1 - `ssim`) L1 + `ssim` (1 - SSIM) + `normal` L_n + `smooth` L_s + `alpha` L_α, and priors:
-    `half_metal` prefers metallic near 0 or 1, `materials` equal roughness and metallic of neighbouring pixels
-    of similar colour, `light_colour` a grey light over a grey albedo, `photographed` a light that is the
-    background of the photographs. Any other NAME is one of `register_loss`.
+    L = `l1` L1 + `ssim` (1 - SSIM) + `normal` L_n + `smooth` L_s + `alpha` L_α, and priors: `gain` prefers
+    equal exposures, `half_metal` metallic near 0 or 1, `materials` equal roughness and metallic of
+    neighbouring pixels of similar colour, `light_colour` a grey light over a grey albedo, `photographed` a
+    light that is the background of the photographs. Any other NAME is one of `register_loss`.
 
     Losses on material maps apply to deferred stages only: forward shading blends no materials.
     """
@@ -173,6 +173,8 @@ class LossWeight:
 LOSS_WEIGHTS = dict.fromkeys(
     ("alpha", "half_metal", "materials", "light_colour", "photographed"), LossWeight(0.0)
 ) | {
+    "l1": LossWeight(0.8),
+    "gain": LossWeight(1e-3),  # two stops cost as much as 0.6 % of brightness
     "ssim": LossWeight(0.2),
     "normal": LossWeight(0.05),
     "smooth": LossWeight(0.0, until=18_000),
@@ -249,10 +251,7 @@ class Method:
 
     def check(self) -> None:
         """Raise InputError for an unknown name, and for a stage or an event without what it needs."""
-        surfels, ssim = self.surfels, self.loss.get("ssim")
-        if ssim is not None and ssim.weight > 1:  # the rest, 1 - ssim, is the weight of L1
-            what = f"{ssim.weight} is out of range"
-            raise InputError(what, field="loss.ssim.weight", remedy="give a number from 0 to 1")
+        surfels = self.surfels
         PRIMITIVES.find(surfels.primitive, "surfels.primitive")
         if self.surroundings is not None:
             PRIMITIVES.find(self.surroundings.primitive, "surroundings.primitive")

@@ -51,7 +51,7 @@ def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def test_perfect_image_costs_nothing(linear: bool, picture: tuple[np.ndarray, np.ndarray]) -> None:
     """8-bit images are composited as displayed, linear ones before they are encoded; either once."""
     data, target = made(linear, *picture)
-    weights = {"ssim": LossWeight(0.2), "alpha": LossWeight(0.3)}
+    weights = {"l1": LossWeight(0.8), "ssim": LossWeight(0.2), "alpha": LossWeight(0.3)}
     loss, error = objective(LossInputs.of(frame_of(*picture), target, data), weights, 1)
     assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
 
@@ -61,7 +61,7 @@ def test_losses_are_weighed_as_method_says(
 ) -> None:
     data, target = made(True, *picture)
     radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
-    weights = {"ssim": LossWeight(0.3), "alpha": LossWeight(0.4)}
+    weights = {"l1": LossWeight(0.7), "ssim": LossWeight(0.3), "alpha": LossWeight(0.4)}
     loss, error = objective(LossInputs.of(frame_of(radiance, alpha), target, data), weights, 1)
     shown, goal = (
         reference.srgb(x + (1 - a[..., None]) * BACKGROUND) for x, a in ((radiance, alpha), picture)
@@ -84,6 +84,7 @@ def test_priors_are_weighed_as_method_says(
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
 
     def loss(iteration: int = 1, **weights: LossWeight) -> float:
+        weights = {"l1": LossWeight(0.8)} | weights
         return float(objective(LossInputs.of(frame, target, data, light), weights, iteration)[0][0])
 
     rest, half = loss(), reference.half_metal(maps["metallic"], alpha)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.fitting.objective import LOSSES
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.types import Float
+from tests.helpers import refused
 from tests.scenes.highlight import without
 
 SETTINGS = ["iterations=30", "surfels.count=80", "surfels.max_count=100", "stage.initial.until=1"]
@@ -53,6 +55,28 @@ def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path, reg
     assert without < early < weighed
 
 
+def test_photometric_loss_is_replaced_or_required(data: Path, method: Path) -> None:
+    """L1 and SSIM are losses like others: without them a step lowers what is left."""
+
+    def squared(inputs: mi_refgs.LossInputs) -> Float:
+        pairs = zip(inputs.image, inputs.target.image, strict=True)
+        return sum((dr.mean(dr.square(a - b)) for a, b in pairs), mi.Float(0)) / 3
+
+    mi_refgs.register_loss(mi_refgs.Loss("squared", squared))
+    try:
+        settings = [*SETTINGS, "loss.l1=0", "loss.ssim=0", "loss.normal=0"]
+        for more in (["loss.squared=1"], []):
+            chosen = methods.load(str(method), "quick", [*settings, *more])
+            trainer = Trainer(without(chosen), read_dataset(data, "train", truth=False))
+            if more:
+                trainer.step()
+                assert float(trainer.loss[0]) == pytest.approx(float(trainer.error[0]), rel=1e-5)
+            else:
+                refused(trainer.step, "loss: none in iteration 1; give one a weight")
+    finally:
+        LOSSES.unregister("squared")
+
+
 def test_loss_per_pixel_is_refused(data: Path, method: Path) -> None:
     mi_refgs.register_loss(mi_refgs.Loss("uneven", lambda inputs: inputs.frame.object_alpha))
     try:
@@ -63,12 +87,12 @@ def test_loss_per_pixel_is_refused(data: Path, method: Path) -> None:
 
 
 def test_loss_that_is_not_registered_is_refused(data: Path, method: Path) -> None:
-    with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: 'rough' is unknown; use normal or"):
+    with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: 'rough' is unknown; use l1 or"):
         roughness_after(data, method, "loss.rough=1.0")
 
 
-@pytest.mark.parametrize("name", ["ssim", "normal", "a.b", "a b", ""])
+@pytest.mark.parametrize("name", ["l1", "normal", "a.b", "a b", ""])
 def test_loss_that_a_method_file_cannot_name_is_refused(name: str) -> None:
     with pytest.raises(mi_refgs.InputError, match="choose another name"):
         mi_refgs.register_loss(mi_refgs.Loss(name, rough))
-    assert name == "normal" or name not in LOSSES
+    assert name in ("l1", "normal") or name not in LOSSES

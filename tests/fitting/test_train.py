@@ -18,7 +18,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import train
 from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.method import DataOptions, Method, Rates
+from mi_refgs.methods.method import DataOptions, LossWeight, Method, Rates
 from mi_refgs.runs.interrupt import TerminatedError, held_interrupts
 from mi_refgs.runs.run import Run
 from tests.scenes.highlight import SIZE, ball, require_same_state, run_folder, small_method, step_to, without
@@ -149,7 +149,9 @@ def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
 ) -> None:
     """As a step on the whole image that weighs the pixels of the crop alone."""
     only = {"only": dataclasses.replace(method.stage["deferred"], until=30)}
-    plain = dataclasses.replace(without(method, "mesh"), stage=only, data=DataOptions(), loss={})
+    plain = dataclasses.replace(
+        without(method, "mesh"), stage=only, data=DataOptions(), loss={"l1": LossWeight(1)}
+    )
     cropped = Trainer(dataclasses.replace(plain, data=DataOptions(crop=12 * 12)), ball())
     column, row, width, height = cropped.setup.crop(1, SIZE, SIZE) or (0, 0, SIZE, SIZE)
     assert width == height == 8

@@ -52,6 +52,8 @@ noise = 0.1
 [data]
 coarse = [{ until = 6, block = 3 }, { until = 12, block = 2 }]
 [loss]
+l1 = 1.0
+gain = 1e-3
 smooth = 0.1
 alpha = 0.1
 """

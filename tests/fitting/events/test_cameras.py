@@ -161,6 +161,7 @@ until = 480
 at = "surfel"
 reflectance = "radiance"
 [loss]
+l1 = 1.0
 normal = 0
 [rates]
 attribute = { position = 2e-5, radiance_sh = 2e-4, scale = 2e-4, rotation = 2e-4, opacity = 2e-4 }

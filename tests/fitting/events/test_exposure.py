@@ -16,12 +16,12 @@ from mi_refgs.data.exposure import fitted_gain
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import image_error, per_view
 from mi_refgs.fitting.events.exposure import DEAD_ZONE, Exposure
-from mi_refgs.fitting.objective import GAIN_PRIOR, LossInputs, objective
+from mi_refgs.fitting.objective import LossInputs, objective
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import GAIN, DataOptions, Method
+from mi_refgs.methods.method import GAIN, LOSS_WEIGHTS, DataOptions, Method
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.run import Run
@@ -31,6 +31,7 @@ from tests.helpers import with_pixels
 from tests.scenes.highlight import ball, require_same_state, run_folder, small_method, step_to
 
 GAINS = np.array([1.4, 0.7, 0.9])
+WEIGHTS = {name: LOSS_WEIGHTS[name] for name in ("l1", "gain")}
 AFTER = 8
 
 
@@ -85,13 +86,15 @@ def test_exposure_of_step_and_its_derivative(
     def define(log: np.ndarray) -> float:
         image = shown(radiance, alpha, linear, np.exp(log))
         image = encode(image) if linear else image
-        return reference.l1(image, goal, clipped) + GAIN_PRIOR * float(np.sum(log**2))
+        return WEIGHTS["l1"].weight * reference.l1(image, goal, clipped) + WEIGHTS["gain"].weight * float(
+            np.sum(log**2)
+        )
 
     log = np.array([0.3, -0.4, 0.2])
     leaves = [mi.Float(float(value)) for value in log]
     dr.enable_grad(leaves)
     frame = Frame(upload(alpha), upload(alpha), mi.Vector3f(0, 0, 1), mi.Color3f(*planes(radiance)))
-    loss, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), {}, 1)
+    loss, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), WEIGHTS, 1)
     assert float(loss[0]) == pytest.approx(define(log), abs=3e-6)
     expected = gradient(define, log)
     dr.backward(loss, dr.ADFlag.ClearInterior)
@@ -99,7 +102,7 @@ def test_exposure_of_step_and_its_derivative(
     np.testing.assert_allclose(found, expected, rtol=2e-4)
     for leaf, tangent in zip(leaves, (0.5, -1.0, 2.0), strict=True):
         dr.set_grad(leaf, mi.Float(tangent))
-    moved, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), {}, 1)
+    moved, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), WEIGHTS, 1)
     dr.forward_to(moved)
     assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
 
