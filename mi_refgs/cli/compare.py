@@ -1,4 +1,4 @@
-"""`refgs compare`: methods fitted to the same data sets, with tables, plots and a page."""
+"""`refgs compare`: methods fitted to the same data sets, and their table."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class Compare:
 
     def run(self) -> Result:
         """Run the missing jobs, then tabulate all runs in the folder."""
-        from mi_refgs.compare import execute, jobs, page
-        from mi_refgs.compare.table import markdown
+        from mi_refgs.compare import execute, jobs
+        from mi_refgs.compare.table import TABLE, TABLE_TEXT, markdown, write
 
         if self.data:
             workers = 1 if self.workers is None else self.workers
@@ -85,8 +85,8 @@ class Compare:
                 if given[name] not in (None, ()):
                     remedy = "name the data sets to which to fit the methods"
                     raise InputError("none given", f"--{name}", "DATA", remedy)
-        table = page.write(self.output)
-        files = ", ".join(str(self.output / name) for name in (jobs.PAGE, jobs.TABLE_TEXT, jobs.TABLE))
+        table = write(self.output)
+        files = ", ".join(str(self.output / name) for name in (TABLE_TEXT, TABLE))
         text = f"{markdown(table)}\n{files}"
         return Result(dataclasses.asdict(table), text, 0 if table.complete else 3)
 

@@ -1,1 +1,1 @@
-"""Comparison of methods: many fits, each a run, and tables, plots and a page."""
+"""Comparison of methods: many fits, each a run, and their table."""

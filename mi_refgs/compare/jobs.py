@@ -1,5 +1,5 @@
 """The jobs of a comparison: one per data set, method and seed, each with its own run folder. Files of a
-comparison beside its runs: compare.json (settings); table.json, table.md and a page with images."""
+comparison beside its runs: compare.json (settings), table.json and table.md."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mi_refgs.runs.run import Run
 from mi_refgs.runs.views import read_views, sized
 
 RUNS = "runs"  # runs/<data>/<method>/seed<k>
-SETTINGS, TABLE, TABLE_TEXT, PAGE = "compare.json", "table.json", "table.md", "index.html"
+SETTINGS = "compare.json"
 JOB, FAILED = "job.json", "failed.json"  # of a run folder: its job, and why it failed
 MAX_SEED = 2**31 - 1
 

@@ -1,10 +1,11 @@
-"""The table of a comparison: mean ± standard deviation over seeds per scene and method; as Markdown."""
+"""The table of a comparison: mean ± standard deviation over seeds per scene and method."""
 
 from __future__ import annotations
 
+import json
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from mi_refgs.compare.jobs import FAILED, Job, finished, jobs_in, require_one_si
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.evaluation.scores import SCORES, Score, caption
-from mi_refgs.io.files import read_json
+from mi_refgs.io.files import read_json, write_bytes
 
+TABLE, TABLE_TEXT = "table.json", "table.md"  # in the folder of the comparison
 NOTHING = "–"
 COLUMNS = tuple(score for score in SCORES if score.compared)
 
@@ -73,6 +75,18 @@ class Table:
     def complete(self) -> bool:
         rows = [row for scene in self.scenes for row in scene.rows]
         return not any(row.failed or row.unfinished for row in rows)
+
+
+def write(folder: Path) -> Table:
+    """Write the table of all jobs in a folder as table.json and table.md; InputError without a job."""
+    table = table_of(folder)
+    if not table.scenes:
+        what = "none given, and the folder has no comparison"
+        raise InputError(what, "DATA", remedy="name data sets to fit")
+    content = json.dumps(asdict(table), indent=1, ensure_ascii=False)
+    write_bytes(folder / TABLE, f"{content}\n".encode())
+    write_bytes(folder / TABLE_TEXT, markdown(table).encode())
+    return table
 
 
 def table_of(folder: Path) -> Table:
@@ -148,7 +162,7 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
 
 
 def markdown(table: Table) -> str:
-    """Return one table per scene, failures, and deviations of methods as numbered footnotes."""
+    """Return one table per scene, failures, deviations of methods as footnotes, and how it was made."""
     lines: list[str] = []
     for scene in table.scenes:
         columns = columns_of(scene)
@@ -158,7 +172,12 @@ def markdown(table: Table) -> str:
         lines += [f"{remark}\n" for remark in remarks(scene)]
     if table.footnotes:
         lines += ["Deviations from the originals:", ""]
-        lines += [f"{number}. {text}" for number, text in enumerate(table.footnotes, 1)]
+        lines += [*(f"{number}. {text}" for number, text in enumerate(table.footnotes, 1)), ""]
+    about = table.about
+    if about:
+        machines = (", ".join(f"{key} {value}" for key, value in one.items()) for one in table.machines)
+        by = f"mi_refgs {about['version']}, preset {about['preset']}, {about['workers']} jobs at once"
+        lines += [f"Made by {'; '.join([by, *machines])}:", "", f"    {about['command']}"]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import html
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -19,8 +17,9 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
-from mi_refgs.compare import execute, jobs, page
+from mi_refgs.compare import execute, jobs
 from mi_refgs.compare.jobs import Job, Shared
+from mi_refgs.compare.table import write
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import decide
 from mi_refgs.io.ownership import RUN, own_folder
@@ -281,23 +280,18 @@ def test_other_settings_are_refused_by_the_run_itself(
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
 
 
-# ---------- The page ----------
-
-
-def test_page_has_table_failures_and_deviations(compared: tuple[Path, int]) -> None:
+def test_table_says_how_it_was_made(compared: tuple[Path, int]) -> None:
     folder, _ = compared
-    page = (folder / "index.html").read_text()
-    tags = re.findall(r"<(/?)(table|tr|td|th|h2|p|b|ol|li|pre)>", page)
-    assert sum(not closing for closing, _ in tags) == sum(bool(closing) for closing, _ in tags) > 20
+    text = (folder / "table.md").read_text()
     command_line = json.loads((folder / "compare.json").read_text())["command"]
-    for said in ("a ball <and> no scene", "llvm_ad_rgb", "cannot be created", command_line):
-        assert html.escape(said) in page, said
+    for said in ("a ball <and> no scene", "llvm_ad_rgb", "2 jobs at once", command_line):
+        assert said in text, said
 
 
 def test_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Path) -> None:
     folder = copied(compared[0], tmp_path / "copy")
     (folder / "runs" / "ball" / "other" / "seed0" / "config.toml").write_text("future = 1")
-    row = page.write(folder).scenes[0].rows[1]
+    row = write(folder).scenes[0].rows[1]
     assert row.seeds == [1] and "future" in row.failed[0]
 
 
