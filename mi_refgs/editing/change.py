@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refgs.editing.options import Assignments, Change
+from mi_refgs.editing.options import Assignments
 from mi_refgs.editing.placement import MAJORITY, Owners
 from mi_refgs.editing.selection import COLOUR, SurfelValues, activated
 from mi_refgs.errors import InputError, abbreviated
@@ -59,28 +59,27 @@ def assignments(given: Assignments) -> tuple[Assignment, ...]:
 def apply(
     scene: TrainedScene,
     chosen: np.ndarray,  # (N,) bool
-    change: Change,
+    made: Sequence[Assignment] = (),
+    cut: bool = False,
 ) -> TrainedScene:
-    """Return the scene with the chosen surfels and their triangles changed; `materials` is the caller's.
+    """Return the scene with the chosen surfels changed, or `cut`, and their triangles.
 
     All other surfels keep their values bit for bit, and the order stays. Raises InputError for values that
-    cannot be set, for options that contradict each other, and if no surfel would be left.
+    cannot be set, for a cut of what is set, and if no surfel would be left.
     """
-    if change.cut and (change.set or change.keep):
+    if cut and made:
         raise InputError("what is removed cannot be changed, too", "--cut", remedy="leave the rest out")
-    if change.cut and chosen.all():
+    if cut and chosen.all():
         raise InputError("no surfel would be left", "--cut", remedy="choose fewer")
     values = SurfelValues(scene)
     raw = values.raw
     own = {name: table[chosen] for name, table in raw.items()}
-    for assignment in assignments(change.set):
+    for assignment in made:
         _assign(values, own, assignment)
-    mesh = _mesh(scene, chosen, own["opacity"], change)
+    mesh = _mesh(scene, chosen, own["opacity"], cut)
     for name, table in raw.items():
-        if change.cut:
+        if cut:
             raw[name] = table[~chosen]
-        elif change.keep:
-            raw[name] = own[name]
         else:
             table[chosen] = own[name]
     return replace(scene, surfels=Surfels.from_numpy(raw), mesh=mesh)
@@ -90,21 +89,20 @@ def _mesh(
     scene: TrainedScene,
     chosen: np.ndarray,  # (N,) bool
     opacity: np.ndarray,  # (chosen, 1) raw, after the change
-    change: Change,
+    cut: bool,
 ) -> Mesh | None:
     """Return the mesh after a change: triangles whose surfels are removed or have become transparent go."""
     mesh, before = scene.mesh, scene.surfels.to_numpy()["opacity"]
-    stays = np.array_equal(before[chosen], opacity) and not (change.cut or change.keep)
+    stays = np.array_equal(before[chosen], opacity) and not cut
     if mesh is None or not len(mesh.faces) or stays:
         return mesh
     owners = Owners(scene)
-    theirs, others = owners.of(chosen), ~owners.of(np.ones(len(chosen), bool))
-    if change.cut:
+    theirs = owners.of(chosen)
+    if cut:
         return mesh.part(~theirs)
     after = sigmoid(before[:, 0])
     after[chosen] = sigmoid(opacity[:, 0])
-    solid = theirs & (owners.share(after) >= MAJORITY)
-    return mesh.part(solid | (others if change.keep else ~theirs))
+    return mesh.part(~theirs | (owners.share(after) >= MAJORITY))
 
 
 def _assign(

@@ -10,7 +10,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from mi_refgs.data.view import evenly_spread
-from mi_refgs.editing.change import apply, assignments
+from mi_refgs.editing.change import Assignment, apply, assignments
 from mi_refgs.editing.options import Change, EditOptions, Selection
 from mi_refgs.editing.selection import COLOUR, select
 from mi_refgs.errors import InputError
@@ -45,15 +45,15 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
         raise InputError("unknown option", "edit", name, f"use some of {', '.join(known)}")
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     selection = Selection(**{f.name: given.pop(f.name) for f in fields(Selection) if f.name in given})
-    given["set"] = tuple(assignment.text for assignment in assignments(given.get("set", ())))
-    change = Change(**given)
+    made = assignments(given.get("set", ()))
+    change = Change(**given | {"set": tuple(assignment.text for assignment in made)})
     if change.is_empty:
         raise InputError("nothing to do", "edit", remedy="give --set, --cut or another change")
     if change.materials:
         scene = replace(relightable(scene), surroundings=scene.surroundings, near=scene.near)
     chosen = select(scene, selection)
-    notes = notes_of(scene, change)
-    changed = apply(scene, chosen, change)
+    notes = notes_of(scene, made, change.cut)
+    changed = apply(scene, chosen, made, change.cut)
     counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}
     return Edited(changed, tuple(notes), {**_recorded(selection, change), **counts, "notes": notes})
 
@@ -69,10 +69,10 @@ def _recorded(*parts: Selection | Change) -> dict[str, Any]:
     return found
 
 
-def notes_of(scene: TrainedScene, change: Change) -> list[str]:
+def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list[str]:
     """Return what of a fit does not follow a change: values that depend on its light."""
     shading, surfels = scene.shading, scene.surfels
-    names = [assignment.name.partition(".")[0] for assignment in assignments(change.set)]
+    names = [assignment.name.partition(".")[0] for assignment in made]
     indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
     read = {*shading.required_attributes, *surfels.primitive.widths}
     read |= {"indirect_sh"} if indirect else set()
@@ -90,7 +90,7 @@ def notes_of(scene: TrainedScene, change: Change) -> list[str]:
             "the diffuse colour was fitted to the light as radiance_sh and stays so: albedo and metallic "
             f"change what is reflected, colour= changes it{convert}"
         )
-    if indirect and (change.cut or change.keep or {*names} - {"roughness"}):
+    if indirect and (cut or {*names} - {"roughness"}):
         trace = "; --materials traces rays instead" if has_materials else ""
         notes.append(f"interreflection (indirect_sh) stays as it was fitted{trace}")
     return notes

@@ -48,14 +48,12 @@ class Change:
     """such as roughness=0.3 albedo=0.9,0.6,0.2 opacity*=0.5, one after the other; colour=R,G,B for methods
     with fitted colours"""
     cut: Flag = False
-    """remove the selection"""
-    keep: Flag = False
-    """remove everything else"""
+    """remove the selection; with --invert everything else"""
 
     @property
     def is_empty(self) -> bool:
         """Whether it changes nothing."""
-        return not (self.materials or self.set or self.cut or self.keep)
+        return not (self.materials or self.set or self.cut)
 
 
 class EditOptions(TypedDict, total=False):
@@ -72,4 +70,3 @@ class EditOptions(TypedDict, total=False):
     materials: bool
     set: Assignments
     cut: bool
-    keep: bool

@@ -19,7 +19,9 @@ from mi_refgs import formats
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.editing import edit as editing
-from mi_refgs.editing.options import EditOptions
+from mi_refgs.editing.change import apply
+from mi_refgs.editing.options import EditOptions, Selection
+from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.evaluation.images import image_array
@@ -268,7 +270,7 @@ def import_splats(
     trained = read_splats(Path(path), linear)
     if box is not None:
         try:
-            trained = editing.edit(trained, box=box, keep=True).scene
+            trained = apply(trained, ~select(trained, Selection(box=box)), cut=True)
         except InputError as error:
             raise error.at(path) from None
     return Reconstruction(trained, Provenance(method_of(trained, Path(path).stem)))

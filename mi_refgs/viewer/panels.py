@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.editing.change import apply
-from mi_refgs.editing.options import Change, Selection
+from mi_refgs.editing.change import apply, assignments
+from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
@@ -115,8 +115,8 @@ class MaterialsPanel:
     def _moved(self, name: str, event: Any) -> None:
         def change_material() -> None:
             self.values[name] = float(self.sliders[name].value)
-            mask, change = self.mask, Change(set=dict(self.values))
-            self.scene.set_change(lambda scene: apply(scene, mask, change))
+            mask, made = self.mask, assignments(self.values)
+            self.scene.set_change(lambda scene: apply(scene, mask, made))
 
         if event.client:  # by a user
             self.submit(("material", name), change_material)

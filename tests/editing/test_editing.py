@@ -216,24 +216,22 @@ def test_bad_options_are_refused_in_one_sentence(
 def test_cut_removes_a_ball_its_shadow_and_its_reflection() -> None:
     """The rest renders like the other ball without any of the first, mesh included."""
     whole = balls(EnvironmentLight.from_radiance(sky(16)), **TRACED_LIGHT)
-    left = edit(whole, where=METAL_BALL, keep=True).scene
-    cut = edit(whole, where=METAL_BALL, cut=True, invert=True).scene
-    assert left.surfels.count == cut.surfels.count == HALF
+    left = edit(whole, where=METAL_BALL, cut=True, invert=True).scene
+    assert left.surfels.count == HALF and left.mesh is not None
     mesh = known_mesh()
     alone = replace(left, mesh=mesh.part(mesh.vertices[mesh.faces].mean(axis=1)[:, 0] < 0))
-    for scene in (left, cut):
-        assert scene.mesh is not None and len(scene.mesh.faces) == len(mesh.faces) / 2
-        np.testing.assert_allclose(image(scene), image(alone), atol=1e-6)
+    assert len(left.mesh.faces) == len(mesh.faces) / 2
+    np.testing.assert_allclose(image(left), image(alone), atol=1e-6)
     ghost = replace(left, mesh=mesh)
     assert np.abs(image(ghost) - image(alone)).max() > 0.05
 
 
 def test_the_background_keeps_its_triangles() -> None:
-    """Only the object's triangles are cut and kept."""
+    """Only the object's triangles are cut."""
     scene = with_background(balls())
     assert scene.mesh is not None
     of_wall = scene.mesh.vertices[scene.mesh.vertices[:, 0] > 0.05]
-    for half in (edit(scene, where="z > 0", keep=True), edit(scene, where="z > 0", cut=True)):
+    for half in (edit(scene, where="z > 0", cut=True, invert=given) for given in (False, True)):
         mesh = half.scene.mesh
         assert mesh is not None and len(mesh.faces) / len(scene.mesh.faces) == pytest.approx(0.75, abs=0.02)
         assert (mesh.vertices[:, 0] > 0.05).sum() == len(of_wall)
@@ -341,4 +339,4 @@ def test_a_bad_command_writes_nothing(
 def test_an_existing_output_is_refused(finished: Path, tmp_path: Path) -> None:
     (tmp_path / "something").touch()
     for taken in (finished, tmp_path):
-        refused(["edit", finished, "-o", taken, "--keep"], "choose an empty folder")
+        refused(["edit", finished, "-o", taken, "--cut"], "choose an empty folder")

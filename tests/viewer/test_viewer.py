@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.editing.change import apply
-from mi_refgs.editing.options import Change, Selection
+from mi_refgs.editing.change import apply, assignments
+from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import image_array
@@ -359,7 +359,7 @@ def test_the_name_of_an_uploaded_light_is_not_used_as_a_path() -> None:
 
 def test_relit_materials_are_those_of_relight_and_edits_stay(scene: TrainedScene) -> None:
     metal = select(scene, Selection(where="metallic > 0.5"))
-    change = Change(set={"roughness": 0.9, "metallic": 0.2})
+    change = assignments({"roughness": 0.9, "metallic": 0.2})
     drawable = ReconstructionView(scene)
     before = shown(drawable)
     drawable.set_relit(True)

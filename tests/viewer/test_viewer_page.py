@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_refgs.editing.change import apply
-from mi_refgs.editing.options import Change, Selection
+from mi_refgs.editing.change import apply, assignments
+from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats.cameras import read_cameras
@@ -245,7 +245,7 @@ def test_every_panel_does_what_it_says(tab: Tab, scene: TrainedScene, tmp_path: 
     tab.press("Save view")
     path = tmp_path / "saved" / "view_000.png"
     tab.until(lambda _: path.is_file(), "a saved view")
-    edited = apply(metal, chosen, Change(set={"roughness": 0.9}))
+    edited = apply(metal, chosen, assignments({"roughness": 0.9}))
     found, camera = read_exr_image(path.with_suffix(".exr")), read_cameras(path.with_suffix(".json"))[0]
     unlike, like = (np.abs(found - rendered(given, camera)) for given in (metal, edited))
     assert unlike.max() > 0.1
