@@ -148,12 +148,13 @@ def run(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
 
 def tried(trainer: Trainer, component: str, rival: Trainer, steps: int, gain: float) -> Row:
     """Continue copies of a fit and of a rival, which stays if its validation PSNR is `gain` dB higher."""
-    begin, plain = trainer.iteration, fork(trainer, trainer.method)
+    begin = trainer.iteration
     try:
         better = validation_psnr(run(rival, steps, trainer))
     except InputError as error:
         return Row(component, begin, False, f"its fit failed: {error}")
-    psnr = validation_psnr(run(plain, steps, trainer))
+    plain = run(fork(trainer, trainer.method), steps, trainer)
+    psnr = validation_psnr(plain)
     gained = better - psnr
     chosen = rival if gained >= gain else plain
     trainer.take(chosen, chosen.method)
