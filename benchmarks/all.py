@@ -69,7 +69,6 @@ PARTS = (
     Part("memory", 6, "benchmarks.memory"),
     *_fits(),
     Part("frames", 2, "benchmarks.frames {run}"),
-    Part("viewer", 2, "benchmarks.viewer {run}"),
 )
 """In this order: those with {run} need groups of fits."""
 

@@ -57,12 +57,12 @@ def results(tmp_path: Path) -> Path:
     build = recorded(dict)["build"] | {"commit": "abc", "clean": True}
     first = {"build": build, "seconds": 1.0, "rows": [row(), row(psnr=30.04), row(source="chair")]}
     write_result(tmp_path / "front.json", first)
-    write_result(tmp_path / "viewer.json", {"build": build, "seconds": 1.0, "result": {"a": [{"b": 7}]}})
+    write_result(tmp_path / "times.json", {"build": build, "seconds": 1.0, "result": {"a": [{"b": 7}]}})
     return tmp_path
 
 
 def test_markers_are_filled(results: Path) -> None:
-    names = ("front.mirror_ring_auto_psnr", "viewer.a_0_b", "frames.not_measured")
+    names = ("front.mirror_ring_auto_psnr", "times.a_0_b", "frames.not_measured")
     text = " ".join(f"<!-- {name} -->?<!-- / -->" for name in names)
     assert re.sub(r"<!--.*?-->", "", pages.filled(text, results)) == "28.0 dB 7 ?"
     found = pages.filled("<!-- front.table -->?<!-- / -->", results)
@@ -75,7 +75,7 @@ def test_markers_are_filled(results: Path) -> None:
 def test_results_of_several_builds_are_refused(results: Path) -> None:
     with pytest.raises(InputError, match="several builds"):
         tables.fits("front", {"build": {"commit": "abc"}, "rows": [row(), row(build="abd")]})
-    first = pages.values(results / "viewer.json")["about"]
+    first = pages.values(results / "times.json")["about"]
     with pytest.raises(InputError, match="abc and abd; measure all with one"):
         merged([first, first | {"commit": "abd"}])
 
