@@ -14,8 +14,8 @@ from mi_refgs.editing.change import Assignment, apply, assignments
 from mi_refgs.editing.options import Change, EditOptions, Selection
 from mi_refgs.editing.selection import COLOUR, select
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import contact_sheet, image_array
-from mi_refgs.render.display import displayed
+from mi_refgs.evaluation.images import contact_sheet
+from mi_refgs.render.display import displayed, image_array
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera

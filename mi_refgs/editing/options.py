@@ -14,8 +14,6 @@ Assignments = Mapping[str, float | Sequence[float]] | Iterable[str]
 
 optional = partial(arg, help_behavior_hint="")
 Flag = Annotated[bool, optional()]
-# What commands parse.
-Four: Any = tuple[float, float, float, float] | None
 Six: Any = tuple[float, float, float, float, float, float] | None
 
 
@@ -29,8 +27,6 @@ class Selection:
     colour.r … .b (the fitted radiance, its SH term of degree 0); an unknown name lists the known ones"""
     box: Annotated[Sequence[float] | None, optional(constructor=Six, metavar="X0 Y0 Z0 X1 Y1 Z1")] = None
     """centres inside an axis-aligned box"""
-    nearest: Annotated[Sequence[float] | None, optional(constructor=Four, metavar="X Y Z R")] = None
-    """centres within R of the surfel that is nearest to the point"""
     invert: Flag = False
     """all other surfels instead"""
 
@@ -65,7 +61,6 @@ class EditOptions(TypedDict, total=False):
 
     where: str | None
     box: Sequence[float] | None  # (6,)
-    nearest: Sequence[float] | None  # (4,)
     invert: bool
     materials: bool
     set: Assignments

@@ -22,7 +22,7 @@ from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
-from mi_refgs.fitting.image_error import displayed_of, image_of, with_gain
+from mi_refgs.fitting.image_error import displayed_image, with_gain
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
 from mi_refgs.io.progress import with_bar
@@ -140,7 +140,7 @@ def _register(
     render = fitted.renderer(aovs=False, samples=samples)
 
     def shown(view: View) -> np.ndarray:
-        return image_of(displayed_of(render(view.camera()), views), view)
+        return displayed_image(render(view.camera()), view, views)
 
     pairs = list(zip(per_view, views.views, strict=True))
     for scores, view in with_bar(pairs, "register", unit="view", disable=not progress):

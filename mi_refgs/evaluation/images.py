@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import drjit as dr
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import map_coordinates
@@ -15,12 +14,12 @@ from skimage.transform import resize_local_mean
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.evaluation.metrics import environment
+from mi_refgs.fitting.image_error import displayed_image
 from mi_refgs.io.images import srgb_from_linear
-from mi_refgs.render.display import displayed
+from mi_refgs.render.display import image_array
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.attributes import ATTRIBUTES
-from mi_refgs.types import Array
 
 LIGHT_KEY = 0.36  # average luminance of a displayed environment before the tone curve, which maps it to 0.55
 CELL_MIN = 128  # pixels: smaller images are enlarged by a whole factor
@@ -29,14 +28,6 @@ TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 14
 """Heights of titles in pixels, and widths of images per height: the longest title then fits."""
 BESIDE_GREYS = np.array([0.80, 0.87, 0.95])  # pale blue: on white, a metallic of 1 would not be visible
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
-
-
-def image_array(array: Array, height: int, width: int) -> np.ndarray:
-    """Convert an array of H*W pixels to (H, W), one of colours or vectors to (H, W, 3), float32."""
-    if isinstance(array, list) or dr.depth_v(array) > 1:
-        return np.stack([image_array(part, height, width) for part in array], axis=-1)
-    values = np.array(array, dtype=np.float32).ravel()
-    return np.broadcast_to(values, height * width).reshape(height, width)
 
 
 def displayed_over(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:
@@ -66,7 +57,7 @@ class RenderedView:
         normal = image_array(frame.normal, *size)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         return RenderedView(
-            image_array(displayed(frame, data.background, data.is_linear_radiance), *size),
+            displayed_image(frame, view, data),
             image_array(frame.object_alpha, *size),
             np.where(length > 1e-6, normal / np.maximum(length, 1e-6), 0),
             RenderedView.maps_of(frame, *size),

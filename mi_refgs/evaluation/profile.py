@@ -7,7 +7,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import cycle
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.timing import listening
+from mi_refgs.kernels.trees import mapped
 
 PHASES = (
     *("prefilter forward", "shade forward", "project", "tile lists", "sort", "splat forward", "ssim forward"),
@@ -60,9 +61,9 @@ class PhaseClock:
             leaves.extend([leaf] if dr.grad_enabled(leaf) else [])
             return leaf
 
-        _map(value, collect)
+        mapped(collect, value)
         passed = iter(dr.custom(_Boundary, leaves, lambda: self._enter(phase)) if leaves else ())
-        return _map(value, lambda leaf: next(passed) if dr.grad_enabled(leaf) else leaf)
+        return mapped(lambda leaf: next(passed) if dr.grad_enabled(leaf) else leaf, value)
 
     def _enter(self, phase: str | None) -> None:
         dr.eval()
@@ -87,20 +88,6 @@ class _Boundary(dr.CustomOp):
         dr.eval(δvalues)
         self.reached()
         self.set_grad_in("values", δvalues)
-
-
-def _map(value: Any, change: Callable[[Any], Any]) -> Any:
-    """Apply a function to every Dr.Jit array in a value."""
-    if dr.is_array_v(value):
-        return change(value)
-    if isinstance(value, list | tuple):
-        return type(value)([_map(item, change) for item in value])
-    if isinstance(value, dict):
-        return {key: _map(item, change) for key, item in value.items()}
-    if is_dataclass(value) and not isinstance(value, type):
-        found = {f.name: _map(getattr(value, f.name), change) for f in fields(value) if f.init}
-        return replace(value, **found)
-    return value
 
 
 @dataclass(frozen=True)

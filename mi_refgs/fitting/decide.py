@@ -14,7 +14,7 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.image_error import displayed_of, image_of, psnr
+from mi_refgs.fitting.image_error import displayed_image, psnr
 from mi_refgs.fitting.initial import converted, with_columns
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
@@ -166,9 +166,7 @@ def validation_psnr(trainer: Trainer) -> float:
     """Mean PSNR (dB) of the present state on the validation views; waits for the device."""
     assert trainer.validation is not None
     frames = ((trainer.view(view.camera(), aovs=False), view) for view in trainer.validation.views)
-    return float(
-        np.mean([psnr(image_of(displayed_of(frame, trainer.data), view), view) for frame, view in frames])
-    )
+    return float(np.mean([psnr(displayed_image(frame, view, trainer.data), view) for frame, view in frames]))
 
 
 def conclude(trainer: Trainer, row: Row, began: float, verdict: str = "") -> None:

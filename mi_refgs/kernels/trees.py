@@ -1,4 +1,4 @@
-"""Functions of arrays, applied to lists, dictionaries and dataclasses of arrays."""
+"""Functions of arrays, applied to sequences, dictionaries and dataclasses of arrays."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def mapped(function: Callable[..., Any], *trees: Arrays) -> Arrays:
         return first
     if isinstance(first, dict):
         return {name: mapped(function, *(tree[name] for tree in trees)) for name in first}
-    if isinstance(first, list):
-        return [mapped(function, *parts) for parts in zip(*trees, strict=True)]
+    if isinstance(first, list | tuple):
+        return type(first)(mapped(function, *parts) for parts in zip(*trees, strict=True))
     if is_dataclass(first) and not isinstance(first, type):
         values = {field.name: [getattr(tree, field.name) for tree in trees] for field in fields(first)}
         return replace(first, **{name: mapped(function, *several) for name, several in values.items()})

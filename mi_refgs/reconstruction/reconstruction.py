@@ -24,14 +24,13 @@ from mi_refgs.editing.options import EditOptions, Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats.gaussian_ply import method_of, read_splats
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.reconstruction.new_light import AnyLight, any_light
 from mi_refgs.reconstruction.provenance import EDITS, Provenance
-from mi_refgs.render.display import composited
+from mi_refgs.render.display import composited, image_array
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.export import export, newest, save, write_if_stale

@@ -12,7 +12,7 @@ import numpy as np
 
 from mi_refgs.io.images import SRGB_LINEAR_LIMIT
 from mi_refgs.render.pipeline import Frame
-from mi_refgs.types import Color3f, Float
+from mi_refgs.types import Array, Color3f, Float
 
 ALPHA_EMPTY = 1e-6  # alpha below which a pixel is empty: only the background is seen
 
@@ -61,3 +61,11 @@ def displayed(
         srgb_from_linear(plane + (1 - frame.alpha) * value)
         for plane, value in zip(radiance, behind, strict=True)
     ]
+
+
+def image_array(array: Array, height: int, width: int) -> np.ndarray:
+    """Convert an array of H*W pixels to (H, W), one of colours or vectors to (H, W, 3), float32."""
+    if isinstance(array, list) or dr.depth_v(array) > 1:
+        return np.stack([image_array(part, height, width) for part in array], axis=-1)
+    values = np.array(array, dtype=np.float32).ravel()
+    return np.broadcast_to(values, height * width).reshape(height, width)

@@ -15,16 +15,13 @@ import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.images import to_8_bits
+from mi_refgs.render.display import image_array
 from mi_refgs.types import Float
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
 from mi_refgs.viewer.viewer_scene import DisplayOptions, ViewerScene, displayed_planes
-
-FAR = 160.0
-"""Depth where nothing is seen, scene units, and the largest: viser packs depth into 24 bits of 1e-5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +29,6 @@ class DeliveredImage:
     image: np.ndarray  # (H, W, 3) uint8
     progress: int  # from resolution.COARSE to resolution.DONE
     seconds: float  # of its last sample
-    depth: np.ndarray | None = None  # (H, W) float32, if overlays require it
 
 
 @dataclass(eq=False)
@@ -152,7 +148,7 @@ class RenderLoop:
         width, height = resolution.size_of(side, resolution.shape_of(*window))
         offset = resolution.offset_of(progress - LARGE) if progress >= LARGE else (0.0, 0.0)
         camera = pose.camera(width, height, offset)
-        planes, distance = self.scene.draw(camera, look, progress >= LARGE)
+        planes = self.scene.draw(camera, look, progress >= LARGE)
         sums = [a + b for a, b in zip(sums, planes, strict=True)] if sums else planes
         dr.eval(sums)
         shown = None  # the mean as an image
@@ -160,9 +156,6 @@ class RenderLoop:
             share = dr.opaque(type(sums[0]), 1 / max(progress - COARSE, 1))
             mean = [plane * share for plane in sums]
             shown = image_array(displayed_planes(mean, look, self.scene.depths(pose)), height, width)
-        depth = None
-        if shown is not None and look.overlays and distance is not None:
-            depth = np.array(image_array(dr.select(distance > 0, distance, FAR), height, width))
         dr.sync_thread()
         taken = self.clock() - begin
         with self._wake:
@@ -174,4 +167,4 @@ class RenderLoop:
                 return
         if shown is not None:
             self.delivered += 1
-            client.deliver(DeliveredImage(to_8_bits(shown), progress, taken, depth))
+            client.deliver(DeliveredImage(to_8_bits(shown), progress, taken))

@@ -78,7 +78,6 @@ class Page:
         self.loop.report = lambda message: self.notify("Not done", message, "red")
         self.moving_side = COARSEST  # first resolution level of a client during motion
         self.status: Callable[[str], None] = lambda text: None  # set by a panel
-        self._overlays: set[str] = set()  # that are displayed and need depth
         self._told = 0.0  # time of the last status
         # An image for a page that has been closed meanwhile is no problem.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
@@ -138,7 +137,6 @@ class Page:
             shown.image,
             format="png" if shown.progress == DONE else "jpeg",
             jpeg_quality=MOVING_JPEG if shown.progress == COARSE else STILL_JPEG,
-            depth=shown.depth,
         )
         client.flush()
         now = time.monotonic()
@@ -151,12 +149,6 @@ class Page:
     def close(self) -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
-
-    def overlay(self, name: str, visible: bool) -> None:
-        """Say whether an overlay, which the image occludes, is displayed."""
-        if visible != (name in self._overlays):
-            self._overlays ^= {name}
-            self.loop.display(overlays=bool(self._overlays))
 
     def notify(self, title: str, body: str, colour: str | None = None) -> None:
         """Display a message on every open page for 8 seconds."""

@@ -14,12 +14,12 @@ from mi_refgs.editing.change import apply, assignments
 from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import make_folder, write_json
 from mi_refgs.io.images import straight_srgb, write_png
 from mi_refgs.plugins.aovs import values_of_planes
 from mi_refgs.reconstruction.new_light import NewLight
+from mi_refgs.render.display import image_array
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.attributes import sigmoid
 from mi_refgs.viewer.page import Page
@@ -160,7 +160,6 @@ def add_cameras(page: Page) -> None:
                     add(split, index, Pose.of_view(view))
         for node in nodes:
             node.visible = box.value
-        page.overlay("cameras", box.value)
 
 
 def add_saving(page: Page, scene: ReconstructionView) -> None:

@@ -39,7 +39,6 @@ class DisplayOptions:
     exposure: float = 0.0  # stops
     backdrop: str = "white"  # one of `backdrops_of`
     largest: int = FINEST  # finest resolution level at rest
-    overlays: bool = False  # whether the browser draws over the image, which requires depth
 
     @property
     def object_only(self) -> bool:
@@ -49,7 +48,7 @@ class DisplayOptions:
     @property
     def aovs(self) -> frozenset[str]:
         """The AOVs to render."""
-        return frozenset({self.what, *(["depth"] if self.overlays else [])} - {IMAGE, "alpha"})
+        return frozenset({self.what} - {IMAGE, "alpha"})
 
 
 class ViewerScene(ABC):
@@ -65,11 +64,10 @@ class ViewerScene(ABC):
     def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
         """Render one sample per pixel; `settled`: nothing has moved for a while, so it may take longer."""
 
-    def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> tuple[list[Float], Float | None]:
-        """Render planes of `planes_of`, and depth along the camera's axis, 0 where nothing is."""
+    def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Float]:
+        """Render planes of `planes_of`."""
         with dr.suspend_grad():
-            frame = self.frame(camera, look, settled)
-            return planes_of(frame, camera, look, self.light), frame.depth
+            return planes_of(self.frame(camera, look, settled), camera, look, self.light)
 
     def depths(self, pose: Pose) -> tuple[float, float]:
         """Return the distances of the object's front and back, which are displayed as white and as black."""

@@ -84,8 +84,6 @@ def scene() -> TrainedScene:
         (Selection(where="albedo.g > 0.1 and albedo.g <= 5.8e-1 and opacity >= .5"), HALF),
         (Selection(where="albedo.r > 0.5", box=(2, -2, -2, -2, 2, 2)), HALF),
         (Selection(box=(-1.1, -0.6, -0.6, 0.05, 0.6, 0.6)), HALF),
-        (Selection(nearest=(-5, 0, 0, 3)), HALF + HALF),
-        (Selection(nearest=(-5, 0, 0, 0)), 1),
     ],
 )
 def test_select_returns_known_surfels(scene: TrainedScene, selection: Selection, count: int) -> None:
@@ -105,15 +103,6 @@ def test_values_are_activated_attributes(scene: TrainedScene) -> None:
     assert {*fields.names} >= {"albedo.r", "opacity", "metallic", "x", "position.z", "size"}
     for name in fields.names:
         assert fields[name].shape == (2 * HALF,) and fields[name].dtype == np.float64
-
-
-def test_nearest_measures_from_the_nearest_surfel(scene: TrainedScene) -> None:
-    """From above the clay ball: its top, within r of which there is a cap of known area."""
-    chosen = select(scene, Selection(nearest=(0.55, 0, 1, 0.2)))
-    position = scene.surfels.to_numpy()["position"][chosen]
-    assert np.linalg.norm(position - (0.55, 0, 0.35), axis=1).max() < 0.2 + 0.03
-    expected = HALF * 0.2**2 / (4 * 0.45**2)  # a cap of chord r has the area π r²
-    assert abs(len(position) - expected) < 0.1 * expected
 
 
 # ---------------- materials ----------------
@@ -200,7 +189,6 @@ def test_the_background_stays(change: Any) -> None:
             "--box: 6 finite numbers are needed, none beyond 1e+09",
         ),
         ({"box": (0, 0, 0, 1, 1, float("inf")), "cut": True}, "--box: 6 finite numbers"),
-        ({"nearest": (0, 0, 0, -1), "cut": True}, "--nearest: the distance -1 is negative"),
         ({"wehre": "x > 0", "set": ["roughness=1"]}, "edit: wehre: unknown option; use some of where, box"),
     ],
 )

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot, baking, write
 from mi_refgs.formats.baking import TexturedMesh, bake, simplified, texels, unwrap
 from mi_refgs.formats.mitsuba_scene import DIFFUSE_RATIO, ROUGHNESSES, base_colour
 from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.images import linear_from_srgb, read_png
 from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.render.display import image_array
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.envmap import EnvironmentLight

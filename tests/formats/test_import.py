@@ -14,14 +14,13 @@ import mi_refgs
 from mi_refgs.cli import main
 from mi_refgs.constants import GAUSSIAN_LOW_PASS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats.cameras import read_cameras
 from mi_refgs.formats.gaussian_ply import read_splats
 from mi_refgs.io.exr import read_exr
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import PinholeCamera
 from mi_refgs.reference.models import harmonics
-from mi_refgs.render.display import displayed
+from mi_refgs.render.display import displayed, image_array
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera

@@ -8,11 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import Shot
 from mi_refgs.formats.gaussians import THIN, gaussians
 from mi_refgs.formats.orbits import shots_around
-from mi_refgs.render.display import display_image
+from mi_refgs.render.display import display_image, image_array
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene

@@ -20,12 +20,12 @@ import pytest
 from mi_refgs import Reconstruction, import_splats, load
 from mi_refgs.cli import main
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats import FORMATS
 from mi_refgs.io.exr import read_exr
 from mi_refgs.methods import read
 from mi_refgs.plugins.aovs import suffixes, values_of_planes
 from mi_refgs.reconstruction.provenance import Provenance
+from mi_refgs.render.display import image_array
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.scene_xml import put
 from mi_refgs.render.surroundings import Surroundings
@@ -194,7 +194,7 @@ def by_viewer_of_a_run(case: Case) -> Maps:
     for what in [IMAGE, *drawable.variables[1 + case.part :: 3]]:
         look = DisplayOptions(what, backdrop=backdrop)
         if case.samples == 1:
-            planes, _ = drawable.draw(camera, look, True)
+            planes = drawable.draw(camera, look, True)
         else:
             planes = planes_of(drawable.fine(camera, look, case.samples), camera, look, None)
         values = planes if what == IMAGE else values_of_planes(what, planes)

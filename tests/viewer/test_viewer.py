@@ -22,13 +22,13 @@ from mi_refgs.editing.change import apply, assignments
 from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.fitting.state import FitState
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import to_8_bits
 from mi_refgs.methods.read import load
 from mi_refgs.render import passes
+from mi_refgs.render.display import image_array
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run, read_log
@@ -143,11 +143,11 @@ class Plain(ViewerScene):
     def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
         raise AssertionError("`draw` of this scene renders no frame")
 
-    def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> tuple[list[Any], None]:
+    def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Any]:
         self.cameras.append(camera)
         self.settled.append(settled)
         self.during()
-        return [mi.Float(self.grey)] * 3 + [mi.Float(1)], None
+        return [mi.Float(self.grey)] * 3 + [mi.Float(1)]
 
     def fovs(self) -> list[float]:
         """The vertical fields of view of the requests."""
@@ -317,7 +317,7 @@ def shown(scene: ViewerScene | TrainedScene, what: str = "image", **options: Any
     """An image (40, 40, 3) of a scene from the front."""
     view = ReconstructionView(scene) if isinstance(scene, TrainedScene) else scene
     look = DisplayOptions(what, **options)
-    planes = displayed_planes(view.draw(front().camera(40, 40), look, True)[0], look, (2.0, 4.0))
+    planes = displayed_planes(view.draw(front().camera(40, 40), look, True), look, (2.0, 4.0))
     return to_8_bits(image_array(planes, 40, 40)).astype(int)
 
 

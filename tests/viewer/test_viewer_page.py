@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
 import shutil
@@ -22,10 +21,10 @@ from PIL import Image
 from mi_refgs.editing.change import apply, assignments
 from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
-from mi_refgs.evaluation.images import image_array
 from mi_refgs.formats.cameras import read_cameras
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.methods.read import load
+from mi_refgs.render.display import image_array
 from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -215,18 +214,7 @@ def test_every_panel_does_what_it_says(tab: Tab, scene: TrainedScene, tmp_path: 
     tab.differs(before, 5, "the object without background")
     alone = tab.still()
 
-    # The region of interest and the cameras, over the image.
-    tab.page.get_by_text("Region of interest", exact=True).click()
-    tab.check("Border")
-    tab.differs(alone, 0.5, "the border")
-    tab.type("Radius", "0.5")
-    (tmp_path / "data" / "region.json").unlink()
-    tab.press("Save region")
-    tab.says("; next: ")
-    region = json.loads((tmp_path / "data" / "region.json").read_text())
-    assert region["radius"] == pytest.approx(0.5, abs=0.01)
-    tab.check("Border")
-    tab.returns(alone, "the image without the border")
+    # The cameras, over the image.
     tab.check("Cameras")
     tab.until(lambda image: bool(np.abs(image - alone).max() > 50), "cameras")
     tab.check("Cameras")

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.decide import Decision, Row, conclude, run
-from mi_refgs.fitting.image_error import displayed_of, image_of, squared_error
+from mi_refgs.fitting.image_error import displayed_image, squared_error
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload
@@ -102,7 +102,7 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
 
 def _squared_error(trainer: Trainer, view: View) -> np.ndarray:
     """Squared error (H, W) of a displayed training image, mean over its channels."""
-    shown = image_of(displayed_of(trainer.view(view.camera(), aovs=False), trainer.data), view)
+    shown = displayed_image(trainer.view(view.camera(), aovs=False), view, trainer.data)
     return np.asarray(squared_error(shown, view).mean(axis=-1))
 
 
