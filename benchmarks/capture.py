@@ -1,7 +1,7 @@
 """How true the cameras of `refgs capture` are: its data set beside one of the same images with true
 cameras.
 
-    python -m benchmarks.capture CAPTURED TRUE [--json]
+    python -m benchmarks.capture CAPTURED TRUE
 
 Both are folders that `refgs train` reads; views are paired by the names of their images. Positions are in
 per cent of the extent (the largest distance of a true camera from their mean), after the similarity that fits
@@ -10,7 +10,6 @@ them best.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -74,7 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = plain_parser("capture", __doc__)
     parser.add_argument("captured", type=Path)
     parser.add_argument("truth", type=Path)
-    parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args(arguments)
     try:
         captured, truth = all_views(args.captured), all_views(args.truth)
@@ -84,13 +82,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     found = {"rotation, degrees": errors.rotation, "position, % of the extent": 100 * errors.position}
     found["focal length, %"] = 100 * abs(errors.focal)
-    if args.json:
-        numbers = {
-            name.split(",")[0].replace(" ", "_"): [float(np.median(x)), float(x.max())]
-            for name, x in found.items()
-        }
-        print(json.dumps({"images": len(captured)} | numbers))
-        return 0
     rows = [[name, f"{np.median(x):.3f}", f"{x.max():.3f}"] for name, x in found.items()]
     print(
         f"{len(captured)} of {len(truth)} images placed",
