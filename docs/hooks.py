@@ -1,7 +1,4 @@
-"""What `mkdocs` runs while it builds the site (mkdocs.yml): pages made from the code that they describe.
-
-A page that is made is never committed, so it cannot be older than the code.
-"""
+"""What `mkdocs` runs while it builds the site: pages of notebooks, and of files outside of docs/."""
 
 from __future__ import annotations
 
@@ -9,17 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File
-from site_pages import api, commands, exports, links, methods, notebooks, plugins, settings
-
-PAGES = {
-    "api.md": api.page,
-    "cli.md": commands.page,
-    "exports.md": exports.page,
-    "methods.md": methods.page,
-    "plugins.md": plugins.page,
-    "settings.md": settings.page,
-}
-"""Page → the function that writes its Markdown."""
+from site_pages import links, notebooks
 
 
 def on_config(config: Any) -> Any:
@@ -32,9 +19,8 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add generated pages: of the code, of files elsewhere in the repository, of notebooks."""
-    made: dict[str, str | bytes] = {name: write() for name, write in PAGES.items()}
-    made |= links.pages_from_elsewhere()
+    """Add the pages of files elsewhere in the repository and of notebooks."""
+    made = links.pages_from_elsewhere()
     for file in [file for file in files if file.src_uri.endswith(".ipynb")]:
         files.remove(file)
         made |= notebooks.pages(file.src_uri)

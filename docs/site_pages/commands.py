@@ -17,7 +17,7 @@ COLUMNS = "84"
 def page() -> str:
     """Return a section per command: its help, with options, defaults and an example."""
     rows = [
-        [group, f"[`refgs {name}`](#{name})", summary]
+        [group, f"[`refgs {name}`](#refgs-{name})", summary]
         for group, commands in COMMANDS.items()
         for name, (_, summary) in commands.items()
     ]
@@ -30,7 +30,7 @@ def page() -> str:
     ]
     for commands in COMMANDS.values():
         for name in commands:
-            text.append(f"## refgs {name} {{#{name}}}\n\n```text\n{help_of(name)}\n```")
+            text.append(f"## refgs {name}\n\n```text\n{help_of(name)}\n```")
     return "\n\n".join(text) + "\n"
 
 

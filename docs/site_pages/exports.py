@@ -12,7 +12,7 @@ def page() -> str:
     text = [
         "# Formats of other programs",
         "`refgs export RUN --to NAME -o PATH` writes them, several at once with commas, and so does "
-        "`Reconstruction.export(NAME, PATH)`. [Files and formats](formats.md) describes what is ours.",
+        "`Reconstruction.export(NAME, PATH)`. [Files and formats](../formats.md) describes what is ours.",
         table(
             ["format", "writes", "what it is", "extra"],
             [
@@ -32,7 +32,7 @@ def page() -> str:
 
 def section(name: str, form: Format) -> str:
     """A format: its description and its options."""
-    text = [f"## {name} {{#{name}}}", form.description]
+    text = [f"## {name}", form.description]
     if form.options:
         rows = [
             [f"`--{o.name.replace('_', '-')}`", "off" if o.default is False else f"`{o.default}`", o.help]

@@ -17,7 +17,7 @@ ELSEWHERE = {
 
 STANDS_FOR = {name: page for page, name in ELSEWHERE.items()} | {
     "scenes": "scenes.md",
-    "variants": "methods.md",
+    "variants": "reference/methods.md",
 }
 """File or folder of the repository → the page that a link to it leads to."""
 

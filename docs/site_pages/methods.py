@@ -73,7 +73,7 @@ def about(method: dict[str, Any], key: str) -> Any:
 
 
 def section(path: Path, method: dict[str, Any]) -> str:
-    """A method: its remark, paper and deviations, what it resolves to, and its file."""
+    """A method: its remark, paper and deviations, and what it resolves to."""
     source = path.read_text(encoding="utf-8").rstrip()
     remark = [line[1:].strip() for line in source.splitlines() if line.startswith("#")]
     resolved = load(path.stem, "standard")
@@ -85,14 +85,12 @@ def section(path: Path, method: dict[str, Any]) -> str:
         f"shades {stages}."
     ]
     lines = [
-        f"### {about(method, 'name')} {{#{path.stem}}}",
+        f"### {path.stem}",
+        f"**{about(method, 'name')}** ([file](../../variants/{path.name}))",
         " ".join(remark[: remark.index("")] if "" in remark else remark),
         about(method, "paper"),
         *facts,
         "\n".join(["How it deviates:", "", *(f"- {text}" for text in about(method, "deviations"))]),
-        f'??? note "variants/{path.name}"\n\n    ```toml\n'
-        + "\n".join(f"    {line}" if line else "" for line in source.splitlines())
-        + "\n    ```",
     ]
     return "\n\n".join(line for line in lines if line)
 

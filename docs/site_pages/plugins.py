@@ -22,7 +22,7 @@ def page() -> str:
     ]
     for name, (register, module) in PLUGINS.items():
         kind = register.removeprefix("register_")
-        text += [f"## `{name}`, a plugin of kind {kind} {{#{name}}}", markdown(docstring(module))]
+        text += [f"## {name}", f"Kind: {kind}.", markdown(docstring(module))]
     return "\n\n".join(text) + "\n"
 
 

@@ -39,7 +39,7 @@ def page() -> str:
         title = f"`[{name}]`" if name else "Top level"
         remark = (inspect.getdoc(kind) or "").split("\n\n")[0]
         text += [
-            f"## {title} {{#{re.sub('[^a-z_.]+', '-', name) or 'top'}}}",
+            f"## {title}",
             remark,
             table(["key", "type", "default", "meaning"], rows),
         ]
@@ -55,7 +55,7 @@ def tables() -> dict[str, type]:
         hints = typing.get_type_hints(kind)
         for field in (one for one in dataclasses.fields(kind) if one.metadata != FLAT):
             name, registry = field.name, field.metadata.get("by_name", {})
-            by_name = [(inner, f".{key}") for key, inner in registry.items()]
+            by_name = [(inner, f".{key}") for key, inner in sorted(registry.items())]
             kinds, usual = field.metadata.get("by_kind", ({}, ""))
             by_kind = [(inner, "" if key == usual else f", kind = {key}") for key, inner in kinds.items()]
             for inner, suffix in by_name or by_kind or _classes(hints[name]):
