@@ -8,10 +8,17 @@ from mi_refgs.data.view import View as View
 from mi_refgs.editing.options import EditOptions as EditOptions
 from mi_refgs.errors import InputError as InputError
 from mi_refgs.evaluation.evaluate import evaluate as evaluate
+from mi_refgs.fitting import losses as losses
+from mi_refgs.fitting.events.densify import densify_and_prune as densify_and_prune
+from mi_refgs.fitting.events.mesh import surface_of as extract_mesh
 from mi_refgs.fitting.objective import Loss as Loss
 from mi_refgs.fitting.objective import LossInputs as LossInputs
 from mi_refgs.fitting.objective import register as register_loss
+from mi_refgs.fitting.optim import Adam as Adam
+from mi_refgs.fitting.optim import LearningRate as LearningRate
 from mi_refgs.fitting.runner import Progress as Progress
+from mi_refgs.fitting.schedule import learning_rates as learning_rates
+from mi_refgs.fitting.state import ParameterTable as ParameterTable
 from mi_refgs.fitting.state import TableEdit as TableEdit
 from mi_refgs.fitting.train import Trainer as Trainer
 from mi_refgs.formats.format import Format as Format

@@ -14,9 +14,10 @@ import mitsuba as mi
 
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.fitting.ssim import ssim
+from mi_refgs.kernels.rows import columns_of
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.light.light import Light
-from mi_refgs.types import Bool, Color3f, Float, Vector3f
+from mi_refgs.types import Bool, Color3f, Float, TensorXf, Vector3f
 
 SATURATED = 254.5 / 255.0  # from here up, 8-bit values are clipped: 255 means "at least this bright"
 CLIPPED = 0.9  # linear radiance from which a photograph may be clipped: the light may be brighter, not darker
@@ -49,6 +50,11 @@ def clip_highlights(render: Iterable[Float], target: Iterable[Float], clipped: I
 
 
 # ---------------- image losses ----------------
+
+
+def planes(image: TensorXf) -> list[Float]:
+    """The channels (H·W,) of an image (H, W, C), as `mi.render` returns it, under AD."""
+    return columns_of(image.array, int(image.shape[-1]))
 
 
 def l1(render: Iterable[Float], target: Iterable[Float]) -> Float:

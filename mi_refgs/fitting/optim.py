@@ -40,8 +40,8 @@ MEMORY = 4096  # steps that `report` may come late
 
 
 @dataclass(frozen=True)
-class Group:
-    """Learning rate of one tensor: log-linear from `rate` to `final` in `steps` iterations, then constant."""
+class LearningRate:
+    """Rate of one tensor: log-linear from `rate` to `final` in `steps` iterations, then constant."""
 
     rate: float  # per step, units of the raw tensor
     final: float | None = None  # None: constant
@@ -73,7 +73,7 @@ class Skipped:
 class Skips:
     """Finds the steps that must change nothing; `params` and `groups` are those of the optimiser."""
 
-    def __init__(self, params: Mapping[str, TensorXf], groups: Mapping[str, Group]) -> None:
+    def __init__(self, params: Mapping[str, TensorXf], groups: Mapping[str, LearningRate]) -> None:
         self._params, self._groups = params, groups
         # By number of rows and word w, (rows,): bit b where a gradient of group WORD w + b was not finite.
         self.marks: dict[tuple[int, int], UInt32] = {}
@@ -147,10 +147,15 @@ class Adam:
     is opaque, so a second step of the same kind compiles nothing.
     """
 
-    def __init__(self, params: MutableMapping[str, TensorXf], groups: Mapping[str, Group]) -> None:
-        """Create moments for every name in groups."""
+    def __init__(
+        self, params: MutableMapping[str, TensorXf], groups: Mapping[str, LearningRate | float]
+    ) -> None:
+        """Let the tensors named in `groups` learn, at a rate each, raw units per step.
+
+        `params` is changed in place: a dictionary, or `mi.traverse` of a scene, to be updated by its user.
+        """
         self.params = params
-        self.groups = dict(groups)
+        self.groups: dict[str, LearningRate] = {}
         self.factors: dict[str, float] = {}  # of learning rates, by tensor; 0 freezes it
         self.stage: Mapping[str, float] = {}  # factors of the present stage of a fit
         self._first: dict[str, Float] = {}
@@ -160,9 +165,9 @@ class Adam:
         self._least: dict[str, Float] = {}  # the same on the device; infinity: not known yet
         self._skips = Skips(params, self.groups)
         for name, group in groups.items():
-            self.add(name, group)
+            self.add(name, group if isinstance(group, LearningRate) else LearningRate(group))
 
-    def add(self, name: str, group: Group) -> None:
+    def add(self, name: str, group: LearningRate) -> None:
         """Let a parameter learn, without history."""
         self.groups[name], self._steps[name] = group, 0
         self._set_usual(name, 0.0)
@@ -296,9 +301,8 @@ class Adam:
             self.factors[name] = float(state.get(f"{name}/factor", 1.0))
 
     def _make_leaf(self, name: str) -> None:
-        tensor = dr.detach(self.params[name])
-        dr.enable_grad(tensor)
-        self.params[name] = tensor
+        self.params[name] = dr.detach(self.params[name])
+        dr.enable_grad(self.params[name])
 
 
 def _distance(positions: Float, centre: tuple[float, float, float]) -> Float:

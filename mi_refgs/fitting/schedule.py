@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,10 +16,10 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.hull import view_focus
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.events import place
-from mi_refgs.fitting.optim import Group
+from mi_refgs.fitting.optim import LearningRate
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.event import EVENTS, Event
-from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, POSE, Method
+from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, POSE, Method, Rates
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.light.kind import FittedLight
@@ -28,6 +28,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.types import Float, TensorXf
 
+DEFAULT_RATES = Rates()
 GAIN_RATES, POSE_RATES = (1e-3, 1e-4), (2e-3, 6e-5)
 """Learning rates of log gains and of corrections, radians or half widths, at the start and at the end."""
 POSITION_STEPS, POSITION_FINAL = 0.6, 1.6e-6
@@ -112,35 +113,24 @@ class FitSetup:
         ends = [stage.until for _, stage in self.method.stages()]
         return light is not None and (iteration % light.every == 0 or iteration in ends)
 
-    def groups(self, params: Mapping[str, TensorXf]) -> dict[str, Group]:
+    def groups(self, params: Mapping[str, TensorXf]) -> dict[str, LearningRate]:
         """Learning rates by the name of the parameter."""
         rates, iterations, extent = self.method.rates, self.method.iterations, self.data.scene_extent
-        groups = self._of_table(self.method.surfels.names, extent)
+        groups = learning_rates(self.method.surfels.names, extent, iterations, rates)
         around = self.method.surroundings
         if self.open_scene and around is not None:
-            table = self._of_table(around.names, extent)
+            table = learning_rates(around.names, extent, iterations, rates)
             # The farther a surface, the less is known of its place.
             assert self.data.region is not None
             table["position"] = replace(table["position"], centre=self.data.region.centre)
             groups |= {AROUND + name: group for name, group in table.items()}
-            groups[BACKGROUND] = Group(around.rate, around.rate * rates.decay, iterations)
+            groups[BACKGROUND] = LearningRate(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None:
             rate = rates.light if self.method.light.learnt else 0.0
-            groups[LIGHT] = Group(rate, rate * rates.decay, iterations, relative=rates.light_relative)
+            groups[LIGHT] = LearningRate(rate, rate * rates.decay, iterations, relative=rates.light_relative)
         for name, (rate, final) in {GAIN: GAIN_RATES, POSE: POSE_RATES}.items():
             if name in params:
-                groups[name] = Group(rate, final, iterations)
-        return groups
-
-    def _of_table(self, names: tuple[str, ...], extent: float) -> dict[str, Group]:
-        """Learning rates of the attributes of one set of surfels."""
-        rates, iterations = self.method.rates, self.method.iterations
-        groups = {}
-        for name in names:
-            rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
-            groups[name] = Group(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
-        start, final = rates.of("position") * extent, POSITION_FINAL * extent
-        groups["position"] = Group(start, final, int(POSITION_STEPS * iterations), unit=extent)
+                groups[name] = LearningRate(rate, final, iterations)
         return groups
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
@@ -168,6 +158,22 @@ class FitSetup:
                 what = f"it has {has}, a fit of this method to {self.data.path} {wants}"
                 remedy = "resume with the method and the data set that the run began with"
                 raise InputError(what, run or "checkpoint", name, f"{remedy}, or choose another -o")
+
+
+def learning_rates(
+    names: Iterable[str], extent: float, iterations: int, rates: Rates = DEFAULT_RATES
+) -> dict[str, LearningRate]:
+    """The rates at which attributes of surfels learn in a fit of so many iterations, by their names.
+
+    extent: of the scene, its units, `Dataset.scene_extent`: positions learn in parts of it.
+    """
+    groups = {}
+    for name in names:
+        rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
+        groups[name] = LearningRate(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
+    start, final = rates.of("position") * extent, POSITION_FINAL * extent
+    groups["position"] = LearningRate(start, final, int(POSITION_STEPS * iterations), unit=extent)
+    return groups
 
 
 GATHERED = "light_gradient"  # name of the gradient of the levels in a checkpoint

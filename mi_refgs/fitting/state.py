@@ -12,7 +12,8 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,6 +48,7 @@ from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.kind import FittedLight, LightKind
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.init import morton_order
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Bool, Float, TensorXf, UInt32
@@ -63,19 +65,27 @@ class TableEdit:
 
 @dataclass(eq=False)
 class ParameterTable:
-    """One set of surfels as parameters: edits of its rows, which moments and statistics follow."""
+    """One set of surfels as parameters: edits of its rows, which moments and statistics follow.
 
-    params: dict[str, TensorXf]  # of the fit, (N, D) each; this table's have the prefix
+    In a loop of one's own: `observe` adds a score of the surfels after each step, and `apply` takes what
+    `densify_and_prune` returns; `clear` then sets the scores to zero.
+    """
+
+    params: MutableMapping[str, TensorXf]  # (N, D) each, also of others; this table's have the prefix
     optimiser: Adam
-    prefix: str  # "" of the object, AROUND of the background
-    max_count: int  # most surfels that the method allows
-    occluder: Occluder  # whose vertices have surfels of the object by their rows
+    prefix: str = ""  # "" of the object, AROUND of the background; of `mi.traverse`, as "refgs."
+    max_count: int = sys.maxsize  # most surfels that the method allows
+    occluder: Occluder = field(default_factory=Occluder)  # its vertices have surfels of the object by row
     error_sum: Float = None  # (N,) squared error that each is responsible for, since the last densification
+
+    def __post_init__(self) -> None:
+        self.clear()
 
     @property
     def surfels(self) -> Surfels:
         """The surfels, attached to the leaves that the optimiser owns."""
-        return Surfels(channels_of(self.params, self.prefix))
+        found = channels_of(self.params, self.prefix)
+        return Surfels({name: tensor for name, tensor in found.items() if name in ATTRIBUTES})
 
     def clear(self) -> None:
         """Set the errors to zero."""
@@ -151,10 +161,7 @@ class FitState:
         """The state before the first step."""
         draws = setup.rng(0, "start")
         params = initial_parameters(setup.method, setup.data, draws, setup.open_scene)
-        made = FitState._assembled(setup, params, Occluder())
-        for table in made.tables:
-            table.clear()
-        return made
+        return FitState._assembled(setup, params, Occluder())
 
     @staticmethod
     def _assembled(setup: FitSetup, params: dict[str, TensorXf], occluder: Occluder) -> FitState:

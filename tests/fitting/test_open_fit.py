@@ -280,9 +280,9 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
         raw["opacity"][rows] = -10
         table.replace(Surfels.from_numpy(raw))
 
-    def edited(surfels: Surfels, error: Any, faint: np.ndarray, *others: Any, **options: Any) -> Any:
+    def edited(*given: Any, faint: np.ndarray, **options: Any) -> Any:
         found.append(faint)
-        return densify(surfels, error, faint, *others, **options)
+        return densify(*given, faint=faint, **options)
 
     densify = densify_event.densify_and_prune
     monkeypatch.setattr(densify_event, "densify_and_prune", edited)

@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.fitting.optim import Adam, Group
+from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.reference import losses as reference
 
-GROUP = Group(0.1)
+GROUP = LearningRate(0.1)
 
 
 def tensor(values: np.ndarray | float) -> Any:
@@ -30,7 +30,7 @@ def advance(optimiser: Adam, number: int, loss: Any = None, **gradients: np.ndar
     optimiser.step(number, loss)
 
 
-def adam(values: np.ndarray, group: Group = GROUP) -> tuple[dict[str, Any], Adam]:
+def adam(values: np.ndarray, group: LearningRate = GROUP) -> tuple[dict[str, Any], Adam]:
     """One tensor "x" and its optimiser."""
     params = {"x": tensor(values)}
     return params, Adam(params, {"x": group})
@@ -38,16 +38,19 @@ def adam(values: np.ndarray, group: Group = GROUP) -> tuple[dict[str, Any], Adam
 
 def test_group_rates() -> None:
     """Log-linear to the end of the schedule, then constant; half-way is the geometric mean."""
-    group = Group(1e-2, final=1e-4, steps=100)
+    group = LearningRate(1e-2, final=1e-4, steps=100)
     assert [group.at(i) for i in (-5, 0, 50, 100, 10**6)] == pytest.approx([1e-2, 1e-2, 1e-3, 1e-4, 1e-4])
-    assert Group(0.05).at(7) == 0.05 and Group(0.0, final=1.0).at(50) == 0.0
+    assert LearningRate(0.05).at(7) == 0.05 and LearningRate(0.0, final=1.0).at(50) == 0.0
 
 
 def test_equals_published_algorithm(rng: np.random.Generator) -> None:
     """Ten steps of two tensors with a schedule and per-column rates; gradients as small as a mean over pixels
     gives."""
     start = {"position": rng.normal(size=(7, 3)), "radiance_sh": rng.normal(size=(7, 12))}
-    groups = {"position": Group(1e-2, 1e-4, 10), "radiance_sh": Group(7.5e-3, head=3, tail=1 / 20)}
+    groups = {
+        "position": LearningRate(1e-2, 1e-4, 10),
+        "radiance_sh": LearningRate(7.5e-3, head=3, tail=1 / 20),
+    }
     params = {name: tensor(values) for name, values in start.items()}
     optimiser = Adam(params, groups)
     gradients = {
@@ -97,7 +100,7 @@ def values(optimiser: Adam) -> dict[str, np.ndarray]:
 def test_step_that_is_not_finite_changes_nothing_and_is_reported(bad: float, where: str) -> None:
     """No entry of any tensor, its moments included; the next step goes on."""
     params = {"x": tensor(np.zeros((4, 2))), "y": tensor(np.zeros((3, 1))), "sh": tensor(np.zeros((4, 12)))}
-    groups = {"x": Group(0.1), "y": Group(0.1), "sh": Group(0.1, head=3, tail=0.05)}
+    groups = {"x": LearningRate(0.1), "y": LearningRate(0.1), "sh": LearningRate(0.1, head=3, tail=0.05)}
     optimiser = Adam(params, groups)
 
     def step(iteration: int, spoilt: bool) -> None:
@@ -136,7 +139,7 @@ def test_one_huge_gradient_slows_its_entry_but_does_not_stop_it(huge: float, at:
     With plain Adam it would not move by a thousandth in a thousand steps.
     """
     rng, rate, after = np.random.default_rng(1), 1e-3, 300
-    params, optimiser = adam(np.zeros((300, 1)), Group(rate))
+    params, optimiser = adam(np.zeros((300, 1)), LearningRate(rate))
     positions = {}
     for step in range(at + 1 + after):
         usual = 1e-7 * (0.5 + np.abs(rng.normal(size=(300, 1))))
@@ -155,7 +158,7 @@ def test_one_huge_gradient_slows_its_entry_but_does_not_stop_it(huge: float, at:
 def test_ordinary_fit_is_not_cut(rng: np.random.Generator) -> None:
     """Gradients that vary by a factor of 50 from step to step, rows that are seldom seen, and a reset."""
     shape, spread = (400, 3), np.exp(0.5 * rng.normal(size=(400, 3)))
-    params, optimiser = adam(np.zeros(shape), Group(1e-2))
+    params, optimiser = adam(np.zeros(shape), LearningRate(1e-2))
     wanted, m, v = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for step in range(120):
         seen = rng.uniform(size=(400, 1)) < (0.1 if step > 60 else 0.7)
@@ -173,7 +176,7 @@ def test_moments_follow_their_rows(rng: np.random.Generator) -> None:
     """Permuting, cloning and pruning rows commutes with stepping; fresh rows start as a new optimiser
     would."""
     start, g1, g2 = (rng.normal(size=(5, 3)) for _ in range(3))
-    (_, whole), (_, moved) = (adam(start, Group(0.01)) for _ in range(2))
+    (_, whole), (_, moved) = (adam(start, LearningRate(0.01)) for _ in range(2))
     for optimiser in (whole, moved):
         advance(optimiser, 0, x=g1)
     middle = whole.params["x"].numpy()
@@ -196,7 +199,7 @@ def test_resume_is_bitwise(rng: np.random.Generator) -> None:
         for number in numbers:
             advance(optimiser, number, x=gradients[number])
 
-    groups = {"x": Group(0.01, 0.001, 6)}
+    groups = {"x": LearningRate(0.01, 0.001, 6)}
     straight = Adam({"x": tensor(np.ones((9, 2)))}, groups)
     straight.factors["x"] = 0.5
     steps(straight, range(3))
@@ -213,7 +216,7 @@ def test_resume_is_bitwise(rng: np.random.Generator) -> None:
 def test_relative_rate_scales_lamps() -> None:
     """A relative group: what is above 1 moves by the rate times itself, what is below by the rate."""
     start = np.array([[-3.0], [0.5], [1.0], [4.0], [50.0]])
-    params, optimiser = adam(start, Group(0.1, relative=True))
+    params, optimiser = adam(start, LearningRate(0.1, relative=True))
     advance(optimiser, 0, x=-np.ones((5, 1)))
     moved = params["x"].numpy() - start
     np.testing.assert_allclose(moved, 0.1 * np.maximum(start, 1), rtol=1e-3)
@@ -222,7 +225,7 @@ def test_relative_rate_scales_lamps() -> None:
 def test_rate_of_positions_grows_with_their_distance() -> None:
     """Each row of a group with a centre moves by the rate times its distance from there, in its unit."""
     start = np.array([[1.0, 2, 3], [1, 2, 5], [1 + 30, 2, 3 + 40], [1, 1.5, 3]])
-    params, optimiser = adam(start, Group(0.1, centre=(1.0, 2.0, 3.0), unit=2.0))
+    params, optimiser = adam(start, LearningRate(0.1, centre=(1.0, 2.0, 3.0), unit=2.0))
     advance(optimiser, 0, x=-np.ones((4, 3)))
     moved = params["x"].numpy() - start
     np.testing.assert_allclose(moved, 0.1 * np.array([0, 1, 25, 0.25])[:, None] * np.ones(3), rtol=1e-3)
@@ -232,7 +235,7 @@ def test_every_tensor_has_its_bit_however_many_there_are() -> None:
     """The first and the last of 40 tensors are distinguished, also where rows are wide."""
     sizes = {f"t{i}": (4, 2) for i in range(38)} | {"wide": (2, 100), "last": (4, 2)}
     params = {name: tensor(np.zeros(size)) for name, size in sizes.items()}
-    optimiser = Adam(params, {name: Group(1.0) for name in sizes})
+    optimiser = Adam(params, {name: LearningRate(1.0) for name in sizes})
     spoilt = {"t0": (1, 0), "t33": (2, 1), "wide": (1, 70), "last": (3, 1)}
     for name, size in sizes.items():
         gradient = np.ones(size, np.float32)

@@ -6,7 +6,6 @@ import numpy as np
 
 from mi_refgs.constants import ALPHA_MAX, GAUSSIAN_LOW_PASS
 from mi_refgs.fitting.events import densify
-from mi_refgs.methods import Window
 from mi_refgs.reference.camera import rotation_axes
 from mi_refgs.reference.footprint import Gaussian, Rules
 from mi_refgs.surfels.table import Surfels
@@ -55,9 +54,7 @@ def test_a_gaussian_is_split_along_its_longest_axis() -> None:
         "opacity": np.zeros((2, 1)),
     }
     gaussians = Surfels.from_numpy(raw)
-    edited = densify.densify_and_prune(
-        gaussians, np.ones(2), densify.NO_ROWS, 1.0, densify.Densify(Window(0, 1, 1), grow=1.0), 4
-    )
+    edited = densify.densify_and_prune(gaussians, np.ones(2), 4, grow=1.0)
     children = edited.surfels.to_numpy()
     assert edited.parent.tolist() == [0, 1, 0, 1] and edited.fresh.all()
     offsets = children["position"] - 1

@@ -18,7 +18,6 @@ from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.events import densify
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods import Window
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels import attributes, primitives
@@ -191,8 +190,7 @@ def test_balls_are_splatted_and_differentiated() -> None:
 def test_balls_are_split_and_written(tmp_path: Path) -> None:
     surfels = balls()
     error = np.arange(30.0) - 9  # two thirds have one
-    how = densify.Densify(Window(0, 1, 1), grow=1.0)
-    edited = densify.densify_and_prune(surfels, error, densify.NO_ROWS, 10.0, how, 90)
+    edited = densify.densify_and_prune(surfels, error, 90, grow=1.0)
     before, after = surfels.to_numpy(), edited.surfels.to_numpy()
     assert len(edited.parent) == 50 and edited.fresh.sum() == 40
     shrunk = np.where(edited.fresh, np.log(densify.SPLIT_SCALE), 0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from mi_refgs.splat.weights import blended_weights, listed_tiles
 from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float
 
 SPLIT_OFFSET, SPLIT_SCALE = 0.6, 0.72
 """Distance of a split surfel's two children from its centre, and their scale, both relative to its longest
@@ -75,10 +76,9 @@ class Densify(Event[Trainer]):
                 assert region is not None
                 offset = table.surfels.raw["position"].numpy() - np.array(region.centre)
                 largest = BACKGROUND_EXTENT * np.maximum(np.linalg.norm(offset, axis=1), region.radius)
-            error, keep_one = table.error_sum.numpy(), bool(table.prefix)
-            table.apply(
-                densify_and_prune(table.surfels, error, few, largest, options, table.max_count, keep_one)
-            )
+            given: dict[str, Any] = {"largest": largest, "faint": few, "keep_one": bool(table.prefix)}
+            given |= {"grow": options.grow, "prune_opacity": options.prune_opacity}
+            table.apply(densify_and_prune(table.surfels, table.error_sum, table.max_count, **given))
         exchange(trainer.setup, fit)
         for table in fit.tables:
             table.clear()
@@ -109,9 +109,8 @@ class Densify(Event[Trainer]):
 def fill(trainer: Trainer) -> None:
     """Split the object's surfels with the largest error, as many as there is room for; prune none."""
     table = trainer.fit.tables[0]
-    options = Densify(Window(0, 0, 1), grow=1.0, prune_opacity=0.0)
-    error = table.error_sum.numpy()
-    table.apply(densify_and_prune(table.surfels, error, NO_ROWS, np.inf, options, table.max_count))
+    given: dict[str, Any] = {"grow": 1.0, "prune_opacity": 0.0}
+    table.apply(densify_and_prune(table.surfels, table.error_sum, table.max_count, **given))
     table.clear()
 
 
@@ -122,23 +121,31 @@ def split_opacity(opacity: np.ndarray) -> np.ndarray:
 
 def densify_and_prune(
     surfels: Surfels,
-    error: np.ndarray,  # (N,) squared error that the surfels are responsible for: Σ w e² over recent pixels
-    faint: np.ndarray,  # rows that may be removed for others, the first ones first: `least_weight`
-    largest: float | np.ndarray,  # scene units, one or (N,): larger surfels are removed
-    options: Densify,
+    error: np.ndarray | Float,
     most: int,
+    *,
+    grow: float = 0.25,
+    prune_opacity: float = 0.05,
+    largest: float | np.ndarray = np.inf,
+    faint: np.ndarray = NO_ROWS,
     keep_one: bool = False,
 ) -> TableEdit:
     """Split the surfels with the largest error; remove transparent and oversized ones, and faint ones.
 
-    At most `most` surfels result; faint ones are removed as far as splits lack room. `keep_one`: the most
-    opaque surfel stays in any case. Raises InputError if no surfel would be left.
+    error: (N,), what each surfel is responsible for: Σ w e² over the pixels of recent steps, as
+    `ParameterTable` adds up, or another score such as the length of the position's gradient; none is split
+    where it is 0. most: surfels that result at most. grow: fraction that is split at most. prune_opacity:
+    surfels of less are removed. largest: scene units, one or (N,), larger ones are removed. faint: rows that
+    may be removed for others as far as splits lack room, the first ones first. keep_one: the most opaque
+    surfel stays in any case. Returns new surfels and the row that each descends from, which
+    `ParameterTable.apply` takes. Raises InputError if no surfel would be left.
     """
+    error = np.array(error)
     raw = surfels.to_numpy()
     primitive = primitive_of(raw)
     opacity = sigmoid(raw["opacity"][:, 0])
     size = primitive.extent(raw)[1].max(axis=1)
-    keep = (size <= largest) & (opacity >= options.prune_opacity)
+    keep = (size <= largest) & (opacity >= prune_opacity)
     if keep_one and not keep.any():
         keep[np.argmax(opacity)] = True
     if not keep.any():
@@ -151,13 +158,13 @@ def densify_and_prune(
         )
 
     # Early in a fit most surfels are faint, those that will be needed, too: they only make room.
-    needed = math.ceil((1 + options.grow) * keep.sum()) - most
+    needed = math.ceil((1 + grow) * keep.sum()) - most
     keep[faint[keep[faint]][: max(needed, 0)]] = False
 
     # The surfels to split: those with the largest error, as many as there is room for.
     left = int(keep.sum())
-    room = min(max(most - left, 0), math.ceil(options.grow * left))
-    lasting = split_opacity(opacity) >= options.prune_opacity  # else the next event would remove the children
+    room = min(max(most - left, 0), math.ceil(grow * left))
+    lasting = split_opacity(opacity) >= prune_opacity  # else the next event would remove the children
     candidates = np.flatnonzero(keep & lasting & (error > 0))
     split = np.sort(candidates[np.argsort(-error[candidates], kind="stable")[:room]])
     keep[split] = False

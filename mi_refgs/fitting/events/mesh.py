@@ -45,8 +45,12 @@ class ExtractMesh(Event[Trainer]):
         trainer.fit.occluder.update(surface_of(trainer.surfels.detach(), cameras, self.resolution))
 
 
-def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int) -> Mesh:
-    """A mesh fused from the depth in all cameras, with `resolution` voxels along the longest side."""
+def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int = 128) -> Mesh:
+    """The surface of surfels as triangles, which occlude: fused from their depth in all cameras.
+
+    cameras: from all around, since what none sees is no surface. resolution: voxels along the longest side of
+    the box around the surfels, 2 … 1023. Detached. Raises InputError without a finite position.
+    """
     bounds = bounds_from_points(surfels.to_numpy()["position"])
     views = tee(render_depth(surfels, camera) for camera in cameras)
     depths, alphas = (depth for depth, _ in views[0]), (alpha for _, alpha in views[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,7 @@ from mi_refgs.fitting.events import reset_opacity
 from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.propagate import Propagate
 from mi_refgs.fitting.events.reset_opacity import ResetOpacity
-from mi_refgs.fitting.optim import Adam, Group
+from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.fitting.state import TableEdit
 from mi_refgs.methods.window import Window
 from mi_refgs.surfels.attributes import logit, sigmoid
@@ -47,7 +48,8 @@ def densify(
     options: Densify = OPTIONS,
     faint: np.ndarray = event.NO_ROWS,
 ) -> TableEdit:
-    return event.densify_and_prune(surfels, error, faint, largest, options, most)
+    given: dict[str, Any] = {"grow": options.grow, "prune_opacity": options.prune_opacity}
+    return event.densify_and_prune(surfels, error, most, largest=largest, faint=faint, **given)
 
 
 def test_surfels_with_the_largest_error_are_split() -> None:
@@ -132,7 +134,7 @@ def test_wait_follows_rate_that_lifts_opacities() -> None:
     """As many steps as Adam needs under a constant gradient, times the patience; 150 as shipped."""
     rate, reset = 0.05, ResetOpacity(Window(0, 10, 10))
     params = {"opacity": mi.TensorXf(np.full((1, 1), logit(reset_opacity.OPACITY), np.float32))}
-    optimiser = Adam(params, {"opacity": Group(rate)})
+    optimiser = Adam(params, {"opacity": LearningRate(rate)})
     steps = 0
     while sigmoid(params["opacity"].numpy())[0, 0] < OPTIONS.prune_opacity:
         dr.set_grad(params["opacity"], -1e-6)
