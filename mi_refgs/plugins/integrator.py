@@ -17,6 +17,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.plugins import properties
 from mi_refgs.plugins.aovs import aov_values
+from mi_refgs.plugins.derivatives import require_derivatives
 from mi_refgs.plugins.film import FilmImage
 from mi_refgs.plugins.light import light_of, used_emitters, warn_of_ignored
 from mi_refgs.plugins.properties import BackgroundProperties
@@ -98,7 +99,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         if not props.id():
             self.set_id("refgs")  # an address otherwise, and with it every parameter's key
         self.surfels = properties.read_surfels(props)
-        self.light, self.light_rotation = properties.read_light(props)
+        self.light, self.light_to_world = properties.read_light(props)
         self.near = properties.read_near_field(props)
         self.seen = 0  # id of the scene whose ignored emitters and shapes were named
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
@@ -138,7 +139,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     # ---------------- parameters ----------------
 
     def traverse(self, cb: Any) -> None:
-        light = {} if self.light is None else {"light": self.light.raw}
+        light: dict[str, Any] = {}
+        if self.light is not None:
+            light = {"light": self.light.raw, "light_to_world": self.light_to_world}
         for name, tensor in {**self.surfels.raw, **light, **self.background.parameters()}.items():
             cb.put(name, tensor, mi.ParamFlags.Differentiable)
 
@@ -181,14 +184,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
         """Tangent of the image for the tangents of the parameters."""
         with dr.resume_grad():
-            return self._image(scene, sensor, spp).tangent()
+            return self._image(scene, sensor, spp, params).tangent()
 
     def render_backward(
         self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> None:
         """Accumulate the adjoints of the parameters for the adjoint of the image."""
         with dr.resume_grad():
-            for image, δ in self._image(scene, sensor, spp).adjoints(grad_in):
+            for image, δ in self._image(scene, sensor, spp, params).adjoints(grad_in):
                 dr.set_grad(image, δ)
                 dr.enqueue(dr.ADMode.Backward, image)
                 dr.traverse(dr.ADMode.Backward)
@@ -197,11 +200,14 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def sample(self, *args: Any, **kwargs: Any) -> Any:
         raise InputError("renders whole images only", "refgs", "sample", "do not nest it, use its own `aovs`")
 
-    def _image(self, scene: Any, sensor: Any, spp: int, forward_only: bool = False) -> FilmImage:
+    def _image(
+        self, scene: Any, sensor: Any, spp: int, params: Any = None, forward_only: bool = False
+    ) -> FilmImage:
         if mi.variant() != self.variant:
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(made, "refgs", "variant", "load the scene again")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        require_derivatives(params, scene, sensor, self)
         request = Request({aov.type for aov in self.aovs}, forward_only)
         view = partial(self.frame, scene, request)
         names, count = self.aov_names(), sum(model.count for model in self._models.values())
@@ -231,10 +237,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     def _light(self, scene: Any, forward_only: bool) -> Light | None:
         """The light as the shading looks it up; its own is filtered once for images without derivatives."""
         if not forward_only or self.light is None:
-            return light_of(self.shading, self.light, self.light_rotation, scene)
+            return light_of(self.shading, self.light, self.light_to_world, scene)
         if self.filtered_light is None:
             with dr.suspend_grad():
-                self.filtered_light = light_of(self.shading, self.light, self.light_rotation, scene)
+                self.filtered_light = light_of(self.shading, self.light, self.light_to_world, scene)
         return self.filtered_light
 
     def to_string(self) -> str:

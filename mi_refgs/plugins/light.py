@@ -12,6 +12,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
+from mi_refgs.kernels.motion import motion_of, rotation_part
 from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import (
     DEFAULT_HEIGHT,
@@ -34,19 +35,22 @@ NAMED = 8  # objects that a warning lists
 
 
 def own_light(emitter: Any) -> tuple[Any, Any]:
-    """A trainable copy of an `envmap` or `constant` emitter and its rotation; InputError for any other."""
+    """A trainable copy of an `envmap` or `constant` emitter, and its `to_world`; InputError for any other."""
     params = mi.traverse(emitter)
     if "data" in params:
         radiance, _ = _map_radiance(params, emitter)
-        return EnvironmentLight.from_radiance(radiance.numpy()), _light_from_world(params)
+        turned = mi.Transform4f(params["to_world"])
+        rotated(None, turned)  # checks it
+        return EnvironmentLight.from_radiance(radiance.numpy()), turned
     colour = np.array(_constant_radiance(params, emitter)).ravel()
-    return EnvironmentLight.from_radiance(np.tile(colour, (DEFAULT_HEIGHT, 2 * DEFAULT_HEIGHT, 1))), None
+    tiled = np.tile(colour, (DEFAULT_HEIGHT, 2 * DEFAULT_HEIGHT, 1))
+    return EnvironmentLight.from_radiance(tiled), mi.Transform4f()
 
 
 def emitter_light(emitter: Any, filtered: bool = True) -> Light:
-    """The light of an emitter, `filtered` or with `radiance` only, under AD: gradients flow to `scale` and
-    `data`, `radiance.value` or `irradiance.value`. Raises InputError for resampled `data` with gradients, and
-    other emitters."""
+    """The light of an emitter, `filtered` or with `radiance` only, under AD by `scale`, `data` and
+    `to_world`, `radiance.value`, or `irradiance.value` and `to_world`. Raises InputError for resampled `data`
+    with gradients, and other emitters."""
     params = mi.traverse(emitter)
     if "irradiance.value" in params:
         towards = -mi.Vector3f(params["to_world"] @ mi.Vector3f(0, 0, 1))
@@ -62,7 +66,7 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
     light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
     if filtered:
         light = PrefilteredLight(*prefilter(radiance))
-    return rotated(light, _light_from_world(params))
+    return rotated(light, params["to_world"])
 
 
 @dataclass(frozen=True)
@@ -103,13 +107,13 @@ class SumOfLights:
         return sum((light.radiance(direction) for light in self.lights), mi.Color3f(0))
 
 
-def light_of(shading: Shading, own: EnvironmentLight | None, rotation: Any, scene: Any) -> Light | None:
+def light_of(shading: Shading, own: EnvironmentLight | None, to_world: Any, scene: Any) -> Light | None:
     """The integrator's light, else the sum of the scene's; None if the model uses none. Raises InputError
     without one."""
     if shading.model.light == "none":
         return None
     if (light := shading.light_of(own)) is not None:
-        return rotated(light, rotation)
+        return rotated(light, to_world)
     lights = [emitter_light(one, shading.model.light == "filtered") for one in used_emitters(shading, scene)]
     if not lights:
         what = f"refgs takes none of {_named(scene.emitters())}" if scene.emitters() else "there is none"
@@ -139,8 +143,17 @@ def _named(objects: list[Any]) -> str:
     return ", ".join(sorted(names)[:NAMED] + more)
 
 
-def rotated(light: Light, light_from_world: Any) -> Light:
-    return light if light_from_world is None else RotatedLight(light, light_from_world)
+def rotated(light: Light | None, to_world: Any) -> Any:
+    """The light under a rotation or reflection (mi.Transform4f), under AD as a rotation; InputError for scale
+    or shear."""
+    matrix = rotation_part(to_world.matrix)
+    value = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    if not np.abs(value.T @ value - np.eye(3)).max() < 1e-4:
+        raise InputError("not a rotation or reflection", "emitter", "to_world", "remove scale and shear")
+    motion = motion_of(matrix) if dr.grad_enabled(matrix) else None
+    if motion is None and np.abs(value - np.eye(3)).max() < 1e-7:
+        return light
+    return RotatedLight(light, mi.Matrix3f(np.linalg.inv(value).astype(np.float32)), motion)
 
 
 def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
@@ -167,14 +180,3 @@ def _constant_radiance(params: Any, emitter: Any) -> Any:
         raise InputError(what, remedy="use an `envmap` or a `constant` environment")
     colour = mi.Color3f(params["radiance.value"])
     return bounded(colour, colour)
-
-
-def _light_from_world(params: Any) -> Any:
-    """Rotation or reflection (mi.Matrix3f, detached), None for the identity; InputError for scale or
-    shear."""
-    matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
-    if np.abs(matrix - np.eye(3)).max() < 1e-7:
-        return None
-    if not np.abs(matrix.T @ matrix - np.eye(3)).max() < 1e-4:
-        raise InputError("not a rotation or reflection", "emitter", "to_world", "remove scale and shear")
-    return mi.Matrix3f(np.linalg.inv(matrix).astype(np.float32))

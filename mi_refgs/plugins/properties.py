@@ -140,14 +140,14 @@ def read_background(props: Any) -> Any:
 
 
 def read_light(props: Any) -> tuple[Any, Any]:
-    """Read the integrator's own EnvironmentLight and its rotation (see `own_light`), or None twice."""
+    """Read the integrator's own EnvironmentLight, or None, and its `to_world` (see `own_light`)."""
     emitters = [child for _, child in props.objects() if isinstance(child, mi.Emitter)]
     if len(emitters) > 1:
         raise InputError("two emitters are nested in the integrator", "refgs", "light", "keep one")
     if emitters:
         return own_light(emitters[0])
     raw = _tensor(props, "light")
-    return (None, None) if raw is None else (EnvironmentLight(raw), None)
+    return None if raw is None else EnvironmentLight(raw), mi.Transform4f()
 
 
 def read_near_field(props: Any) -> NearField | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from mi_refgs.constants import RIGID_TOLERANCE, tile_size
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.motion import motion_of, part_of, rotation_part, turned_by
 from mi_refgs.types import Float, Point2f, Point3f, Sensor, UInt32, Vector3f
 
 
@@ -36,7 +37,7 @@ class Camera:
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film; tiles are those of the film
     film: tuple[int, int] | None = None  # pixels, size of the film; None: the camera has all of it
     motion: Float | None = None
-    """(6,) zeros under AD: rotation about the origin (radians, world axes), translation (scene units)."""
+    """(6,) of `kernels.motion`: rotation about the origin, translation (scene units)."""
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -147,29 +148,31 @@ class Camera:
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
     def attached(self, sensor: Sensor) -> Camera:
-        """The camera with derivatives, where enabled, of its sensor's `x_fov` and of the rigid part of
-        `to_world`."""
-        camera, matrix, angle = self, sensor.world_transform().matrix, mi.traverse(sensor)["x_fov"]
+        """The camera with derivatives, where enabled, of its sensor's `x_fov`, principal point and, as a rigid
+        motion, `to_world`."""
+        camera, matrix, params = self, sensor.world_transform().matrix, mi.traverse(sensor)
         if dr.grad_enabled(matrix):
-            turned = mi.Matrix3f(*(matrix[i, j] for i in range(3) for j in range(3)))
-            turned @= dr.rcp(dr.detach(turned))
-            moved = mi.Vector3f(*(matrix[i, 3] for i in range(3)))
-            camera = replace(camera, motion=_motion_of(turned, moved))
-        if dr.grad_enabled(angle):
+            moved = (matrix[i, 3] for i in range(3))
+            camera = replace(camera, motion=motion_of(rotation_part(matrix), *moved))
+        if dr.grad_enabled(angle := params["x_fov"]):
             slope = dr.tan(dr.deg2rad(0.5 * angle))
             factor = dr.detach(slope) / slope
             camera = replace(camera, fx=self.fx * factor, fy=self.fy * factor)
+        for axis, pixels in zip("xy", self.film or (self.width, self.height), strict=True):
+            if dr.grad_enabled(share := params[f"principal_point_offset_{axis}"]):
+                centre = getattr(self, f"c{axis}") - pixels * (share - dr.detach(share))
+                camera = replace(camera, **{f"c{axis}": centre})
         return camera
 
     def towards(self, point: Point3f) -> Vector3f:
         """Vector in the world from the camera to a point, with the precision of float32 of the vector."""
         vector = (mi.Vector3f(point) - mi.Vector3f(self.origin)) - self.origin_rest
-        return vector if self.motion is None else vector - self._motion(3, vector)
+        return vector if self.motion is None else vector - part_of(self.motion, 3, vector)
 
     def along(self, ray: Vector3f, distance: Float) -> Point3f:
         """Point in the world at a distance along each of the camera's rays, in lengths of the ray."""
         vector = distance * ray
-        return self.origin + (vector if self.motion is None else vector + self._motion(3, vector))
+        return self.origin + (vector if self.motion is None else vector + part_of(self.motion, 3, vector))
 
     def to_camera(self, point: Point3f) -> Vector3f:
         """World point to camera frame."""
@@ -177,21 +180,11 @@ class Camera:
 
     def rotate_to_camera(self, vector: Vector3f) -> Vector3f:
         """World vector to camera frame."""
-        if self.motion is not None:
-            vector = vector - dr.cross(self._motion(0, vector), vector)
-        return self.rotation @ vector
+        return self.rotation @ turned_by(self.motion, vector, -1)
 
     def rotate_to_world(self, vector: Vector3f) -> Vector3f:
         """Vector of the camera frame to the world."""
-        vector = self.rotation.T @ vector
-        return vector if self.motion is None else vector + dr.cross(self._motion(0, vector), vector)
-
-    def _motion(self, first: int, vector: Vector3f) -> Vector3f:
-        """Three numbers of `motion` per vector, gathered: the adjoint of a broadcast is a kernel per use."""
-        assert self.motion is not None
-        index = dr.full(mi.UInt32, first, dr.width(vector))
-        mode = dr.ReduceMode.Expand
-        return mi.Vector3f(*(dr.gather(mi.Float, self.motion, index + i, mode=mode) for i in range(3)))
+        return turned_by(self.motion, self.rotation.T @ vector)
 
     def pixel_centres(self, raster: UInt32 | None = None) -> Point2f:
         """Centres (i + ½, j + ½) of pixels, by their index in the image; of all pixels by default."""
@@ -223,7 +216,7 @@ class Camera:
         origin = dr.detach(mi.Point3f(self.origin + self.origin_rest + change))
         rest = (mi.Vector3f(self.origin) - mi.Vector3f(origin)) + self.origin_rest + dr.detach(change)
         enabled = dr.grad_enabled(rotation, translation)
-        motion = _motion_of(rotation @ dr.detach(rotation).T, change) if enabled else None
+        motion = motion_of(rotation, *change) if enabled else None
         matrix = self.rotation @ dr.detach(rotation).T
         dr.eval(matrix, origin, rest, motion)
         return replace(self, rotation=matrix, origin=origin, origin_rest=rest, motion=motion)
@@ -269,11 +262,3 @@ class Camera:
         offset = self.offset[0] * factor, self.offset[1] * factor
         film = None if self.film is None else (self.film[0] * factor, self.film[1] * factor)
         return replace(self, offset=offset, film=film, **scaled)
-
-
-def _motion_of(turned: mi.Matrix3f, moved: Vector3f) -> Float:
-    """`Camera.motion` of a matrix that is the identity, and of a vector, under AD, by the tangent's
-    antisymmetric part, which is that of the nearest rotation."""
-    angles = [0.5 * (turned[i, j] - turned[j, i]) for i, j in ((2, 1), (0, 2), (1, 0))]
-    motion = dr.concat([*angles, *moved])
-    return motion - dr.detach(motion)

@@ -7,6 +7,9 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
+from mi_refgs.kernels.motion import turned_by
+from mi_refgs.types import Color3f, Float, Vector3f
+
 
 class Light(Protocol):
     """Light from far away. Lookups take unit world directions; they are traced and differentiable."""
@@ -27,12 +30,16 @@ class RotatedLight:
 
     light: Light
     light_from_world: Any  # mi.Matrix3f, detached
+    motion: Float | None = None  # (3,) of `kernels.motion`, of the light in the world
 
-    def specular(self, direction: Any, roughness: Any) -> Any:
-        return self.light.specular(self.light_from_world @ mi.Vector3f(direction), roughness)
+    def _inside(self, direction: Vector3f) -> Vector3f:
+        return self.light_from_world @ turned_by(self.motion, mi.Vector3f(direction), -1)
 
-    def irradiance(self, normal: Any) -> Any:
-        return self.light.irradiance(self.light_from_world @ mi.Vector3f(normal))
+    def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
+        return self.light.specular(self._inside(direction), roughness)
 
-    def radiance(self, direction: Any) -> Any:
-        return self.light.radiance(self.light_from_world @ mi.Vector3f(direction))
+    def irradiance(self, normal: Vector3f) -> Color3f:
+        return self.light.irradiance(self._inside(normal))
+
+    def radiance(self, direction: Vector3f) -> Color3f:
+        return self.light.radiance(self._inside(direction))
