@@ -15,8 +15,8 @@ from mi_refgs.types import Float, Vector3f
 
 
 def motion_of(matrix: Any, *more: Float) -> Float:
-    """The motion of a rotation matrix and of further numbers, all of width 1 under AD: a tangent of the matrix
-    counts by its antisymmetric part, the tangent of the nearest rotation."""
+    """The motion of a rotation matrix and of further numbers, all of width 1 under AD. A tangent of the
+    matrix counts by its antisymmetric part, which is that of the nearest rotation."""
     turned = matrix @ dr.rcp(dr.detach(matrix))
     angles = [0.5 * (turned[i, j] - turned[j, i]) for i, j in ((2, 1), (0, 2), (1, 0))]
     motion = dr.concat([*angles, *more])

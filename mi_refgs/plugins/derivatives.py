@@ -1,8 +1,8 @@
 """Which parameters of a Mitsuba scene have derivatives through the `refgs` integrator, in both modes.
 
-All parameters of the integrator have, SENSOR of the sensor that is rendered, and ENVIRONMENT of the scene's
-environment, if the integrator has no light of its own. Any other raises InputError: none is zero in silence. A
-parameter that the shading does not use, or of another sensor, has the derivative 0.
+All parameters of the integrator have, SENSOR of the sensor that is rendered, and EMITTER of the scene's lights
+that `light.used_emitters` lists, if the integrator has no light of its own. All others raise InputError. The derivative is 0 only
+by parameters that the shading does not use, and by those of other sensors.
 
 No derivative, on purpose: scale and shear of `to_world`; a background colour; the mesh, and the visibility
 and radiance that rays find with it; the side to which a normal is turned; what `splat.composite` lists (sort
@@ -17,18 +17,19 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
+from mi_refgs.plugins.light import used_emitters
 from mi_refgs.types import Scene, Sensor
 
 SENSOR = {"to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"}
-ENVIRONMENT = {"to_world", "scale", "data", "value"}  # the last: of the texture `radiance`
+EMITTER = {"to_world", "scale", "data", "value"}  # the last: of the texture `radiance` or `irradiance`
 
 
 def require_derivatives(params: Any, scene: Scene, sensor: Sensor, integrator: Any) -> None:
-    """Raise InputError, with name and reason, for a parameter that has gradients enabled and no derivative."""
+    """Raise InputError for a parameter with gradients enabled and without derivative, and say why."""
     for key, value in () if params is None else params.items():
         if dr.grad_enabled(value) and (reason := _reason(params, key, scene, sensor, integrator)):
             remedy = "detach it, or leave it out of `params`"
-            raise InputError(f"has no derivative, {reason}", "mi.render", key, remedy)
+            raise InputError(f"has no derivative: {reason}", "mi.render", key, remedy)
 
 
 def _reason(params: Any, key: str, scene: Scene, sensor: Sensor, integrator: Any) -> str:
@@ -40,8 +41,8 @@ def _reason(params: Any, key: str, scene: Scene, sensor: Sensor, integrator: Any
         return ""
     if isinstance(node, mi.Sensor):
         return "" if node is not sensor or name in SENSOR else "refgs does not use it"
-    if isinstance(node, mi.Emitter) and node is scene.environment():
+    if any(node is emitter for emitter in used_emitters(integrator.shading, scene)):
         if integrator.light is not None:
             return "the integrator has a light of its own"
-        return "" if name in ENVIRONMENT else "refgs does not use it"
-    return "refgs renders surfels under an environment, and nothing else of the scene"
+        return "" if name in EMITTER else "refgs does not use it"
+    return "refgs does not render shapes, nor use other emitters than it says"

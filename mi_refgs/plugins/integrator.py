@@ -75,6 +75,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        update, N may change. Three columns of ``scale``: 3D Gaussians.
      * light (tensor, differentiable): Raw map (h, w, 3) of the integrator's own light: radiance =
        ``EnvironmentLight(raw).radiance()``.
+     * light_to_world (transform, differentiable): Rotation or reflection of that light.
      * surroundings_position, …, surroundings_radiance_sh, background (tensor, differentiable): Raw attributes
        of the surroundings, and raw map of the background as of ``light``, if there are any.
 
@@ -85,8 +86,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     no noise. A sample count n (of ``mi.render``, else of the sampler) gives ⌈√n⌉² regular samples per pixel,
     box filtered; n = 1 takes pixel centres. The film's ``rfilter`` is not used. Derivatives in both modes
     reach the parameters above, ``data``, ``scale``, ``radiance.value`` or ``irradiance.value`` of the scene's
-    lights, and ``to_world`` (rigid changes) and ``x_fov`` of sensors, but neither a background colour nor the
-    mesh.
+    lights, ``x_fov`` and principal point of the sensor, and ``to_world`` of both as a rigid motion; any other
+    parameter with gradients raises InputError.
 
     A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 covers no
     pixel and gets zero gradient; such a value of the light is black. One warning names the attribute.

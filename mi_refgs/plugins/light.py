@@ -143,7 +143,7 @@ def _named(objects: list[Any]) -> str:
     return ", ".join(sorted(names)[:NAMED] + more)
 
 
-def rotated(light: Light | None, to_world: Any) -> Any:
+def rotated(light: Any, to_world: Any) -> Any:
     """The light under a rotation or reflection (mi.Transform4f), under AD as a rotation; InputError for scale
     or shear."""
     matrix = rotation_part(to_world.matrix)

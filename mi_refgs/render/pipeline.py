@@ -3,8 +3,7 @@
     forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.shaded_at` is "surfel")
     deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.shaded_at` is "pixel")
 
-Both use the same splatter and the same `shade`. No derivative: visibility, the side to which a normal is
-turned, traced rays, and what `mi_refgs.splat.composite` lists; cameras have one if they have a `motion`.
+Both use the same splatter and the same `shade`. `mi_refgs.plugins.derivatives` lists what has no derivative.
 """
 
 from __future__ import annotations

@@ -148,8 +148,8 @@ class Camera:
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
     def attached(self, sensor: Sensor) -> Camera:
-        """The camera with derivatives, where enabled, of its sensor's `x_fov`, principal point and, as a rigid
-        motion, `to_world`."""
+        """The camera with derivatives, where enabled, by its sensor's `x_fov`, principal point and `to_world`
+        (a rigid motion)."""
         camera, matrix, params = self, sensor.world_transform().matrix, mi.traverse(sensor)
         if dr.grad_enabled(matrix):
             moved = (matrix[i, 3] for i in range(3))

@@ -66,7 +66,7 @@ def test_parameter_keys_do_not_depend_on_the_address(tmp_path: Path) -> None:
     run_folder(tmp_path, background=(1, 0.5, 0.25))
     params = mi.traverse(mi.load_file(str(tmp_path / "scene.xml")))
     keys = [key.removeprefix("refgs.") for key in params.keys() if key.startswith("refgs.")]
-    assert keys == [*raw_channels(), "light"]
+    assert keys == [*raw_channels(), "light", "light_to_world"]
     anonymous = '<scene version="3.0.0"><integrator type="refgs">'
     anonymous += f'<string name="filename" value="{tmp_path}/surfels.ply"/>'
     params = mi.traverse(mi.load_string(anonymous + "</integrator></scene>"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -9,24 +10,92 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs.surfels.attributes import ATTRIBUTES
+from tests import gradients
 from tests.helpers import refused, slow
 from tests.scenes.integrator import (
     COUNT,
     HEIGHT,
+    TANGENT_TOLERANCE,
     WIDTH,
     check_derivatives,
     image,
+    integrator,
     lit_scene,
     raw_channels,
     scene,
+    sensor,
     sky,
 )
 
 
-@pytest.mark.parametrize("key", ["position", "light", slow("opacity"), slow("albedo")])
+def test_every_parameter_is_in_the_table(tmp_path: Path) -> None:
+    """Those of scenes with every feature, refused with the sentence that is listed, or exact."""
+    found, listed = {key: (of, able) for key, of, able in gradients.parameters(tmp_path)}, gradients.listed()
+    assert [*listed] == [*found] and {f"integrator.{name}" for name in ATTRIBUTES} <= {*listed}
+    for key, (of, able) in found.items():
+        if able:
+            assert float(listed[key]) < TANGENT_TOLERANCE, key
+        else:
+            assert gradients.refusals(of, key) == {listed[key]}
+
+
+@pytest.mark.parametrize(
+    ("keys", "threads"),
+    [(("sky.to_world", "sensor.principal_point_offset_y"), 2), slow((), 1), slow((), 2)],
+    ids=["some", "all, one thread", "all, two threads"],
+)
+def test_derivatives_by_parameters(
+    keys: tuple[str, ...], threads: int, tmp_path: Path, set_threads: Callable[[int], None]
+) -> None:
+    set_threads(threads)
+    for key, of, able in gradients.parameters(tmp_path):
+        if able and (not keys or key in keys):
+            check_derivatives(of, key)
+
+
+@pytest.mark.parametrize("key", ["position", slow("light_to_world")])
 def test_derivatives_with_irradiance_and_supersampling(key: str) -> None:
     of = scene(diffuse="irradiance", aovs="nn:normal,d:depth,a:albedo")
     check_derivatives(of, f"integrator.{key}", spp=4)
+
+
+@pytest.mark.parametrize("model", ["monte_carlo", *map(slow, ("mirror", "gaussian_shader"))])
+def test_derivatives_by_the_rotation_of_the_environment(model: str) -> None:
+    """Also where lookups are in a loop; diffuse and mirror terms are in the table."""
+    rng = np.random.default_rng(5)
+    more = {name: rng.normal(size=(COUNT, 3)).astype(np.float32) for name in ("tint", "normal_offset")}
+    check_derivatives(scene(raw=raw_channels() | more, reflectance=model), "integrator.light_to_world")
+
+
+def test_parameters_that_are_not_rendered_may_have_gradients() -> None:
+    """The derivative by another sensor's parameters is 0: loops over views pass those of all sensors."""
+    cameras = {"sensor": sensor(), "other": sensor(fov=40)}
+    of = mi.load_dict({"type": "scene", "integrator": integrator(), **cameras})
+    params = mi.traverse(of)
+    for name in cameras:
+        dr.enable_grad(params[f"{name}.x_fov"])
+    params.update()
+    dr.backward(dr.sum(mi.render(of, params, sensor=1), axis=None))
+    assert dr.grad(params["sensor.x_fov"])[0] == 0 != dr.grad(params["other.x_fov"])[0]
+
+
+def test_camera_and_environment_are_found_by_descent() -> None:
+    """A rotation of the environment by 2° and a principal point that is off by 1 % of the image."""
+    camera = sensor(film={"width": 32, "height": 32})
+    of = scene(camera, diffuse="irradiance")
+    params, target = mi.traverse(of), mi.render(of)
+    optimiser = mi.ad.Adam(lr=0.5, beta_1=0.5, beta_2=0.9)
+    optimiser["angle"], optimiser["shift"] = mi.Float(2), mi.Float(1)  # degrees, %
+    for step in range(30):
+        optimiser.set_learning_rate(0.5 * 0.88**step)
+        turned = mi.Transform4f().rotate([0.6, 0, 0.8], optimiser["angle"])
+        params["integrator.light_to_world"] = turned
+        params["sensor.principal_point_offset_x"] = 0.01 * optimiser["shift"]
+        params.update()
+        dr.backward(dr.mean(dr.square(mi.render(of, params) - target), axis=None))
+        optimiser.step()
+    assert abs(optimiser["angle"][0]) < 0.01 and abs(optimiser["shift"][0]) < 0.01
 
 
 @pytest.mark.parametrize("columns", [64, 48], ids=["as it is", "resampled"])

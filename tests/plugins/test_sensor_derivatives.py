@@ -20,7 +20,7 @@ from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import PinholeCamera, ray_slopes
 from mi_refgs.splat.camera import Camera
 from tests.helpers import slow
-from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotation_of
+from tests.scenes.camera_motion import moved_pose, require_slopes, transform
 from tests.scenes.integrator import (
     check_image_derivatives,
     integrator,
@@ -34,15 +34,6 @@ POSE, ANGLE = "sensor.to_world", "sensor.x_fov"
 FOV = 45.0  # degrees
 START = np.array([0.06, -0.1, 0.08, 0.04, 0.06, -0.02, 0.03], np.float32)
 """Where derivatives are taken: a motion, and the relative change of the field of view."""
-
-
-def transform(motion: mi.Float) -> mi.Transform4f:
-    """The rigid motion of `moved_pose`, under AD."""
-    rotation, translation = rotation_of(motion)
-    rows = [x for i in range(3) for x in (*(rotation[i, j] for j in range(3)), mi.Float(0))]
-    turned = mi.Transform4f(mi.Matrix4f(*rows, 0, 0, 0, 1))
-    centre = mi.Vector3f(CENTRE)
-    return mi.Transform4f().translate(centre + translation) @ turned @ mi.Transform4f().translate(-centre)
 
 
 @dataclass

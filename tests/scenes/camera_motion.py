@@ -28,6 +28,15 @@ def rotation_of(motion: mi.Float) -> tuple[mi.Matrix3f, mi.Vector3f]:
     return dr.quat_to_matrix(mi.Matrix3f, q), mi.Vector3f(*x[3:])
 
 
+def transform(motion: mi.Float) -> mi.Transform4f:
+    """The rigid motion of `moved_pose`, under AD."""
+    rotation, translation = rotation_of(motion)
+    rows = [x for i in range(3) for x in (*(rotation[i, j] for j in range(3)), mi.Float(0))]
+    turned = mi.Transform4f(mi.Matrix4f(*rows, 0, 0, 0, 1))
+    centre = mi.Vector3f(CENTRE)
+    return mi.Transform4f().translate(centre + translation) @ turned @ mi.Transform4f().translate(-centre)
+
+
 def require_slopes(total: Any, define: Any, at: np.ndarray, tolerance: float = 2e-3) -> None:
     """The gradient of `total`, and its forward derivative, are the differences of `define` at (K,) values."""
     exact = at.astype(np.float64)

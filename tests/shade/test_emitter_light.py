@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
-from mi_refgs.plugins.light import emitter_light, own_light
-from mi_refgs.shade.light.light import RotatedLight
+from mi_refgs.plugins.light import emitter_light, own_light, rotated
 from tests.scenes.integrator import sky
 
 AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
@@ -42,8 +41,8 @@ def test_radiance_is_that_of_mitsuba(turn: str, rng: np.random.Generator) -> Non
     si.wi = -world
     truth = made.eval(si).numpy()
     np.testing.assert_allclose(emitter_light(made).radiance(world).numpy(), truth, rtol=1e-3)
-    own, matrix = own_light(made)
-    light = own.prefilter() if matrix is None else RotatedLight(own.prefilter(), matrix)
+    own, to_world = own_light(made)
+    light = rotated(own.prefilter(), to_world)
     np.testing.assert_allclose(light.radiance(world).numpy(), truth, rtol=1e-3)
 
 
