@@ -1,8 +1,8 @@
 """Which parameters of a Mitsuba scene have derivatives through the `refgs` integrator, in both modes.
 
-All parameters of the integrator have, SENSOR of the sensor that is rendered, and EMITTER of the scene's lights
-that `light.used_emitters` lists, if the integrator has no light of its own. All others raise InputError. The derivative is 0 only
-by parameters that the shading does not use, and by those of other sensors.
+All parameters of the integrator have, SENSOR of the sensor that is rendered, and EMITTER of the emitters that
+`light.used_emitters` lists, if the integrator has no light of its own. All others raise InputError. The
+derivative is 0 only by parameters that the shading does not use, and by those of other sensors.
 
 No derivative, on purpose: scale and shear of `to_world`; a background colour; the mesh, and the visibility
 and radiance that rays find with it; the side to which a normal is turned; what `splat.composite` lists (sort
@@ -45,4 +45,4 @@ def _reason(params: Any, key: str, scene: Scene, sensor: Sensor, integrator: Any
         if integrator.light is not None:
             return "the integrator has a light of its own"
         return "" if name in EMITTER else "refgs does not use it"
-    return "refgs does not render shapes, nor use other emitters than it says"
+    return "refgs renders surfels under environments and directional emitters only"

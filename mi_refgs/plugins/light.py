@@ -59,10 +59,9 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
         return ConstantLight(_constant_radiance(params, emitter))
     radiance, resampled = _map_radiance(params, emitter)
     if resampled and dr.grad_enabled(params["data"]):
-        raise InputError(
-            f"emitter '{emitter.id()}': data: a map of {resampled} has no derivative",
-            remedy=f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}",
-        )
+        what = f"has no derivative: a map of {resampled} is resampled"
+        remedy = f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
+        raise InputError(what, "mi.render", f"{emitter.id()}.data", remedy)
     light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
     if filtered:
         light = PrefilteredLight(*prefilter(radiance))

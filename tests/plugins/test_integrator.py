@@ -82,7 +82,7 @@ def test_terms_add_up_and_radiance_needs_no_light() -> None:
 
 
 def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
-    """A directional light and a constant one; the derivative of a colour is the image of its light."""
+    """A directional light and a constant one."""
     sky = {"type": "constant", "radiance": 0.3}
     sun = {
         "type": "directional",
@@ -97,16 +97,7 @@ def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
 
     alone = image(lit(sun=sun))
     assert alone.max() > 0.1
-    both = lit(sky=sky, sun=sun)
-    np.testing.assert_allclose(image(both), image(lit(sky=sky)) + alone, atol=1e-6)
-    params, t = mi.traverse(both), mi.Float(1)
-    dr.enable_grad(t)
-    params["sun.irradiance.value"] = mi.Color3f(3, 2, 1) * t
-    params.update()
-    rendered = mi.render(both, params)
-    dr.set_grad(t, 1)
-    tangent = dr.forward_to(rendered)
-    np.testing.assert_allclose(tangent.numpy(), alone, atol=1e-6)
+    np.testing.assert_allclose(image(lit(sky=sky, sun=sun)), image(lit(sky=sky)) + alone, atol=1e-6)
 
     lamp = {"type": "rectangle", "bulb": {"type": "area"}}
     more = lit(sky=sky, spot={"type": "spot"}, lamp=lamp, floor={"type": "disk"})

@@ -51,19 +51,15 @@ def integrator(raw: dict[str, np.ndarray] | None = None, **changes: object) -> d
     return {"type": "refgs", **channels, "light": light} | changes
 
 
-def scene(
-    camera: dict | None = None, raw: dict[str, np.ndarray] | None = None, **changes: object
-) -> mi.Scene:
-    inner = integrator(raw, **changes)
-    return mi.load_dict({"type": "scene", "integrator": inner, "sensor": camera or sensor()})
+def scene(camera: dict | None = None, *, more: dict | None = None, **changes: Any) -> mi.Scene:
+    inner = {name: value for name, value in integrator(**changes).items() if value is not None}
+    return mi.load_dict({"type": "scene", "integrator": inner, "sensor": camera or sensor()} | (more or {}))
 
 
-def lit_scene(emitter: dict | None, **changes: object) -> mi.Scene:
+def lit_scene(emitter: dict | None, more: dict | None = None, **changes: Any) -> mi.Scene:
     """A scene whose light is an emitter outside the integrator, or which has none."""
-    inner = integrator(**changes)  # type: ignore[arg-type]
-    del inner["light"]
-    made = {"type": "scene", "integrator": inner, "sensor": sensor()}
-    return mi.load_dict(made if emitter is None else made | {"sky": emitter})
+    sky = {} if emitter is None else {"sky": emitter}
+    return scene(more=sky | (more or {}), light=None, **changes)
 
 
 def image(of: mi.Scene, **arguments: object) -> np.ndarray:
