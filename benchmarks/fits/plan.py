@@ -36,22 +36,22 @@ SOURCES = {
     "tabletop": _room(
         "copper jug in a room",
         "135x240",
-        "--shapes jug handle knob --fov 42 --distance 2.7 3.4 --elevation 5 65",
+        "--object jug handle knob --fov 42 --distance 2.7 3.4 --elevation 5 65",
     ),
     "figure": _room(
         "red gloss and silver in a kitchen",
         "180x320",
-        "--shapes red_parts silver_parts --fov 30 --distance 1.9 2.3 --elevation 8 55",
+        "--object red_parts silver_parts --fov 30 --distance 1.9 2.3 --elevation 8 55",
     ),
     "can": _room(
         "printed aluminium on bright tiles",
         "320x180",
-        "--shapes ends wall tab --fov 30 --distance 3.2 3.8 --elevation 10 55",
+        "--object ends wall tab --fov 30 --distance 3.2 3.8 --elevation 10 55",
     ),
     "glass_shelf": _room(
         "glazed mug on glass",
         "180x320",
-        "--shapes mug_outside mug_inside --max-depth 8 --fov 30 --distance 3.4 4.2 --elevation 5 55 "
+        "--object mug_outside mug_inside --max-depth 8 --fov 30 --distance 3.4 4.2 --elevation 5 55 "
         "--azimuth -160 -20",
     ),
 }

@@ -180,14 +180,15 @@ def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 and faces (F, 3) of shapes of a scene, concatenated. Spheres, disks and
     cylinders are tessellated. Raises InputError that names another shape but a mesh."""
     vertices, faces, count = [], [], 0
-    for points, triangles in map(_triangles, shapes):
+    for points, corners in map(triangles, shapes):
         vertices.append(points)
-        faces.append(triangles + count)
+        faces.append(corners + count)
         count += len(points)
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
+def triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of one shape, as `surface_mesh` has them."""
     import mitsuba as mi
 
     if shape.is_mesh():

@@ -33,7 +33,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
-from mi_refgs.io.progress import with_bar
+from mi_refgs.io.progress import say, with_bar
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.synthesis.ground_truth import surface_mesh
 from mi_refgs.synthesis.options import DatasetOptions, LightFile
@@ -44,6 +44,7 @@ from mi_refgs.synthesis.pathtrace import (
     bounding_sphere,
     environment_image,
     incident_image,
+    object_of,
     reach,
 )
 from mi_refgs.synthesis.settings import RELIGHT, SURFACE, load_scene, prepare_folder, under_light, without
@@ -79,21 +80,26 @@ def make_dataset(
     lights = [relight] if isinstance(relight, str | Path) else relight
     settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
     # The scene under each light, and its surface.
-    loaded = load_scene(scene, whole=bool(given.objects))
+    loaded = load_scene(scene)
     named = {shape.id(): shape for shape in loaded.shapes() if shape.id()}
     for name in {*given.objects} - {*named}:
         remedy = f"give one of {', '.join(sorted(named)) or 'none'}"
-        raise InputError(f"no shape has the id '{name}'", scene, "--shapes", remedy)
+        raise InputError(f"no shape has the id '{name}'", scene, "--object", remedy)
     about = [named[name] for name in dict.fromkeys(given.objects)]
-    shapes = about or loaded.shapes()
-    lit = loaded if given.light is None else under_light(loaded, Path(given.light))
     try:
+        shapes, around = (about, []) if about else object_of(loaded.shapes(), given)
         vertices, faces = surface_mesh(shapes)
+        centre, radius = bounding_sphere(shapes)
+        farthest = reach(loaded.shapes(), centre)
     except InputError as error:
         raise error.at(file=scene) from error
+    if progress and not about and len(shapes) < len(loaded.shapes()):
+        what = f"the object is {_names(shapes)}; around it: {_names(around)}; lamps do not count"
+        say(f"{scene.name}: {what}; `--object ID …` decides")
+    about = about or (shapes if around else [])
+    lit = loaded if given.light is None else under_light(loaded, Path(given.light))
     relit = [under_light(loaded, other.path, about) for other in others]
-    centre, radius = bounding_sphere(shapes)
-    cameras = Cameras(given, centre, radius, reach(loaded.shapes(), centre) if about else radius, about)
+    cameras = Cameras(given, centre, radius, farthest, about)
     x, y, z = (float(c) for c in centre)
     region = Region((x, y, z), REGION_MARGIN * radius, estimated=True)  # fits look for what supports it
     if about and cameras.distance[0] <= region.radius:
@@ -111,6 +117,10 @@ def make_dataset(
         alone = Tracer(scene_there, replace(cameras, objects=()))
         write_views(out / RELIGHT / other.name, ("test",), alone, {}, progress)
     return out
+
+
+def _names(shapes: Sequence[Any]) -> str:
+    return ", ".join(sorted({shape.id() or shape.class_name() for shape in shapes})) or "nothing"
 
 
 def write_views(

@@ -51,8 +51,9 @@ class DatasetOptions:
     """pixels per side, or width and height"""
     spp: Annotated[int, arg(metavar="N", name="samples")] = 128
     """samples per pixel; path tracing is noisy, so that the default is larger than that of other commands"""
-    objects: Annotated[tuple[str, ...], optional(metavar="NAME …", name="shapes")] = ()
-    """shapes of interest of an open scene: opaque images, ground truth of these shapes only"""
+    objects: Annotated[tuple[str, ...], optional(metavar="ID …", name="object")] = ()
+    """shapes of the object, among others: opaque images, ground truth of these shapes only (default: all but
+    lamps; all but floors, walls and domes much larger than the rest, if there are any)"""
     distance: Annotated[Range | None, optional(metavar="NEAR FAR")] = None
     """distance of cameras from the object's centre, scene units (default: the object fills the image)"""
     elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)

@@ -12,16 +12,16 @@ import numpy as np
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
-from mi_refgs.occlusion.visibility import mesh_arrays
 from mi_refgs.shade.light import lobe_matrices
-from mi_refgs.synthesis.ground_truth import materials_at
+from mi_refgs.synthesis.ground_truth import materials_at, triangles
 from mi_refgs.synthesis.options import DatasetOptions
 from mi_refgs.types import Color3f, Scene, Vector3f
 
 SAMPLES_PER_LAUNCH = 1 << 24  # most paths per launch; the path tracer keeps about 100 bytes for each
-SURFACE_SAMPLES = 4096  # points per shape that measure the scene's size; the farthest is found to about 1 %
 ENVIRONMENT_OVERSAMPLING = 4  # directions per texel and axis of a rotated map: a small sun keeps its energy
 FILL = 0.95  # of the shorter side that the object's bounding sphere fills, unless distances are given
+BACKDROP = 2.0  # radii of the object: a flat shape that is larger is a floor or a wall
+FLAT = 0.05  # least over largest spread of the points of a flat shape: the top of a table is one
 MAPS = {"normal": "XYZ", "depth": "Y", "albedo": "RGBA", "roughness": "YA", "metallic": "YA"}
 """Channels of the maps of a view; A is 1 where the BSDF defines the material, 0 where it does not."""
 
@@ -35,20 +35,43 @@ def bounding_sphere(shapes: Sequence[Any]) -> tuple[np.ndarray, float]:
 
 
 def reach(shapes: Sequence[Any], centre: np.ndarray) -> float:
-    """The radius around a centre (3,) that contains every surface of the shapes."""
-    import drjit as dr
-    import mitsuba as mi
+    """The radius around a centre (3,) that contains every surface of the shapes. Raises InputError as
+    `surface_mesh` does."""
+    return max(float(np.linalg.norm(triangles(shape)[0] - centre, axis=1).max()) for shape in shapes)
 
-    side = math.isqrt(SURFACE_SAMPLES)
-    x, y = dr.meshgrid(dr.linspace(mi.Float, 0, 1 - 1e-6, side), dr.linspace(mi.Float, 0, 1 - 1e-6, side))
-    radius = 0.0
-    for shape in shapes:
-        if shape.is_mesh():
-            points, _ = mesh_arrays(shape)
-        else:
-            points = np.array(shape.sample_position(0.0, mi.Point2f(x, y)).p, dtype=np.float64).T
-        radius = max(radius, float(np.linalg.norm(points - centre, axis=1).max()))
-    return radius
+
+def object_of(shapes: Sequence[Any], options: DatasetOptions) -> tuple[list[Any], list[Any]]:
+    """The shapes that are an object, and what is around it: floors and walls, flat and more than BACKDROP
+    times as large, and domes and rooms, in whose bounding boxes its cameras stand. Lamps are neither."""
+    solid = [shape for shape in shapes if not shape.is_emitter()]
+    flat = [shape for shape in solid if _flat(triangles(shape)[0])]
+    body = sorted(_without(solid, flat), key=lambda shape: bounding_sphere([shape])[1])
+    around = []
+    while len(body) > 1:
+        centre, radius = bounding_sphere(body[:-1])
+        box, far = body[-1].bbox(), distances(options, radius)[0]
+        if np.any(np.array(box.min) > centre - far) or np.any(np.array(box.max) < centre + far):
+            break
+        around.append(body.pop())
+    if body:
+        largest = BACKDROP * bounding_sphere(body)[1]
+        around += [shape for shape in flat if bounding_sphere([shape])[1] > largest]
+    return _without(solid, around) or list(shapes), around
+
+
+def _flat(points: np.ndarray) -> bool:
+    spread = np.linalg.svd(np.cov(points.T), compute_uv=False)  # squared
+    return bool(spread[2] <= FLAT**2 * spread[0])
+
+
+def _without(shapes: Sequence[Any], others: Sequence[Any]) -> list[Any]:
+    return [shape for shape in shapes if not any(shape is other for other in others)]
+
+
+def distances(options: DatasetOptions, radius: float) -> tuple[float, float]:
+    """Of the nearest and the farthest camera from the centre of an object of this radius, scene units."""
+    filling = radius / (FILL * math.sin(math.radians(options.fov) / 2))
+    return options.distance or (filling, filling)
 
 
 def camera_poses(
@@ -142,9 +165,7 @@ class Cameras:
 
     @property
     def distance(self) -> tuple[float, float]:
-        """Of the nearest and the farthest camera from the centre."""
-        filling = self.radius / (FILL * math.sin(math.radians(self.options.fov) / 2))
-        return self.options.distance or (filling, filling)
+        return distances(self.options, self.radius)
 
     def of(self, split: str) -> list[tuple[np.ndarray, int]]:
         """Pose and seed of each view of a split, from independent random streams."""

@@ -29,13 +29,13 @@ FILES = (
 """Files of a data set, and of its views under another map, which overwriting removes."""
 
 
-def load_scene(scene: Path, whole: bool = False) -> Any:
-    """Load a Mitsuba scene; `whole`: keep shapes and their ids, else meshes of one material are merged."""
+def load_scene(scene: Path) -> Any:
+    """Load a Mitsuba scene with all shapes and their ids: Mitsuba would merge meshes of one material."""
     import mitsuba as mi
 
     try:
         with mitsuba_exr():
-            loaded = mi.load_file(str(scene), optimize=not whole)
+            loaded = mi.load_file(str(scene), optimize=False)
     except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
         raise InputError(f"Mitsuba cannot load it: {error}", scene, "scene", "correct the scene") from error
     for kind, there in (("shapes", loaded.shapes()), ("emitters", loaded.emitters())):
@@ -69,10 +69,10 @@ def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
     """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
     import mitsuba as mi
 
-    left_out = {shape.id() for shape in objects}
+    shapes = [shape for shape in scene.shapes() if not any(shape is one for one in objects)]
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
     lamps = [lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)]
-    return [*(shape for shape in scene.shapes() if shape.id() not in left_out), *lamps]
+    return [*shapes, *lamps]
 
 
 def _scene_of(parts: Sequence[Any]) -> Any:
@@ -117,7 +117,7 @@ def prepare_folder(
 def _option(field: str) -> str:
     """The option of `refgs dataset` that sets a field, or the scene file."""
     names = {"scene": "the scene file", "scene_sha256": "the scene file", "height": "--size"}
-    names |= {"light_sha256": "--light", "objects": "--shapes", "spp": "--samples"}
+    names |= {"light_sha256": "--light", "objects": "--object", "spp": "--samples"}
     return names.get(field) or f"--{field.replace('_', '-')}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +16,8 @@ from mi_refgs.cli import main
 from mi_refgs.data.region import read_region
 from mi_refgs.io.exr import write_exr
 from mi_refgs.synthesis.make_dataset import REGION_MARGIN, make_dataset
+from mi_refgs.synthesis.options import DatasetOptions
+from mi_refgs.synthesis.pathtrace import object_of
 from tests.helpers import read_loaded, refused
 
 CENTRE, RADIUS = np.array([0.3, -0.2, 0.5]), 0.5
@@ -43,6 +46,7 @@ ROOM = f"""<scene version="3.0.0">
         <point name="center" value="0, 0, 5"/><emitter type="area"><rgb name="radiance" value="4"/></emitter>
     </shape>
 </scene>"""
+DOME = '<shape type="sphere" id="dome"><float name="radius" value="40"/></shape>'
 OPTIONS: dict[str, Any] = {"views": 6, "test_views": 2, "size": (WIDTH, HEIGHT), "spp": 16, "progress": False}
 OPTIONS |= {"objects": ["ball"], "elevation": (20.0, 60.0), "distance": (2.0, 2.6), "environment_height": 32}
 
@@ -129,9 +133,42 @@ def test_cameras_stay_within_their_azimuths(made: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("more", "around"),
+    [
+        ("", ["table", "wall"]),
+        (
+            '<shape type="sphere" id="dome"><float name="radius" value="40"/></shape>',
+            ["dome", "table", "wall"],
+        ),
+    ],
+)
+def test_object_is_chosen_among_lamps_and_backdrops(more: str, around: list[str]) -> None:
+    scene = mi.load_string(ROOM.replace("</scene>", f"{more}</scene>"), optimize=False)
+    chosen, others = object_of(scene.shapes(), DatasetOptions())
+    assert [shape.id() for shape in chosen] == ["ball"]
+    assert sorted(shape.id() for shape in others) == around
+
+
+def test_the_choice_is_said_and_keeps_transparency_without_a_backdrop(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = OPTIONS | {"objects": (), "views": 1, "test_views": 1, "spp": 1, "progress": True}
+    room = read_loaded(make_dataset(made.parent / "room.xml", tmp_path / "out", **options), "train").views[0]
+    assert room.alpha is None and read_region(tmp_path / "out") == read_region(made)
+    assert "object is ball; around it: table, wall; lamps do not count; `--object" in capsys.readouterr().err
+    lit = ElementTree.fromstring(ROOM)
+    for shape in [shape for shape in lit.iter("shape") if shape.get("id") in ("table", "wall")]:
+        lit.remove(shape)
+    (tmp_path / "lit.xml").write_bytes(ElementTree.tostring(lit))
+    alone = read_loaded(make_dataset(tmp_path / "lit.xml", tmp_path / "lit", **options), "train").views[0]
+    assert alone.alpha is not None and 0.05 < alone.alpha.mean() < 0.7
+    assert "object is ball; around it: nothing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"objects": ["vase"]}, "--shapes: no shape has the id 'vase'; give one of ball, lamp, table, wall"),
+        ({"objects": ["vase"]}, "--object: no shape has the id 'vase'; give one of ball, lamp, table, wall"),
         ({"distance": (0.55, 2.0)}, "inside of the region"),
         ({"vews": 3}, "make_dataset: vews: unknown option; use some of views"),
     ],
