@@ -38,7 +38,9 @@ def by_package() -> dict[str, list[str]]:
     """First name below `mi_refgs` → public names."""
     found: dict[str, list[str]] = {}
     for name in mi_refgs.__all__:
-        found.setdefault(getattr(mi_refgs, name).__module__.split(".")[1], []).append(name)
+        value = getattr(mi_refgs, name)
+        module = value.__name__ if inspect.ismodule(value) else value.__module__
+        found.setdefault(module.split(".")[1], []).append(name)
     return dict(sorted(found.items(), key=lambda item: (item[0] not in FIRST, item[0])))
 
 
@@ -52,6 +54,12 @@ def summary(package: str) -> str:
 def entry(name: str, value: Any) -> Iterator[str]:
     """A public name: its signature, docstring, fields, and documented methods."""
     source = textwrap.dedent(inspect.getsource(value))
+    if inspect.ismodule(value):
+        yield inspect.getdoc(value) or ""
+        for one in ast.parse(source).body:
+            if isinstance(one, ast.FunctionDef) and not one.name.startswith("_"):
+                yield from _function(f"{name}.{one.name}", one)
+        return
     [node] = ast.parse(source).body
     if isinstance(node, ast.FunctionDef):
         yield from _function(name, node)
