@@ -1,10 +1,10 @@
-"""COLMAP's model files, text or binary. COLMAP's own library is an extra, and allocates what a file promises
-before it compares the file's length."""
+"""COLMAP's model files: read as text or binary, written as text. COLMAP's own library is an extra, and
+allocates what a file promises before it compares the file's length."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.lens import Lens
+from mi_refgs.data.poses import MITSUBA_FROM_OPENCV
 from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.io.files import write_bytes
 
 MODELS: dict[str, tuple[int, str]] = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),
@@ -222,3 +224,34 @@ def _text_points(lines: Iterator[str]) -> Records:
 def _without_comments(lines: Iterator[str]) -> Iterator[str]:
     """Lines that are neither empty nor comments; a caller may read the line after one from `lines`."""
     return (line for line in lines if line and not line.startswith("#"))
+
+
+def write_model(
+    folder: Path,
+    cameras: Iterable[tuple[tuple[float, ...], Lens | None]],  # (width, height, fx, fy, cx, cy), pixels; lens
+    names: Sequence[str],  # of the images
+    poses: Iterable[np.ndarray],  # `View.to_world` (4, 4)
+    camera_of: Iterable[int],  # number of each image's camera, from 1
+    tests: Iterable[str],  # names of the test views
+) -> None:
+    """Write cameras.txt, images.txt, points3D.txt without points, and test.txt."""
+    rows, images = list[str](), list[str]()
+    for i, (numbers, lens) in enumerate(cameras, 1):
+        given = {} if lens is None else lens.coefficients
+        model = "PINHOLE" if lens is None else lens.model
+        model = "FULL_OPENCV" if model == "OPENCV" and given.get("k3") else model
+        coefficients = [given.get(name, 0.0) for name in MODELS[model][1].split()[4:]]
+        rows.append(f"{i} {model} {' '.join(map(repr, (*numbers, *coefficients)))}")
+    for i, (name, pose, camera) in enumerate(zip(names, poses, camera_of, strict=True), 1):
+        rotation = (pose[:3, :3] @ MITSUBA_FROM_OPENCV[:3, :3]).T
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
+        values = " ".join(repr(float(value)) for value in (w, x, y, z, *(-rotation @ pose[:3, 3])))
+        images += [f"{i} {values} {camera} {name}", ""]
+    files = {
+        "cameras.txt": ["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY, and coefficients", *rows],
+        "images.txt": ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points", *images],
+        "points3D.txt": ["# POINT3D_ID X Y Z R G B ERROR TRACK[IMAGE_ID POINT2D_IDX]"],
+        TEST_LIST: tests,
+    }
+    for name, lines in files.items():
+        write_bytes(folder / name, "".join(f"{line}\n" for line in lines).encode())

@@ -1,11 +1,13 @@
-"""transforms.json of cameras: written for a scene, and read."""
+"""transforms.json and COLMAP's text files of cameras: written for a scene, and transforms.json read."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from mi_refgs.data.colmap_model import write_model
 from mi_refgs.data.lens import COEFFICIENTS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.data.transforms import Frame
@@ -22,14 +24,30 @@ SIZE_MAX = 2**14  # pixels along a side of an image, at most
 
 
 def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Path]:
-    """The cameras of a run as transforms.json, which instant-ngp and nerfstudio read.
+    """The cameras of a run as transforms.json (instant-ngp, nerfstudio) and as COLMAP's text files.
 
-    Intrinsics, lens and OpenGL pose per frame; train_filenames and test_filenames. Names, sizes and lenses
-    are those of the data set's image files on disk, whatever the fit made of them. Paths are relative to it.
+        transforms.json         intrinsics, lens and OpenGL pose per frame; train_filenames, test_filenames
+        sparse/0/cameras.txt …  the same in COLMAP's convention without points; test.txt lists the test views
+
+    Names, sizes and lenses are those of the data set's image files on disk, whatever the fit made of them.
+    Paths are relative to the data set, in COLMAP's files to its folder `images` where all images are there.
     """
-    make_folder(target)
+    sparse = target / "sparse" / "0"
+    make_folder(sparse)
     write_json(target / TRANSFORMS, transforms(shots))
-    return [target / TRANSFORMS]
+    files = [_file(shot) for shot in shots]
+    names = [file.path.as_posix() for file in files]
+    poses = [shot.camera.pose() for shot in shots]
+    cameras = [((file.width, file.height, *map(float, file.intrinsics)), file.lens) for file in files]
+    numbered = {camera: i for i, camera in enumerate(dict.fromkeys(cameras), 1)}
+    folder = re.match(r"images(_\d+)?/", names[0])  # to which COLMAP's names are relative
+    below = names
+    if folder and all(name.startswith(folder[0]) for name in names):
+        below = [name.removeprefix(folder[0]) for name in names]
+    tests = [name for name, shot in zip(below, shots, strict=True) if shot.split == "test"]
+    write_model(sparse, numbered, below, poses, [numbered[camera] for camera in cameras], tests)
+    written = "cameras.txt", "images.txt", "points3D.txt", "test.txt"
+    return [target / TRANSFORMS, *(sparse / file for file in written)]
 
 
 def transforms(shots: Sequence[Shot]) -> dict[str, Any]:

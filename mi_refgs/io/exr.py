@@ -101,12 +101,18 @@ def _readable(path: Path, field: str = "pixels") -> Iterator[None]:
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
     """Write an (H, W, C) or (H, W) array as ZIP-compressed EXR, float32 or float16, atomically. `names` has
     one letter per channel, by default Y, RGB or RGBA. Raises InputError as `replace_file` does."""
-    import OpenEXR
-
-    image = np.asarray(image, np.float16 if half else np.float32)
+    image = np.asarray(image)
     planes = image[..., None] if image.ndim == 2 else image
     names = names or {1: "Y", 3: "RGB", 4: "RGBA"}[planes.shape[-1]]
-    channels = {name: np.ascontiguousarray(planes[..., i]) for i, name in enumerate(names)}
+    dtype = np.float16 if half else np.float32
+    write_exr_layers(path, {name: planes[..., i].astype(dtype) for i, name in enumerate(names)})
+
+
+def write_exr_layers(path: str | Path, layers: Mapping[str, np.ndarray]) -> None:
+    """Write (H, W) arrays of float32 or float16 by name of channel, as `write_exr` does."""
+    import OpenEXR
+
+    channels = {name: np.ascontiguousarray(plane) for name, plane in layers.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     replace_file(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
 

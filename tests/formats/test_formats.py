@@ -62,10 +62,10 @@ def test_registered_format_is_a_choice_of_the_command(
 
 def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: Path, tmp_path: Path) -> None:
     """Their names are separated by commas and blanks."""
-    names = "plain,cameras, 3dgs-ply,"
+    names = "plain,cameras, exr, 3dgs-ply, gltf-splats,"
     assert main(["export", str(finished), "--to", names, "-o", str(tmp_path / "out")]) == 0
     files = {path.name for path in (tmp_path / "out").iterdir()}
-    assert files == {MARK, "plain.txt", "cameras", "3dgs-ply.ply"}
+    assert files == {MARK, "plain.txt", "cameras", "exr.exr", "3dgs-ply.ply", "gltf-splats.glb"}
     assert (tmp_path / "out" / "plain.txt").read_text() == "3"
     assert (tmp_path / "out" / "cameras" / "transforms.json").is_file()
 
@@ -81,6 +81,7 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
             "--level: no option of cameras; leave it out, or choose a format that has it (plain)",
         ),
         (["--to", "plain", "-o", "OUT.ply"], "suffix: plain writes .txt"),
+        (["--to", "exr", "-o", "OUT.exr", "--view", "9"], "--view: 9 is out of range; there are 5, give"),
         (["--to", "gltf-mesh", "-o", "OUT.glb", "--faces=3"], "--faces: 3 is out of range"),
     ],
 )

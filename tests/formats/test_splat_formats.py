@@ -1,24 +1,32 @@
-"""3D Gaussians of a scene for other viewers."""
+"""3D Gaussians of a scene in PLY and glTF files for other viewers, and a view with its layers as EXR."""
 
 from __future__ import annotations
 
+import json
+import struct
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.formats import Shot
+from mi_refgs.formats import Shot, write
 from mi_refgs.formats.gaussians import THIN, gaussians
 from mi_refgs.formats.orbits import shots_around
+from mi_refgs.io.exr import read_exr
 from mi_refgs.render.display import display_image, image_array
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.sh import sh_basis
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import SH_DC, logit
+from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 
@@ -140,3 +148,75 @@ def test_background_gaussians_are_exported_unless_object_only(
     assert whole.count == COUNT + 400 and alone.count == COUNT
     assert db(their_image(whole, camera)[..., :3], encoded(both, camera)[..., :3]) > 26
     assert db(their_image(alone, camera)[..., :3], encoded(both, camera, alone=True)[..., :3]) > 28
+
+
+def columns_of(file: Path) -> tuple[dict[str, Any], Callable[[str], np.ndarray]]:
+    """JSON of a binary glTF file, and its attributes by name."""
+    data = file.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    content = json.loads(data[20 : 20 + size])
+    rest, binary = struct.unpack_from("<I4s", data, 20 + size)
+    assert (magic, version, length, kind, binary) == (b"glTF", 2, len(data), b"JSON", b"BIN\0")
+    assert size % 4 == rest % 4 == 0 and content["buffers"][0]["byteLength"] == rest == len(data) - 28 - size
+
+    def column(name: str) -> np.ndarray:
+        accessor = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"][name]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        view = content["bufferViews"][accessor["bufferView"]]
+        offset = 28 + size + view["byteOffset"]
+        values = np.frombuffer(data, "<f4", accessor["count"] * width, offset).reshape(-1, width)
+        assert values.nbytes == view["byteLength"] and accessor["componentType"] == 5126
+        if "min" in accessor:
+            np.testing.assert_array_equal(values.min(axis=0), np.float32(accessor["min"]))
+            np.testing.assert_array_equal(values.max(axis=0), np.float32(accessor["max"]))
+        return values
+
+    return content, column
+
+
+def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
+    files = write(scene, ["3dgs-ply", "gltf-splats"], tmp_path, shots, {"degree": 2})
+    table, (content, column) = read_ply(files["3dgs-ply"][0]), columns_of(files["gltf-splats"][0])
+    raw, prefix = table.to_numpy(), "KHR_gaussian_splatting"
+    primitive = content["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and content["extensionsUsed"] == [prefix]
+    extension = primitive["extensions"][prefix]
+    assert (extension["kernel"], extension["colorSpace"]) == ("ellipse", "srgb_rec709_display")
+    np.testing.assert_array_equal(column("POSITION"), raw["position"])
+    np.testing.assert_allclose(column(f"{prefix}:SCALE"), np.exp(raw["scale"]), rtol=1e-5)
+    np.testing.assert_allclose(column(f"{prefix}:OPACITY")[:, 0], table.opacity().numpy(), atol=1e-6)
+    rotation = column(f"{prefix}:ROTATION")
+    np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-6)
+    q = table.rotation()
+    np.testing.assert_allclose(rotation, np.stack([q.x, q.y, q.z, q.w], axis=1), atol=1e-6)
+    # SH coefficients by degree and order give the colour of the table in any direction.
+    toward = mi.Vector3f(0.48, -0.6, 0.64)
+    basis = [float(f[0]) for f in sh_basis(toward, 2)]
+    names = [f"{prefix}:SH_DEGREE_{k}_COEF_{n}" for k in range(3) for n in range(2 * k + 1)]
+    colour = sum(column(name) * y for name, y in zip(names, basis, strict=True))
+    coefficients = raw["radiance_sh"].reshape(COUNT, 9, 3)
+    np.testing.assert_allclose(colour, np.einsum("nkc,k->nc", coefficients, basis), atol=1e-5)
+    assert len(primitive["attributes"]) == 5 + 9
+    shown = column("COLOR_0")
+    assert shown.min() >= 0 and shown.max() <= 1 and shown.shape[1] == 4
+    x, y, z, w = content["nodes"][0]["rotation"]  # +z of the data is +y of glTF
+    turned = [2 * (x * z + w * y), 2 * (y * z - w * x), w * w + z * z - x * x - y * y]
+    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-7)
+
+
+def test_exr_has_every_layer(scene: TrainedScene, shots: list[Shot], tmp_path: Path) -> None:
+    (file,) = write(scene, ["exr"], tmp_path / "view.exr", shots, {"view": 1, "samples": 1})["exr"]
+    layers, frame = read_exr(file), scene.renderer()(shots[1].camera)
+    expected = dict(zip("RGB", frame.radiance, strict=True)) | {"A": frame.alpha, "depth.Z": frame.depth}
+    expected |= {f"albedo.{c}": plane for c, plane in zip("RGB", frame.maps["albedo"], strict=True)}
+    for name, plane in expected.items():
+        np.testing.assert_allclose(layers[name], image_array(plane, SIZE, SIZE), atol=1e-6)
+    for letter in "RGB":
+        terms = sum(layers[f"{name}.{letter}"] for name in ("diffuse", "specular", "indirect"))
+        np.testing.assert_allclose(terms, layers[letter], atol=1e-5)
+    solid = layers["A"] > 0.99
+    normal = np.stack([layers[f"normal.{letter}"] for letter in "XYZ"], axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(normal[solid], axis=-1), 1, atol=1e-5)
+    np.testing.assert_allclose(layers["roughness.V"][solid], 0.6, atol=1e-3)
+    assert {"metallic.V", "visibility.V"} <= {*layers} and solid.mean() > 0.2

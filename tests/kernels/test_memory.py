@@ -22,7 +22,7 @@ BOUNDED = {
     "render": ["render", "RUN", "-o", "OUT/a.exr"],
     "relight": ["relight", "RUN", "--envmap", "RUN/envmap.exr", "-o", "OUT"],
     "edit": ["edit", "RUN", "--where", "metallic > 0.5", "--set", "roughness=0.3", "-o", "OUT"],
-    "export": ["export", "RUN", "--to", "3dgs-ply", "-o", "OUT"],
+    "export": ["export", "RUN", "--to", "exr", "-o", "OUT"],
     "import": ["import", "RUN/surfels.ply", "-o", "OUT"],
     "profile": ["profile", "RUN"],
     "view": ["view", "RUN", "--port", "0"],

@@ -20,7 +20,7 @@ import pytest
 from mi_refgs import Reconstruction, import_splats, load
 from mi_refgs.cli import main
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
-from mi_refgs.formats import FORMATS
+from mi_refgs.formats import FORMATS, Shot
 from mi_refgs.io.exr import read_exr
 from mi_refgs.methods import read
 from mi_refgs.plugins.aovs import suffixes, values_of_planes
@@ -202,6 +202,21 @@ def by_viewer_of_a_run(case: Case) -> Maps:
     return case.of_whole(found)
 
 
+def by_layers(case: Case) -> Maps:
+    """`refgs export --to exr`, which has the depth along the axis, and what is behind as a layer."""
+    path, camera = case.scratch / "layers.exr", Camera.from_sensor(sensor(case.crop))
+    shots = [Shot("view", "test", camera)]
+    options = {"view": 0, "samples": case.samples, "object": case.alone}
+    FORMATS["exr"].writer(case.made.trained, path, shots, **options)
+    layers = read_exr(path)
+    found = {IMAGE: np.stack([layers[letter] for letter in "RGBA"], axis=-1)}
+    if "background.R" in layers:
+        through = np.stack([layers[f"background.{letter}"] for letter in "RGB"], axis=-1)
+        found[IMAGE][..., :3] += (1 - layers["A"][..., None]) * through
+        found[IMAGE][..., 3] = 1
+    return found | of_layers(layers, [name for name in case.names if name not in ("depth", "alpha")])
+
+
 ROUTES: tuple[Callable[[Case], Maps], ...] = (
     by_reconstruction,
     by_its_mitsuba_scene,
@@ -210,6 +225,7 @@ ROUTES: tuple[Callable[[Case], Maps], ...] = (
     by_command_of_a_scene,
     by_command_with_a_camera,
     by_viewer_of_a_run,
+    by_layers,
 )
 
 
