@@ -18,6 +18,7 @@ from mi_refgs.viewer import resolution
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.panels import MaterialsPanel, add_cameras, add_display, add_light, add_saving
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.region_panel import RegionPanel
 
 USUAL_SHAPES, WARM = (1.0, 1.6), 4
 """Aspect ratios of desktop windows less the panel, and number of levels, that are compiled beforehand."""
@@ -44,6 +45,8 @@ def serve(
     if scene.materials:
         MaterialsPanel(page, scene)
     add_cameras(page)
+    if some is not None and some.region is not None:
+        RegionPanel(page, some, some.region)
     add_saving(page, scene)
     page.listen()
     return page

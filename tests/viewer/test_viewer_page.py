@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import shutil
@@ -214,7 +215,18 @@ def test_every_panel_does_what_it_says(tab: Tab, scene: TrainedScene, tmp_path: 
     tab.differs(before, 5, "the object without background")
     alone = tab.still()
 
-    # The cameras, over the image.
+    # The region of interest and the cameras, over the image.
+    tab.page.get_by_text("Region of interest", exact=True).click()
+    tab.check("Border")
+    tab.differs(alone, 0.5, "the border")
+    tab.type("Radius", "0.5")
+    (tmp_path / "data" / "region.json").unlink()
+    tab.press("Save region")
+    tab.says("; next: ")
+    region = json.loads((tmp_path / "data" / "region.json").read_text())
+    assert region["radius"] == pytest.approx(0.5, abs=0.01)
+    tab.check("Border")
+    tab.returns(alone, "the image without the border")
     tab.check("Cameras")
     tab.until(lambda image: bool(np.abs(image - alone).max() > 50), "cameras")
     tab.check("Cameras")
