@@ -15,6 +15,7 @@ from mi_refgs.formats.gaussians import gaussians
 from mi_refgs.io.ply import read_header
 from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.shade.light.maps import Learnt
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
@@ -66,7 +67,9 @@ def read_splats(path: Path, linear: bool = False) -> TrainedScene:
 
 def method_of(trained: TrainedScene, name: str) -> Method:
     """Describe a scene that was fitted elsewhere as a method, for config.toml: how it is shaded."""
-    surfels, degree = trained.surfels, {"radiance_sh": trained.surfels.sh_degree()}
-    count, stages = surfels.count, {"imported": Stage(1, trained.shading)}
-    options = SurfelOptions(surfels.primitive.name, ("radiance_sh",), count, count, degree=degree)
-    return Method(1, stages, surfels=options, data=DataOptions(downscale=1), name=name, preset="standard")
+    surfels, stages = trained.surfels, {"imported": Stage(1, trained.shading)}
+    count, attributes = surfels.count, tuple(x for x in surfels.raw if x not in surfels.primitive.widths)
+    degree = {x: surfels.sh_degree(x) for x in attributes if ATTRIBUTES[x].harmonics}
+    options = SurfelOptions(surfels.primitive.name, attributes, count, count, degree=degree)
+    light = None if trained.light is None else Learnt(height=trained.light.height)
+    return Method(1, stages, surfels=options, light=light, data=DataOptions(downscale=1), name=name)

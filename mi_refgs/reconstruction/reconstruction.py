@@ -27,8 +27,10 @@ from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.formats.gaussian_ply import method_of, read_splats
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
+from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.plugins.aovs import aov_values, suffixes
 from mi_refgs.reconstruction.new_light import AnyLight, any_light
+from mi_refgs.reconstruction.own_scene import scene_of
 from mi_refgs.reconstruction.provenance import EDITS, Provenance
 from mi_refgs.render.display import composited, image_array
 from mi_refgs.render.load_scene import load_scene
@@ -37,6 +39,7 @@ from mi_refgs.runs.export import export, newest, save, write_if_stale
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
+from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.splat import Camera
 
 CameraLike: TypeAlias = "Camera | View | int | Any"
@@ -54,6 +57,28 @@ class Reconstruction:
     folder: Path | None = None  # the run folder with exactly this content; None: only in memory
     _temporary: Any = field(default=None, repr=False)  # keeps a temporary folder until the last user is gone
     _renderers: dict[Any, Callable[[Camera], Frame]] = field(default_factory=dict, init=False, repr=False)
+
+    @staticmethod
+    def from_params(
+        params: Any,
+        *,
+        mesh: Mesh | None = None,
+        shading: ShadingOptions | None = None,
+        data: str | Path | None = None,
+        name: str = "own",
+    ) -> Reconstruction:
+        """Make a reconstruction, in memory, of the state of a loop of one's own.
+
+        params: an `mi.Scene` with the `refgs` integrator or its `mi.traverse`, whose light, mesh, shading and
+        surroundings are taken too. Or a mapping of arrays or tensors: raw attributes (N, D) by name, and
+        "light", the raw map (h, 2h, 3); names may begin with "refgs.". Of a mapping only, mesh: occludes;
+        shading: by default the first model whose attributes are there.
+        data: folder of its data set; without one, cameras are around the object, z up. name: of its method.
+        Raises InputError for another object, unknown names, wrong shapes, NaN, and without a light that the
+        shading needs."""
+        trained = scene_of(params, mesh, shading)
+        provenance = Provenance(method_of(trained, name)).with_data(None if data is None else Path(data))
+        return Reconstruction(trained, provenance)
 
     def __repr__(self) -> str:
         light, mesh, around = self.trained.light, self.trained.mesh, self.trained.surroundings

@@ -1,0 +1,71 @@
+"""The state of a loop of one's own as a fitted scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_refgs.errors import InputError
+from mi_refgs.occlusion.mesh import Mesh
+from mi_refgs.plugins.light import light_of
+from mi_refgs.render.surroundings import Surroundings, nothing_around
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, EnvironmentLight
+from mi_refgs.shade.light.lobe_matrices import map_directions
+from mi_refgs.shade.options import ShadingOptions
+from mi_refgs.shade.reflectance import MODELS
+from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.table import Surfels
+
+
+def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> TrainedScene:
+    """The scene of `Reconstruction.from_params`, detached."""
+    if isinstance(params, mi.SceneParameters):  # the object that was traversed is nobody's child
+        params = next(node for node, (parent, _) in params.hierarchy.items() if parent is None)
+    if isinstance(params, Mapping):
+        return _of_arrays(params, mesh, shading)
+    integrator = params.integrator() if isinstance(params, mi.Scene) else params
+    if type(integrator).__name__ != "RefGSIntegrator":
+        what, remedy = "it has no `refgs` integrator", "give such a scene, its parameters, or raw arrays"
+        raise InputError(what, "from_params", type(params).__name__, remedy)
+    if mesh is not None or shading is not None:
+        raise InputError("a scene has its own", "from_params", "mesh, shading", "give arrays, or drop them")
+    with dr.suspend_grad():
+        seen = light_of(integrator.shading, integrator.light, integrator.light_rotation, params)
+    light = integrator.light
+    if seen is not None and (light is None or integrator.light_rotation is not None):
+        direction = map_directions(DEFAULT_HEIGHT if light is None else light.height)
+        radiance = seen.radiance(mi.Vector3f(direction.reshape(-1, 3).T.astype(np.float32)))
+        values = np.broadcast_to(np.array(radiance), (3, direction.size // 3))
+        light = EnvironmentLight.from_radiance(values.T.reshape(direction.shape))
+    around, behind = integrator.background.surfels, integrator.background.map
+    return TrainedScene(
+        integrator.surfels.detach(),
+        None if light is None else EnvironmentLight(dr.detach(light.raw)),
+        None if integrator.occluder is None else integrator.occluder.mesh(),
+        integrator.shading,
+        iteration=0,
+        seconds=0.0,
+        surroundings=None
+        if around is None and behind is None
+        else Surroundings((around or nothing_around(integrator.surfels)).detach(), behind),
+        near=integrator.near,
+    )
+
+
+def _of_arrays(params: Mapping[str, Any], mesh: Mesh | None, shading: ShadingOptions | None) -> TrainedScene:
+    """The scene of raw values by attribute, and of a light."""
+    values = {name.removeprefix("refgs."): np.array(value, np.float32) for name, value in params.items()}
+    light = EnvironmentLight(mi.TensorXf(values.pop("light"))) if "light" in values else None
+    surfels = Surfels.from_numpy(values)
+    surfels.validate()
+    if shading is None:
+        reflectance, diffuse = Shading.default(surfels.raw)
+        shading = ShadingOptions(MODELS[reflectance].shaded_at[0], reflectance, diffuse)
+    resolved = Shading.resolve(shading, mesh is not None)
+    resolved.require_inputs(surfels.raw, light is not None)
+    return TrainedScene(surfels, light, mesh, resolved, iteration=0, seconds=0.0)

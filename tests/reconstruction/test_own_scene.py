@@ -1,0 +1,75 @@
+"""`Reconstruction.from_params`: the state of a loop is what save, relight, export and view take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mi_refgs
+from mi_refgs import Reconstruction
+from tests.helpers import refused
+from tests.scenes.integrator import sky
+
+
+@pytest.fixture(scope="module")
+def balls(known: Path) -> Reconstruction:
+    return mi_refgs.load(known / "run")
+
+
+def test_round_trip_keeps_the_image(balls: Reconstruction, known: Path, tmp_path: Path) -> None:
+    """From a scene, its parameters, and their arrays; saved, it is a run that can be relit and exported."""
+    scene = balls.scene()
+    params = mi.traverse(scene)
+    arrays = {name: x for name, x in params.items() if name.startswith("refgs.") and "to_world" not in name}
+    camera, before = balls.camera(0), balls.render(0)
+    of_arrays: dict[str, Any] = {"mesh": balls.trained.mesh, "shading": balls.trained.shading}
+    for given in (scene, params, arrays):
+        options = of_arrays if given is arrays else {}
+        made = Reconstruction.from_params(given, **options, data=known / "data")
+        np.testing.assert_allclose(made.render(0), before, atol=1e-6)
+    saved = Reconstruction.from_params(params).save(tmp_path / "run")
+    np.testing.assert_allclose(saved.render(camera), before, atol=1e-6)
+    relit = [one.relight(np.full((16, 32, 3), 0.7)).trained for one in (saved, balls)]
+    assert relit[0].shading == relit[1].shading and [*relit[0].surfels.raw] == [*relit[1].surfels.raw]
+    assert saved.export("cameras", tmp_path / "cameras")
+    params["refgs.roughness"] = params["refgs.roughness"] + 1
+    dr.enable_grad(params["refgs.roughness"])
+    params.update()
+    changed, camera = Reconstruction.from_params(params), mi_refgs.Camera.from_sensor(scene.sensors()[0])
+    np.testing.assert_allclose(changed.render(camera)[..., :3], mi.render(scene, spp=1)[..., :3], atol=1e-6)
+    assert not dr.grad_enabled(changed.trained.surfels.raw["roughness"])
+
+
+def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) -> None:
+    """A rotated environment, of the integrator or of the scene, becomes a map without rotation."""
+    turned = {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(sky(16)),
+        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 70),
+    }
+    camera = balls.camera(0, 24)
+    sensor = balls.scene(camera).sensors()[0]
+    for inside in (True, False):
+        surfels: dict[str, Any] = {"type": "refgs", **balls.trained.surfels.raw, "reflectance": "split_sum"}
+        surfels |= {"light": turned} if inside else {}
+        parts = {"refgs": surfels, "sensor": sensor} | ({} if inside else {"sky": turned})
+        scene = mi.load_dict({"type": "scene", **parts})
+        expected = mi.render(scene, spp=1).numpy()
+        found = Reconstruction.from_params(scene).render(camera)
+        np.testing.assert_allclose(found[..., :3], expected[..., :3], atol=0.03 * expected.max())
+
+
+def test_other_states_are_refused(balls: Reconstruction) -> None:
+    arrays = balls.trained.surfels.to_numpy()
+    make = Reconstruction.from_params
+    refused(lambda: make(mi.load_dict({"type": "sphere"})), "no `refgs` integrator")
+    refused(lambda: make(arrays | {"hue": arrays["opacity"]}), "hue")
+    refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
+    refused(lambda: make(arrays), "shading: light: reflectance = split_sum needs one")
+    refused(lambda: make(arrays | {"opacity": np.full_like(arrays["opacity"], np.nan)}), "NaN")
+    refused(lambda: make(balls.scene(), mesh=balls.trained.mesh), "a scene has its own")
