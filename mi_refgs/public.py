@@ -8,9 +8,16 @@ from mi_refgs.data.view import View as View
 from mi_refgs.editing.options import EditOptions as EditOptions
 from mi_refgs.errors import InputError as InputError
 from mi_refgs.evaluation.evaluate import evaluate as evaluate
-from mi_refgs.fitting import losses as losses
 from mi_refgs.fitting.events.densify import densify_and_prune as densify_and_prune
 from mi_refgs.fitting.events.mesh import surface_of as extract_mesh
+from mi_refgs.fitting.losses import alpha_loss as alpha_loss
+from mi_refgs.fitting.losses import d_ssim as d_ssim
+from mi_refgs.fitting.losses import half_metal as half_metal
+from mi_refgs.fitting.losses import l1 as l1
+from mi_refgs.fitting.losses import light_colour as light_colour
+from mi_refgs.fitting.losses import normal_consistency as normal_consistency
+from mi_refgs.fitting.losses import planes as image_planes
+from mi_refgs.fitting.losses import smoothness as smoothness
 from mi_refgs.fitting.objective import Loss as Loss
 from mi_refgs.fitting.objective import LossInputs as LossInputs
 from mi_refgs.fitting.objective import register as register_loss

@@ -15,10 +15,12 @@ from mi_refgs.plugins.light import light_of
 from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, EnvironmentLight
+from mi_refgs.shade.light.light import RotatedLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
+from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 
 
@@ -35,9 +37,9 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     if mesh is not None or shading is not None:
         raise InputError("a scene has its own", "from_params", "mesh, shading", "give arrays, or drop them")
     with dr.suspend_grad():
-        seen = light_of(integrator.shading, integrator.light, integrator.light_rotation, params)
+        seen = light_of(integrator.shading, integrator.light, integrator.light_to_world, params)
     light = integrator.light
-    if seen is not None and (light is None or integrator.light_rotation is not None):
+    if isinstance(seen, RotatedLight) or (light is None and seen is not None):
         direction = map_directions(DEFAULT_HEIGHT if light is None else light.height)
         radiance = seen.radiance(mi.Vector3f(direction.reshape(-1, 3).T.astype(np.float32)))
         values = np.broadcast_to(np.array(radiance), (3, direction.size // 3))
@@ -59,7 +61,12 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
 
 def _of_arrays(params: Mapping[str, Any], mesh: Mesh | None, shading: ShadingOptions | None) -> TrainedScene:
     """The scene of raw values by attribute, and of a light."""
-    values = {name.removeprefix("refgs."): np.array(value, np.float32) for name, value in params.items()}
+    values = {}
+    for key, value in params.items():
+        name = key.removeprefix("refgs.")
+        if name != "light":
+            attribute(name)  # is registered
+        values[name] = np.array(value, np.float32)
     light = EnvironmentLight(mi.TensorXf(values.pop("light"))) if "light" in values else None
     surfels = Surfels.from_numpy(values)
     surfels.validate()

@@ -38,8 +38,8 @@ def test_a_loop_over_the_parameters_of_a_scene(rng: np.random.Generator) -> None
     for step in range(16):
         params.update()
         image = mi.render(scene, params, spp=1)
-        planes, true_planes = (mi_refgs.losses.planes(x) for x in (image, goal))
-        loss = mi_refgs.losses.l1(planes, true_planes) + mi_refgs.losses.d_ssim(planes, true_planes, 24, 24)
+        planes, true_planes = (mi_refgs.image_planes(x) for x in (image, goal))
+        loss = mi_refgs.l1(planes, true_planes) + mi_refgs.d_ssim(planes, true_planes, 24, 24)
         dr.backward(loss)
         moved = dr.grad(params["refgs.position"]).numpy()
         table.observe(mi.Float(np.linalg.norm(moved, axis=1)))
