@@ -43,44 +43,53 @@ class FilmImage:
 
     def image(self) -> Any:
         """The image (h, w, c), without derivatives."""
-        parts = []
-        for band in self._bands(None):
-            parts.append(self._values(band))
-            if band.size[1] < self._size[0]:
-                dr.eval(parts[-1])
-        values = dr.concat(parts) if len(parts) > 1 else parts[0]
-        parts.clear()
-        return self._developed(values)
+        views = []
+        for sensor in self._sensors:
+            parts = []
+            for band in self._bands(sensor, None):
+                parts.append(self._values(sensor, band))
+                if band.size[1] < self._size[0]:
+                    dr.eval(parts[-1])
+            views.append(parts)
+            del parts
+        return self._developed(self._joined(views))
 
     def adjoints(self, δ_image: Any) -> Iterator[tuple[Any, Any]]:
         """Attached values of each pass, and their adjoints; delete them before the next."""
-        found = self._bands(DERIVATIVE_SAMPLES)
+        found = [(one, band) for one in self._sensors for band in self._bands(one, DERIVATIVE_SAMPLES)]
         if len(found) == 1:
-            yield self._developed(self._values(found[0])), δ_image
+            yield self._developed(self._values(*found[0])), δ_image
             return
         δ_values = self._through_film(dr.ADMode.Backward, δ_image)
+        height, views = self._size[0], len(self._sensors)
+        row = dr.width(δ_values) // (height * views)  # entries of a view's row
         at = 0
-        for band in found:
-            entries = band.size[1] * dr.width(δ_values) // self._size[0]
-            index = dr.arange(mi.UInt32, entries) + dr.opaque(mi.UInt32, at)
-            at += entries
-            yield self._values(band), dr.gather(mi.Float, δ_values, index)
+        for sensor, band in found:
+            index = dr.arange(mi.UInt32, band.size[1] * row)
+            place = divmod(at, height)  # view, and first row of the band in it
+            first = dr.opaque(mi.UInt32, place[1] * views + place[0])
+            at += band.size[1]
+            δ_band = dr.gather(mi.Float, δ_values, (index // row * views + first) * row + index % row)
+            yield self._values(sensor, band), δ_band
 
     def tangent(self) -> Any:
         """Tangent of the image for the tangents of the parameters; zero where none of these changes it."""
-        found = self._bands(DERIVATIVE_SAMPLES)
+        found = [(one, self._bands(one, DERIVATIVE_SAMPLES)) for one in self._sensors]
         # The tangents of the parameters stay: other losses and later passes read them, too.
         flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-        if len(found) == 1:
-            return dr.forward_to(self._developed(self._values(found[0])), flags=flags)
-        parts = []
-        for band in found:
-            values = self._values(band)
-            parts.append(dr.forward_to(values, flags=flags))
-            dr.eval(parts[-1])
-            del values
-        tangent = dr.concat(parts)
-        return self._through_film(dr.ADMode.Forward, tangent)
+        if sum(len(bands) for _, bands in found) == 1:
+            [(sensor, [band])] = found
+            return dr.forward_to(self._developed(self._values(sensor, band)), flags=flags)
+        views = []
+        for sensor, of_sensor in found:
+            parts = []
+            for band in of_sensor:
+                values = self._values(sensor, band)
+                parts.append(dr.forward_to(values, flags=flags))
+                dr.eval(parts[-1])
+                del values
+            views.append(parts)
+        return self._through_film(dr.ADMode.Forward, self._joined(views))
 
     # ---------------- passes ----------------
 
@@ -97,16 +106,42 @@ class FilmImage:
     def _samples(self) -> int:
         return max(1, int(self.spp) or int(self.sensor.sampler().sample_count()))
 
-    def _bands(self, most: int | None) -> list[Band]:
-        camera, channels = Camera.from_sensor(self.sensor), 5 + len(self.aovs)
+    @property
+    def _sensors(self) -> list[Any]:
+        """The sensors of a `batch`, whose images are side by side in its film; else the sensor itself."""
+        found = []
+
+        class Inner(mi.TraversalCallback):
+            def put(self, name: str, value: Any, *flags: Any) -> None:
+                if isinstance(value, mi.Sensor):
+                    found.append(value)
+
+            put_object = put_value = put
+
+        self.sensor.traverse(Inner())
+        return found or [self.sensor]
+
+    def _joined(self, views: list[list[Any]]) -> Any:
+        """Values of all pixels of the film, from those of the bands of each view; empties the list."""
+        height, found = self._size[0], []
+        while views:
+            parts = views.pop(0)
+            found.append(dr.concat(parts) if len(parts) > 1 else parts[0])
+        if len(found) == 1:
+            return found[0]
+        rows = [mi.TensorXf(values, (height, dr.width(values) // height)) for values in found]
+        return dr.concat(rows, axis=1).array
+
+    def _bands(self, sensor: Any, most: int | None) -> list[Band]:
+        camera, channels = Camera.from_sensor(sensor), 5 + len(self.aovs)
         size = camera.width, camera.height
         require_image(size, self._samples, self.surfels, channels, most is not None)
         return bands(camera, samples_per_axis(self._samples), self.neighbours, most)
 
-    def _values(self, band: Band) -> Any:
+    def _values(self, sensor: Any, band: Band) -> Any:
         """Channels of the pixels of a band (mi.Float), pixel by pixel; under AD."""
         # Attached anew in each pass: a traversal removes the graph from the sensor to its camera.
-        camera = band.camera.attached(self.sensor)
+        camera = band.camera.attached(sensor)
         frame = supersampled(self.view, camera, self._samples)
         made = self.channels(frame, camera, self._alpha)
         pixels = dr.zeros(mi.Float, camera.width * camera.height)

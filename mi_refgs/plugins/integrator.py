@@ -36,7 +36,7 @@ CHECK_SECONDS = 1.0  # least time between checks for unusable values: each waits
 
 class RefGSIntegrator(mi.SamplingIntegrator):
     r"""
-    Splats the surfels of a ``perspective`` view, and shades them under an environment.
+    Splats surfels into ``perspective`` views, also in a ``batch``, and shades them under an environment.
 
     .. pluginparameters::
 
@@ -207,6 +207,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         if mi.variant() != self.variant:
             made = f"made under {self.variant}, not {mi.variant()}"
             raise InputError(made, "refgs", "variant", "load the scene again")
+        if dr.flag(dr.JitFlag.FreezingScope):  # Dr.Jit would abort the process, or replay wrong sizes
+            what = "cannot be recorded: the lengths of the tiles' lists of surfels change from call to call"
+            raise InputError(what, "refgs", "dr.freeze", "call mi.render outside of the frozen function")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         require_derivatives(params, scene, sensor, self)
         request = Request({aov.type for aov in self.aovs}, forward_only)

@@ -148,6 +148,39 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
         params.update()
 
 
+# ---------------- Dr.Jit and torch ----------------
+
+
+def test_a_node_of_a_torch_pipeline_may_be_a_render() -> None:
+    """tanh → mi.render → sigmoid: gradients as those of the same pipeline in Dr.Jit."""
+    torch = pytest.importorskip("torch")
+    of, key = scene(), "integrator.albedo"
+    params, raw = mi.traverse(of), raw_channels()["albedo"]
+    weights = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+
+    def rendered(albedo: mi.TensorXf) -> mi.TensorXf:
+        params[key] = albedo
+        params.update()
+        return mi.render(of, params)
+
+    theirs = torch.tensor(raw, requires_grad=True)
+    shown = dr.wrap("torch", "drjit")(rendered)(torch.tanh(theirs))
+    (torch.tensor(weights) * torch.sigmoid(shown)).sum().backward()
+    ours = mi.TensorXf(raw)
+    dr.enable_grad(ours)
+    shown = rendered(dr.tanh(ours))
+    dr.backward(dr.sum(mi.TensorXf(weights) / (1 + dr.exp(-shown)), axis=None))
+    np.testing.assert_allclose(theirs.grad.numpy(), dr.grad(ours).numpy(), rtol=1e-3, atol=1e-6)
+    assert np.abs(theirs.grad.numpy()).max() > 1e-3
+
+
+def test_recording_by_dr_freeze_is_refused() -> None:
+    """Dr.Jit would abort the process."""
+    of = scene()
+    refused(lambda: dr.freeze(lambda t: mi.render(of) * t)(mi.Float(1)), "dr.freeze: cannot be recorded")
+    assert image(of).max() > 0.1
+
+
 # ---------------- refusals ----------------
 
 

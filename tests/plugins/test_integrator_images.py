@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from tests.helpers import refused
-from tests.scenes.integrator import HEIGHT, WIDTH, image, plane_mesh, scene, sensor
+from tests.scenes.integrator import HEIGHT, WIDTH, check_derivatives, image, plane_mesh, scene, sensor
 
 EVERY_AOV = "al:albedo,m:metallic,r:roughness,n:normal,dd.y:depth,a:alpha,v:visibility"
 EVERY_AOV += ",di:diffuse,sp:specular,ind:indirect"
@@ -39,6 +40,27 @@ def test_aovs_follow_mitsubas_names(tmp_path: Path) -> None:
     assert set(layers) == {"<root>", "al", "m", "r", "n", "dd.y", "a", "v", "di", "sp", "ind"}
     normal = np.stack([aov[f"n.{c}"] for c in "XYZ"], -1)
     assert np.allclose(np.array(layers["n"]), normal, atol=1e-3)  # float16 film
+
+
+def test_a_batch_is_its_sensors_side_by_side() -> None:
+    """Images, and derivatives in both modes, also by a sensor's own field of view."""
+    eyes = ([3, 1, 2], [-1, 2.5, 2], [0, -2, 1.5])
+    poses = [mi.ScalarTransform4f().look_at(eye, [0, 0, 0], [0, 0, 1]) for eye in eyes]
+    whole = sensor(film={"width": 3 * WIDTH})
+    lenses = {f"s{i}": {"type": "perspective", "fov": 45, "to_world": pose} for i, pose in enumerate(poses)}
+    batch = {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **lenses}
+    alone = [scene(sensor(to_world=pose)) for pose in poses]
+    together = scene(batch)
+    np.testing.assert_array_equal(image(together), np.concatenate([image(one) for one in alone], axis=1))
+    check_derivatives(together, "integrator.albedo", spp=4)
+    slopes = []
+    for of, key in ((alone[1], "sensor.x_fov"), (together, "sensor.s1.x_fov")):
+        params = mi.traverse(of)
+        dr.enable_grad(params[key])
+        dr.backward(dr.sum(mi.render(of, params), axis=None))
+        slopes.append(dr.grad(params[key]).numpy())
+    np.testing.assert_allclose(*slopes, rtol=1e-5)
+    assert slopes[0] != 0
 
 
 def test_depth_is_that_of_mitsuba() -> None:
