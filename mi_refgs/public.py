@@ -18,9 +18,7 @@ from mi_refgs.fitting.losses import light_colour as light_colour
 from mi_refgs.fitting.losses import normal_consistency as normal_consistency
 from mi_refgs.fitting.losses import planes as image_planes
 from mi_refgs.fitting.losses import smoothness as smoothness
-from mi_refgs.fitting.objective import Loss as Loss
 from mi_refgs.fitting.objective import LossInputs as LossInputs
-from mi_refgs.fitting.objective import register as register_loss
 from mi_refgs.fitting.optim import Adam as Adam
 from mi_refgs.fitting.optim import LearningRate as LearningRate
 from mi_refgs.fitting.runner import Progress as Progress
@@ -35,6 +33,8 @@ from mi_refgs.methods.event import Event as Event
 from mi_refgs.methods.event import register as register_event
 from mi_refgs.methods.initialiser import Initialiser as Initialiser
 from mi_refgs.methods.initialiser import register as register_initialiser
+from mi_refgs.methods.loss import Loss as Loss
+from mi_refgs.methods.loss import register as register_loss
 from mi_refgs.methods.method import Method as Method
 from mi_refgs.methods.read import load as load_method
 from mi_refgs.methods.window import Window as Window
@@ -49,6 +49,7 @@ from mi_refgs.reconstruction.reconstruction import import_splats as import_splat
 from mi_refgs.reconstruction.reconstruction import load as load
 from mi_refgs.reconstruction.relight import relight as relight
 from mi_refgs.reconstruction.relightable_import import import_relightable as import_relightable
+from mi_refgs.registry import load_plugins as load_plugins
 from mi_refgs.render.pipeline import Frame as Frame
 from mi_refgs.render.pipeline import Request as Request
 from mi_refgs.render.pipeline import SurfelScene as SurfelScene
@@ -78,3 +79,5 @@ from mi_refgs.surfels.primitives import register as register_primitive
 from mi_refgs.surfels.table import Surfels as Surfels
 from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
 from mi_refgs.synthesis.options import DatasetOptions as DatasetOptions
+
+load_plugins()  # those of installed packages

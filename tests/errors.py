@@ -37,6 +37,9 @@ train data -o out --mitsuba-variant scalar_rgb
 train data -o file/out --method tiny.toml
 train data -o run --method tiny.toml
 train data -o run --resume --preset standard
+train data -o new --resume
+train data -o out --plugin no.py
+train data -o out --plugin wrong.py
 dataset no.xml -o out
 dataset scene.xml -o out --size x
 capture nothing -o out
@@ -102,6 +105,7 @@ def prepare() -> None:
         (here / name).write_text("text")
     (here / "broken.xml").write_text("<scene")
     (here / "scene.xml").write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    (here / "wrong.py").write_text("import mi_refgs\nmi_refgs.register_loss(len)\n")
     (here / "empty.json").write_text("{}")
     write_exr("light.exr", np.ones((4, 8, 3), np.float32))
 

@@ -80,9 +80,10 @@ def _fitted(fit: Fit, data: Path, run: Path, place: Workplace) -> Row:
     if (downscale := SOURCES[fit.source].downscale) is not None:
         options.append(f"data.downscale={downscale}")
     if not run.exists() and not place.small:  # compiles the kernels
-        refgs("train", data, "-o", run.with_name("rehearsal"), "--resume", "--preset", REHEARSAL, *options)
+        refgs("train", data, "-o", run.with_name("rehearsal"), "--preset", REHEARSAL, *options)
     preset = SMALL_PRESET if place.small else fit.preset
-    row: Row = {"decisions": refgs("train", data, "-o", run, "--preset", preset, "--resume", *options)}
+    options += ["--resume"] if run.exists() else []
+    row: Row = {"decisions": refgs("train", data, "-o", run, "--preset", preset, *options)}
     row["decisions"] = row["decisions"].get("decisions", [])
     if fit.samples is not None:
         scores = refgs("eval", run, "--samples", fit.samples, *threads)

@@ -17,6 +17,7 @@ from mi_refgs import llvm
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError
 from mi_refgs.io.resources import resource_dir
+from mi_refgs.registry import load_plugins
 
 
 def optional(metavar: str | None = None, hint: str = "", **more: Any) -> Any:
@@ -61,9 +62,12 @@ class Common:
 
     json: Flag = False
     """print one JSON object on standard output and nothing else there"""
+    plugin: Annotated[UseAppendAction[tuple[Path, ...]], optional("FILE.py")] = ()
+    """run a Python file that registers models, losses and the like; may be repeated"""
 
     def prepare(self) -> None:
-        """Set up what the command needs."""
+        """Load plugins, those of installed packages too; raises InputError for one that fails."""
+        load_plugins(self.plugin)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +100,7 @@ class Rendering(Common):
             problem = llvm.problem() if variant.startswith("llvm") else None
             raise UnusableError(f"{problem or error} (`refgs doctor` says more)") from error
         mi.set_log_level(mi.LogLevel.Warn)
+        super().prepare()
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,9 @@ class Demo:
         images: dict[str, Any] = {"views": VIEWS, "test_views": TEST_VIEWS, "size": SIZE, "spp": SAMPLES}
         make_dataset(resource_dir("scenes") / SCENE, data, environment_height=64, **images)
         say(f"2 of 3: fitting into {output}")
-        found = fit(data, preset=self.preset, settings=joined(self.set), output=output, resume=True)
+        found = fit(
+            data, preset=self.preset, settings=joined(self.set), output=output, resume=folder.exists()
+        )
         say("3 of 3: evaluating")
         result, sheet = read_metrics(folder), output / SHEET
         if result is None or result.get("iterations") != found.trained.iteration or not sheet.is_file():

@@ -39,9 +39,9 @@ class Render:
 
     def run(self) -> Result:
         """Render the image."""
+        from mi_refgs.data.dataset import require_no_data
         from mi_refgs.formats.cameras import read_cameras
         from mi_refgs.io.ownership import require_no_run
-        from mi_refgs.render.load_scene import load_scene
         from mi_refgs.render.scene_xml import sensors_of
 
         out = self.output  # refused before the scene is read
@@ -53,11 +53,12 @@ class Render:
             remedy = "create it or choose a writable folder"
             raise InputError("its folder does not exist", out, "output", remedy)
         require_no_run(out)
+        require_no_data(out)
         if self.samples is not None and self.samples < 1:
             what = f"{self.samples} is out of range"
             raise InputError(what, "--samples", remedy="give a number from 1")
         cameras = None if self.camera is None else read_cameras(self.camera)
-        scene = load_scene(scene_file(self.scene), separated(self.aov), self.object)
+        scene = read(self.scene, separated(self.aov), self.object)
         own = scene.sensors()
         sensors = own if cameras is None else sensors_of(cameras)
         if not sensors:
@@ -77,24 +78,24 @@ class Render:
         return Result(data, f"{out}: {width} × {height}, {', '.join(names)}")
 
 
-def scene_file(path: Path) -> Path:
-    """Find the XML of a scene, or of a run, whose artefacts are first written if a checkpoint is newer."""
-    if not path.is_dir():
-        if not path.is_file():
-            raise InputError("no such file", path, "scene", "give a Mitsuba XML or a run folder")
-        return path
+def read(path: Path, aovs: list[str], object_only: bool) -> Any:
+    """Load the scene of a Mitsuba XML, or of a run: its scene.xml, first written if a checkpoint is newer,
+    or while another process trains it the newest checkpoint."""
     from mi_refgs.reconstruction.provenance import Provenance
-    from mi_refgs.runs.export import write_if_stale
+    from mi_refgs.reconstruction.reconstruction import Reconstruction
+    from mi_refgs.render.load_scene import load_scene
+    from mi_refgs.runs.export import fresh, write_if_stale
     from mi_refgs.runs.run import Run
 
-    run = Run(path)
-    if run.checkpoints():
-        provenance = Provenance.of(run)
-        write_if_stale(run, provenance.method, provenance.first_camera)
-    scene = path / "scene.xml"
+    run, scene = Run(path), path / "scene.xml" if path.is_dir() else path
+    if run.exists() and (run.checkpoints() or not scene.is_file()):
+        source = Provenance.of(run)
+        trained = write_if_stale(run, source.method, source.first_camera)
+        if fresh(run, source.method) is not None:
+            return Reconstruction(trained, source).scene(aovs=aovs, object_only=object_only)
     if not scene.is_file():
-        raise InputError("missing", scene, "scene", f"write it with `refgs export {path}`")
-    return scene
+        raise InputError("no such file", scene, "scene", "give a Mitsuba XML or a run folder")
+    return load_scene(scene, aovs, object_only)
 
 
 def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:

@@ -41,7 +41,7 @@ class Train:
     preset: Preset = None
     set: Settings = ()
     resume: Flag = False
-    """continue from the newest checkpoint, if there is one"""
+    """continue the run from its newest checkpoint"""
     watch: Flag = False
     """display images and curves of the fit in the browser"""
     port: Port = PORT

@@ -41,6 +41,7 @@ class Job:
     settings: tuple[str, ...]  # key=value
     mitsuba_variant: str
     threads: int | None  # None: every core
+    plugins: tuple[str, ...] = ()  # absolute paths of files to run before
 
     @property
     def run(self) -> Run:
@@ -69,8 +70,8 @@ class Job:
         """Read the job of a run folder; raises InputError for another file."""
         content = read_json(folder / JOB)
         try:
-            content["settings"] = tuple(content["settings"])
-            return Job(**content)
+            lists = {name: tuple(content.get(name, ())) for name in ("settings", "plugins")}
+            return Job(**content | lists)
         except (KeyError, TypeError) as error:
             raise InputError(f"not a job ({error})", folder / JOB, remedy="remove the file") from error
 
@@ -83,6 +84,7 @@ class Shared:
     settings: tuple[str, ...] = ()  # KEY=VALUE
     mitsuba_variant: str = "llvm_ad_rgb"
     threads: int | None = None  # None: every core
+    plugins: tuple[str, ...] = ()  # absolute paths
 
 
 def plan(

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.errors import InputError
+from mi_refgs.registry import load_plugins
 from mi_refgs.runs.interrupt import TerminatedError
 from mi_refgs.runs.run import Run
 
@@ -49,6 +50,7 @@ def fit_and_measure(job: Job) -> None:
         dr.set_thread_count(job.threads)
     mi.set_variant(job.mitsuba_variant)
     mi.set_log_level(mi.LogLevel.Warn)
+    load_plugins(job.plugins)
     from mi_refgs.evaluation.evaluate import evaluate
     from mi_refgs.fitting.runner import begin, finish
     from mi_refgs.runs.views import read_views

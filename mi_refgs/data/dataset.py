@@ -95,13 +95,10 @@ class Reader(Protocol):
         """Read the views of "train" or "test"; raises InputError that names file, field and remedy."""
 
 
-READERS: Registry[Reader] = Registry("reader of data sets")
+READERS: Registry[Reader] = Registry("reader of data sets", newest_first=True)
 """All readers, in the order in which `recognises` is called."""
-
-
-def register_reader(reader: Reader) -> Reader:
-    """Add a reader, whose `recognises` is called before those of all others; returns it."""
-    return READERS.register(reader, first=True)
+register_reader = READERS.register
+"""Add a reader, whose `recognises` is called before those of all others."""
 
 
 def reader_of(folder: Path) -> Reader:
@@ -272,6 +269,14 @@ def read_dataset(
         (x, y, z),
         downscale=options.downscale,
     )
+
+
+def require_no_data(path: Path) -> None:
+    """Raise InputError if a file that the user names as output is one of a data set."""
+    folders = path.resolve().parents[:2] if path.exists() else ()
+    if any(reader.recognises(folder) for folder in folders for reader in READERS.values()):
+        what = "belongs to a data set, which is never overwritten"
+        raise InputError(what, path, "output", "choose another output")
 
 
 def _fitting(view: View, pixels: int) -> int:

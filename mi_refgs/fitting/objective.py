@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import drjit as dr
@@ -14,8 +13,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.targets import Target
-from mi_refgs.methods.method import LossWeight, Method
-from mi_refgs.registry import Registry
+from mi_refgs.methods.loss import LOSSES, Loss, register
+from mi_refgs.methods.method import LossWeight
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame
@@ -59,32 +58,6 @@ class LossInputs:
         if target.clipped is not None:
             image = losses.clip_highlights(image, target.image, target.clipped)
         return LossInputs(frame, image, target, light, log_gain, photographed)
-
-
-@dataclass(frozen=True)
-class Loss:
-    """A loss, which a method weighs by its name; the same for all of a fit, photometric or not."""
-
-    name: str  # of its weight in `[loss]` of a method file
-    value: Callable[[LossInputs], Float | None]  # width 1; None: not defined for these inputs
-    normals: bool = False  # reads blended normals
-    maps: bool = False  # reads blended materials, which deferred stages have
-    light: bool = False  # reads the light
-    attributes: tuple[str, ...] = ()  # of surfels, that it reads
-
-
-def _check_name(loss: Loss) -> None:
-    """Raise InputError for a name that a method file cannot weigh."""
-    if not re.fullmatch("[A-Za-z0-9_-]+", loss.name):
-        raise InputError(
-            f"'{loss.name}' has characters besides letters, digits, _ and -",
-            "loss",
-            remedy="choose another name",
-        )
-
-
-LOSSES = Registry[Loss]("loss", _check_name)  # in the order in which they are summed
-register = LOSSES.register
 
 
 def _l1(inputs: LossInputs) -> Float:
@@ -153,22 +126,7 @@ register(Loss("photographed", _photographed, light=True))
 register(Loss("alpha", _alpha))
 
 
-def require_losses(method: Method) -> None:
-    """Raise InputError for a loss that is not registered or whose inputs the method lacks."""
-    attributes = method.surfels.names
-    deferred = any(stage.shading.at == "pixel" for _, stage in method.stages())
-    for name in method.loss:
-        loss = LOSSES.find(name, f"loss.{name}")
-        absent = [f"the attribute {one}" for one in loss.attributes if one not in attributes]
-        absent += ["a stage at = pixel"] * (loss.maps and not deferred)
-        absent += ["a light"] * (loss.light and method.light is None)
-        if absent and method.loss[name].weight:
-            raise InputError(
-                f"needs {' and '.join(absent)}", f"loss.{name}", remedy="add it, or drop the loss"
-            )
-
-
-def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss]:
+def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss[LossInputs]]:
     """The registered losses that a method weighs, in the order in which they are summed."""
     return [loss for loss in LOSSES.values() if loss.name in weights and weights[loss.name].weight]
 

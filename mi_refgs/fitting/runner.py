@@ -27,7 +27,6 @@ from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.decide import DECISIONS, HOLDOUT, as_decided, differences, waiting
 from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
-from mi_refgs.fitting.objective import require_losses
 from mi_refgs.fitting.per_view import camera_of, gains_of
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
@@ -94,27 +93,27 @@ class Progress:
 def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Progress) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
 
-    resume: continue if the folder contains a run; the choice has to be the run's own.
+    resume: continue the run in the folder; the choice has to be the run's own.
 
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
     TerminatedError with a message that says how to continue.
     """
     run = Run(output)
-    resumed = resume and run.exists()
-    if resumed:
+    if resume:
+        run.require_resumable()
         method = run.method()
         views = read_views(method, data, "train", truth=False)
         _require_same(run, method, choice, views)
     else:
         run.require_none()
         method, views = chosen(data, choice, progress.say)
-        require_losses(method)
+        method.require_registered()
     if note := few_views(len(views.views)):
         progress.warn(f"{data}: {note}")
     if not views.has_alpha and (method.surroundings is None or views.region is None):
         progress.warn(f"{data}: images without alpha: surfels start at random, and model the background too")
     with run.alone():
-        if not resumed:  # asked again: another process may have begun a run while the data was read
+        if not resume:  # asked again: another process may have begun a run while the data was read
             run.require_none()
         return _fit(method, views, run, progress)
 

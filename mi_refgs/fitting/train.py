@@ -20,7 +20,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.fitting import per_view
 from mi_refgs.fitting.health import Health
-from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective, require_losses
+from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState
 from mi_refgs.fitting.targets import Targets, require_memory
@@ -56,7 +56,7 @@ class Trainer:
 
         `targets` of another fit are shared if they are of the same data. `warn` tells of failed steps.
         """
-        require_losses(method)
+        method.require_registered()
         require_memory(method, data)
         self.run, self.tell, self.warn = run, tell, warn
         self.release: Callable[[], None] = lambda: None  # raises a pending interrupt, while `train` runs

@@ -69,7 +69,7 @@ class Format:
         return inspect.getdoc(self.writer) or self.summary
 
 
-FORMATS: Registry[Format] = Registry("format")  # every format by name
+FORMATS: Registry[Format] = Registry("format", of=Format)  # every format by name
 register = FORMATS.register
 
 
@@ -123,6 +123,8 @@ def write(
         able = ", ".join(made.name for made in FORMATS.values() if name in [o.name for o in made.options])
         remedy = f"leave it out, or choose a format that has it ({able or 'none'})"
         raise InputError(f"no option of {', '.join(names)}", f"--{name.replace('_', '-')}", remedy=remedy)
+    from mi_refgs.data.dataset import require_no_data
+
     found, shots, owner = {}, tuple(shots), f"export of {source and source.resolve()}"
     if len(chosen) > 1:
         own_folder(Path(output), owner)
@@ -131,6 +133,7 @@ def write(
         own = {option.name: given.get(option.name, option.default) for option in made.options}
         if made.suffix and target == Path(output):
             require_no_run(target)
+            require_no_data(target)
         else:
             own_folder(target.parent if made.suffix else target, owner)
         found[made.name] = made.writer(trained, target, shots, **own)

@@ -20,7 +20,7 @@ FLAT = {"flat": True}  # metadata of a dataclass's field that is one too, with k
 
 
 def by_name(registry: Registry[Any]) -> Metadata:
-    """Metadata of a `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME."""
+    """Metadata of a `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME, if it is."""
     return {"by_name": registry}
 
 
@@ -46,9 +46,9 @@ def build(
 ) -> Any:
     """Convert plain TOML data to `kind`; raises InputError with the dotted key of what is wrong."""
     if "by_name" in metadata:
-        find = metadata["by_name"].find
-        tables = _converted(dict[str, Any], value, key)
-        return {name: build(find(name, key), table, f"{key}.{name}") for name, table in tables.items()}
+        registry, tables = metadata["by_name"], _converted(dict[str, Any], value, key)
+        kinds = {name: registry.get(name, dict[str, Any]) for name in tables}
+        return {name: build(kinds[name], table, f"{key}.{name}") for name, table in tables.items()}
     if "by_kind" in metadata:
         registry, default = metadata["by_kind"]
         table = _converted(dict[str, Any], value, key)

@@ -34,6 +34,6 @@ class Event(Generic[Fit]):
         raise NotImplementedError
 
 
-EVENTS = Registry[type[Event[Any]]]("event", package="mi_refgs.fitting.events")
+EVENTS = Registry[type[Event[Any]]]("event", package="mi_refgs.fitting.events", of=Event, classes=True)
 register = EVENTS.register
 """Add an event, for which method files can have a table from then on."""

@@ -9,12 +9,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 from mi_refgs.constants import PATCH_EDGE
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.methods.build import FLAT, by_kind, by_name
 from mi_refgs.methods.event import EVENTS, Event
 from mi_refgs.methods.initialiser import INITIALISERS
+from mi_refgs.methods.loss import LOSSES
 from mi_refgs.methods.ranges import at_least, between, more_than
 from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.registry import load_again
 from mi_refgs.shade.light.kind import LIGHTS, LightKind
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.shading import Shading
@@ -231,7 +233,7 @@ class Method:
     surfels: SurfelOptions = SurfelOptions()
     light: LightKind | None = field(default=None, metadata=by_kind(LIGHTS, "learnt"))  # absent: no light
     surroundings: SurroundingsOptions | None = None  # absent: the object is everything
-    # What happens beside gradient steps (`fitting.events`), by name.
+    # What happens beside gradient steps (`fitting.events`), by name; of an unregistered one the plain table.
     event: dict[str, Event[Any]] = field(default_factory=dict, metadata=by_name(EVENTS))
     loss: dict[str, LossWeight] = field(default_factory=LOSS_WEIGHTS.copy)  # by name
     rates: Rates = Rates()
@@ -244,6 +246,7 @@ class Method:
     file: str = ""
     preset: str = ""
     assignments: tuple[str, ...] = ()
+    plugins: tuple[str, ...] = ()  # files outside the package that had registered something when it was saved
 
     def __post_init__(self) -> None:
         if not self.stage:
@@ -265,6 +268,7 @@ class Method:
         _require_known("surfels.from_images", surfels.from_images, {*surfels.attributes})
         _require_known("rates.attribute", self.rates.attribute, {*ATTRIBUTES})
         _require_known("rates.rest", self.rates.rest, harmonics)
+        self.require_registered()
         for name, stage in self.stages():
             _require_known(f"stage.{name}.restart", stage.restart, {*surfels.attributes} | others)
             _require_known(f"stage.{name}.rates", stage.rates, attributes | others)
@@ -273,13 +277,32 @@ class Method:
                 resolved.require_inputs(attributes, self.light is not None)
             except InputError as error:
                 raise error.at(field=f"stage.{name}") from error
-        for name in surfels.start:
-            INITIALISERS.find(name, "surfels.start")
+
+    def require_registered(self) -> None:
+        """Raise InputError for an event, a loss or an initialiser that is not registered, or whose inputs the
+        method lacks. Only a fit needs them."""
+        attributes = self.surfels.names
+        deferred = any(stage.shading.at == "pixel" for stage in self.stage.values())
+        try:
+            for name in self.surfels.start:
+                INITIALISERS.find(name, "surfels.start")
+            for name in self.event:
+                EVENTS.find(name, "event")
+            losses = {name: LOSSES.find(name, f"loss.{name}") for name in self.loss}
+        except UnknownNameError as error:
+            raise load_again(error, self.plugins) from None
         for name, event in self.event.items():
             try:
                 event.require(attributes)
             except InputError as error:
                 raise error.at(field=f"event.{name}") from error
+        for name, loss in losses.items():
+            absent = [f"the attribute {one}" for one in loss.attributes if one not in attributes]
+            absent += ["a stage at = pixel"] * (loss.maps and not deferred)
+            absent += ["a light"] * (loss.light and self.light is None)
+            if absent and self.loss[name].weight:
+                what = f"needs {' and '.join(absent)}"
+                raise InputError(what, f"loss.{name}", remedy="add it, or drop the loss")
 
     @property
     def has_mesh(self) -> bool:

@@ -15,11 +15,12 @@ from typing import Any
 import tomli_w
 
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.errors import InputError, UnknownNameError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.build import build, plain, scaled
 from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method
+from mi_refgs.registry import load_again, plugin_files
 
 DEFAULT_LOSSES = plain(LOSS_WEIGHTS)
 MAX_TEXT, MAX_LINE = 2**16, 2000
@@ -58,7 +59,7 @@ def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | N
     """Read a method by name or TOML path, scaled to a preset; `assignments`, key=value, apply unscaled.
     Raises InputError that names the file and the key for anything unknown or of the wrong type."""
     path, chosen = _find(name, "--method", Path()), preset_of(preset)
-    method = _built(_extended(path, []), path)
+    method = _checked(_extended(path, []), path)
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
@@ -68,11 +69,15 @@ def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | N
         _assign(table, assignment)
     file = str(path.resolve()) if name.endswith(".toml") else name
     table |= {"name": path.stem, "file": file, "preset": preset, "assignments": [*(assignments or [])]}
-    method = _built(table, "--set" if assignments else path)
+    return _checked(table, "--set" if assignments else path)
+
+
+def _checked(table: dict[str, Any], where: str | Path) -> Method:
+    method = _built(table, where)
     try:
         method.check()
     except InputError as error:
-        raise error.at(path) from error
+        raise error.at(where) from error
     return method
 
 
@@ -89,13 +94,17 @@ def load_resolved(path: Path) -> Method:
 def _built(table: dict[str, Any], where: str | Path, losses: dict[str, Any] = DEFAULT_LOSSES) -> Method:
     try:
         return typing.cast(Method, build(Method, _merge({"loss": losses}, table)))
+    except UnknownNameError as error:  # the kind of light
+        files = table.get("plugins")
+        raise load_again(error, files if isinstance(files, list) else []).at(where) from error
     except InputError as error:
         raise error.at(where) from error
 
 
 def dump(method: Method) -> str:
-    """The method as TOML text that `load_resolved` reads back."""
-    return tomli_w.dumps(plain(method))
+    """The method as TOML text that `load_resolved` reads back, with the plugins of this process."""
+    plugins = tuple(dict.fromkeys([*method.plugins, *plugin_files()]))
+    return tomli_w.dumps(plain(replace(method, plugins=plugins)))
 
 
 def names() -> list[str]:
@@ -118,8 +127,8 @@ def for_purpose(purpose: str) -> str:
 def differences(before: Method, now: Method) -> dict[str, tuple[Any, Any]]:
     """Dotted keys by which two resolved methods differ beside `about`, with both values, None for no such
     key."""
-    compared = (replace(method, about=About(), file="", assignments=()) for method in (before, now))
-    first, second = (_flat(plain(method)) for method in compared)
+    left_out: dict[str, Any] = {"about": About(), "file": "", "assignments": (), "plugins": ()}
+    first, second = (_flat(plain(replace(method, **left_out))) for method in (before, now))
     keys = sorted(first.keys() | second.keys())
     return {key: (first.get(key), second.get(key)) for key in keys if first.get(key) != second.get(key)}
 

@@ -44,7 +44,7 @@ def fit(
     "photographs" or "relighting", in place of a method.
 
     output: the run folder. Without one a temporary folder is used, which is removed with the last
-    `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`, if there is one;
+    `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`;
     other arguments are those that it was started with, or absent. progress: True shows messages and a bar on
     standard error, False only Python's warnings; a `Progress` is called after each step.
 

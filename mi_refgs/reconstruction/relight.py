@@ -70,10 +70,15 @@ def relight(
     # The views, and the ground truth under this light.
     fitted = load(run.path)
     fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
-    provenance, requested, true_views = fitted.provenance, light, None
+    provenance, requested, true_views, no_truth = fitted.provenance, light, None, NO_TRUTH
     views = provenance.views("test") if provenance.has_data else None
     if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
-        true_views, light = _true_views(provenance.method, known[0], views), known[1]
+        try:
+            true_views, light = _true_views(provenance.method, known[0], views), known[1]
+        except InputError as error:
+            if known[0] != views.path:
+                raise
+            no_truth = f"its own images are no linear radiance ({error})"
     cameras = fitted.turntable(turntable) if turntable else fitted.cameras()
     try:
         relit = fitted.relight(light)
@@ -99,7 +104,7 @@ def relight(
         write_png(folder / image, straight_srgb(ours[-1]))
     colour = BACKGROUNDS[provenance.method.data.background]
     background = np.full(3, colour, np.float32) if views is None else views.background
-    reason = NO_DATA if views is None else "a turntable has no ground truth" if turntable else NO_TRUTH
+    reason = NO_DATA if views is None else "a turntable has no ground truth" if turntable else no_truth
     result: dict[str, Any] = {
         "run": str(run.path),
         "output": str(folder),

@@ -54,7 +54,9 @@ def import_relightable(
     preset also chooses the size of the views. Raises InputError for a file that `import_splats` refuses or
     that shows no free object, for a folder with another run or foreign files, and as `fit` does."""
     path, run = Path(path), Run(output)
-    if method is None and not (resume and run.exists()):
+    if resume:
+        run.require_resumable()
+    elif method is None:
         method = methods.for_purpose(PURPOSE)
     wanted = runner.load_method(None if method is None else str(method), preset)
     made = import_splats(path, linear=linear, box=box)
@@ -63,7 +65,7 @@ def import_relightable(
         chosen = enumerate(held_out(cameras or (), split))
         given += [Shot(f"{split}/r_{i:03d}", split, camera) for i, camera in chosen]
     views, owner = run.path / DATA, f"import of {path.resolve()}"
-    if not (resume and run.exists()):
+    if not resume:
         run.require_none()
         pixels = PRESETS.get(wanted.preset, PRESETS[DEFAULT_PRESET]).pixels
         shots = given or shots_around(made.trained.surfels, VIEWS, math.isqrt(pixels), ELEVATION)

@@ -18,7 +18,7 @@ from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.kind import FittedLight, LightKind
 from mi_refgs.shade.light.near_field import NearField
-from mi_refgs.surfels.attributes import ATTRIBUTES
+from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 
 
@@ -59,10 +59,6 @@ class DamagedError(Exception):
     """The file is no checkpoint of ours, or not all of one."""
 
 
-class UnregisteredError(DamagedError):
-    """The file is whole, but has an attribute that this process does not know."""
-
-
 def encode(state: Mapping[str, np.ndarray]) -> bytes:
     """The bytes of a checkpoint."""
     buffer = io.BytesIO()
@@ -74,7 +70,8 @@ def encode(state: Mapping[str, np.ndarray]) -> bytes:
 
 
 def decode(data: bytes) -> dict[str, np.ndarray]:
-    """The state in the bytes of a checkpoint; raises DamagedError for what `encode` did not write."""
+    """The state in the bytes of a checkpoint; raises DamagedError for what `encode` did not write, and
+    UnknownNameError for an attribute that is not registered."""
     content, digest = data[:-_DIGITS], data[-_DIGITS:]
     if not content.endswith(_MARK) or hashlib.sha256(content).hexdigest().encode() != digest:
         raise DamagedError("its checksum is wrong or missing")
@@ -82,15 +79,13 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
         state = {name: archive[name] for name in archive.files}
     if (version := int(state.pop("version"))) != VERSION:
         raise DamagedError(f"it has version {version}, not {VERSION}")
-    names = [*channels_of(params := part(state, PARAMS)), *channels_of(params, AROUND)]
-    if unknown := [name for name in names if name not in ATTRIBUTES]:
-        what = "the attribute is not registered; register it as when the run was fitted"
-        raise UnregisteredError(f"surfels: {unknown[0]}: {what}")
+    for name in (*channels_of(params := part(state, PARAMS)), *channels_of(params, AROUND)):
+        attribute(name)
     return state
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """The state in a file; raises DamagedError, also for a file that cannot be read."""
+    """The state in a file; raises as `decode`, and DamagedError for a file that cannot be read."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -80,7 +80,7 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Ca
     return [folder / name for name in written]
 
 
-def _fresh(run: Run, method: Method) -> TrainedScene | None:
+def fresh(run: Run, method: Method) -> TrainedScene | None:
     """The scene of a checkpoint that is newer than the artefacts; raises InputError if there is neither."""
     shown, model = -1, run.path / MODEL
     if (run.path / SURFELS).is_file():
@@ -92,6 +92,8 @@ def _fresh(run: Run, method: Method) -> TrainedScene | None:
             return TrainedScene.from_state(method, state)
     if not model.is_file():
         remedy = f"train it with `refgs train DATA -o {run.path} --resume`"
+        if run.busy():
+            remedy = f"wait for the first of the fit that runs, after {method.checkpoint_every} iterations"
         raise InputError("none yet", run.path, "checkpoints", remedy)
     return None
 
@@ -99,21 +101,21 @@ def _fresh(run: Run, method: Method) -> TrainedScene | None:
 def newest(run: Run, method: Method) -> TrainedScene:
     """The scene, with any mesh, of the newest checkpoint or newer artefacts; raises as
     `TrainedScene.read`."""
-    if (fresh := _fresh(run, method)) is not None:
-        return fresh
-    scene, mesh = TrainedScene.read(run.path), run.path / MESH
+    if (newer := fresh(run, method)) is not None:
+        return newer
+    scene, mesh = TrainedScene.read(run.path, method.plugins), run.path / MESH
     return replace(scene, mesh=read_mesh(mesh)) if scene.mesh is None and mesh.is_file() else scene
 
 
 def write_if_stale(run: Run, method: Method, camera: Callable[[TrainedScene], Camera]) -> TrainedScene:
     """Write the artefacts of a run if the newest checkpoint is newer, and read them; or return that
     checkpoint if another process trains the run. Raises InputError if there is neither."""
-    if (fresh := _fresh(run, method)) is not None:
+    if (newer := fresh(run, method)) is not None:
         try:
-            export(fresh, run.path, camera(fresh))
+            export(newer, run.path, camera(newer))
         except BusyError:
-            return fresh
-    return TrainedScene.read(run.path)
+            return newer
+    return TrainedScene.read(run.path, method.plugins)
 
 
 def save(

@@ -21,8 +21,9 @@ import numpy as np
 
 from mi_refgs.data.poses import rigid
 from mi_refgs.data.region import Region
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.io.files import (
+    BusyError,
     cannot_write,
     locked,
     make_folder,
@@ -34,6 +35,7 @@ from mi_refgs.io.files import (
 from mi_refgs.io.ownership import RUN, own_folder, require_own
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
+from mi_refgs.registry import load_again
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"  # the folder of the data set, and its region of interest
@@ -60,10 +62,23 @@ class Run:
             raise InputError("contains a run already", self.path, remedy=remedy)
         require_own(self.path, RUN)
 
+    def require_resumable(self) -> None:
+        """Raise InputError if there is no run to continue."""
+        if not self.exists():
+            raise InputError("no run to continue", self.path, "--resume", "leave it out to start one")
+
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Lock the run for changes; raises BusyError if another process has it locked for `wait` seconds."""
         busy = "another process trains this run or writes it; wait until it ends, or choose another folder"
         return locked(self.path / LOCK, f"{self.path}: run folder: {busy}", wait)
+
+    def busy(self) -> bool:
+        """Whether another process has locked the run."""
+        try:
+            with self.alone():
+                return False
+        except BusyError:
+            return True
 
     def create(self, method: Method, dataset: str, region: Region | None = None) -> None:
         """Start a run on the data set in folder `dataset`; raises InputError as `require_none` does."""
@@ -134,8 +149,8 @@ class Run:
         for path in reversed(self.checkpoints()):
             try:
                 return checkpoint.read(path)
-            except checkpoint.UnregisteredError as error:
-                raise InputError(f"{error}", path) from error
+            except UnknownNameError as error:
+                raise load_again(error, self.method().plugins).at(path) from error
             except checkpoint.DamagedError as error:
                 damaged.append(f"{path}: damaged ({error})")
                 print(f"refgs: warning: {damaged[-1]}; trying the one before", file=sys.stderr)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.registry import load_again
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
@@ -74,8 +75,9 @@ class TrainedScene:
         return self.surfels.count + (0 if self.surroundings is None else self.surroundings.surfels.count)
 
     @staticmethod
-    def read(folder: Path) -> TrainedScene:
-        """Read the artefacts in a run folder; raises InputError for a file that cannot be used."""
+    def read(folder: Path, plugins: Sequence[str] = ()) -> TrainedScene:
+        """Read the artefacts in a run folder, fitted with these plugins; raises InputError for a file that
+        cannot be used."""
         note = folder / MODEL
         remedy = f"restore it, or write it again with `refgs export {folder}` if the run has checkpoints"
         try:
@@ -88,7 +90,7 @@ class TrainedScene:
             if iteration < 0 or not 0 <= seconds < math.inf:
                 raise ValueError("iteration or seconds out of range")
         except UnknownNameError as error:
-            raise error.at(note) from error
+            raise load_again(error, plugins).at(note) from error
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
             raise InputError(f"cannot be read ({reason})", note, remedy=remedy) from error

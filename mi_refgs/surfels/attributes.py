@@ -90,13 +90,10 @@ def _check(attribute: Attribute) -> None:
             raise InputError(what, remedy="rename it")
 
 
-ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check)
+ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check, of=Attribute)
 """Every attribute by name, in the order of the surfel model."""
-
-
-def register(attribute: Attribute) -> Attribute:
-    """Add an attribute, which is returned; raises InputError if its name, properties or AOV do not fit."""
-    return ATTRIBUTES.register(attribute)
+register = ATTRIBUTES.register
+"""Add an attribute; raises InputError if its name, properties or AOV do not fit."""
 
 
 def attribute(name: str) -> Attribute:

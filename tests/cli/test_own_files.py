@@ -118,6 +118,10 @@ def test_a_file_that_the_user_names_is_replaced_unless_a_run_has_it(
     file = run / ("envmap.exr" if suffix == ".exr" else "surfels.ply")
     refused([*command, "-o", file], f"{file}: output: belongs to a run, which is never overwritten")
     assert contents(run) == before
+    image = place / "data" / ("environment.exr" if suffix == ".exr" else "train/points.ply")
+    if suffix == ".ply":
+        image.write_bytes(FOREIGN)
+    refused([*command, "-o", image], f"{image}: output: belongs to a data set")
 
 
 def test_files_of_a_run_are_known(finished: Path) -> None:

@@ -59,7 +59,7 @@ def test_help_has_summary_options_and_example(capsys: pytest.CaptureFixture[str]
     text = capsys.readouterr().out
     for part in ("Count the lines of a file.", "Blank lines", "example:\n  refgs count", "--words", "--json"):
         assert part in text
-    assert command_options("count") == ["file", "--output", "--words", "--json"]
+    assert command_options("count") == ["file", "--output", "--words", "--json", "--plugin"]
 
 
 def test_command_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,12 +12,14 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.exr import read_exr
 from mi_refgs.io.files import BusyError
 from mi_refgs.reconstruction import fit as reconstruct
 from mi_refgs.runs.run import LOCK, Run
@@ -116,6 +118,7 @@ def test_second_process_on_a_run_is_refused(
     for command in (argv, ["export", str(run)], ["export", str(tmp_path / "run"), "-o", str(run)]):
         refused(command, "another process trains this run", run)
     assert tree(run) == before
+    (run / "scene.xml").unlink()  # as in a first fit
     scene = reconstruct.load(run)
     assert scene.trained.iteration == 6
     for command in (
@@ -124,8 +127,18 @@ def test_second_process_on_a_run_is_refused(
         ["export", str(run), "-o", str(tmp_path / "copy")],
     ):
         assert main(command) == 0
+    assert not (run / "scene.xml").exists() and (run / "metrics.json").is_file()
+    expected = scene.render(0)
+    found = read_exr(tmp_path / "a.exr")
+    np.testing.assert_allclose(np.stack([found[x] for x in "RGBA"], axis=-1), expected, atol=1e-5)
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 6
     assert json.loads((run / "model.json").read_text())["iteration"] == 3  # nothing is written
+    kept = [run / "checkpoints", run / "model.json"]
+    for path in kept:
+        path.rename(tmp_path / path.name)
+    refused(["render", run, "-o", tmp_path / "a.exr"], "none yet; wait for the first")
+    for path in kept:
+        (tmp_path / path.name).rename(path)
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert main(argv) == 0 and not (run / LOCK).exists()

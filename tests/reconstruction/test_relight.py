@@ -163,6 +163,14 @@ def test_relight_command(known: Path, tmp_path: Path, capfd: pytest.CaptureFixtu
     assert "score: none" in shown.out and "warning" not in shown.err
 
 
+def test_images_without_linear_radiance_are_no_ground_truth(known: Path, tmp_path: Path) -> None:
+    data = shutil.copytree(known / "data", tmp_path / "data")
+    for path in data.glob("test/r_???.exr"):
+        path.unlink()
+    relit = relight(Run(known / "run"), NewLight(data / "environment.exr", True), tmp_path / "out", data=data)
+    assert relit["psnr"] is None and "r_000.exr" in relit["score_reason"]
+
+
 def test_relight_warns_of_fitted_diffuse_colour(known: Path, tmp_path: Path) -> None:
     run = write_known_run(known / "data", tmp_path / "run", diffuse="sh")
     relit = relight(run, NewLight(known / "dusk.exr"), turntable=2)

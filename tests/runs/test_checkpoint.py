@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
+from mi_refgs.errors import UnknownNameError
 from mi_refgs.io.ownership import MARK
 from mi_refgs.runs import checkpoint
 from mi_refgs.runs.run import Run
@@ -59,7 +60,7 @@ def test_another_version_and_an_unknown_attribute_are_named(
     state: State, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     odd = checkpoint.encode(state | {"params/colour": state["params/albedo"]})
-    with pytest.raises(checkpoint.UnregisteredError, match="colour: the attribute is not registered"):
+    with pytest.raises(UnknownNameError, match="surfels: 'colour' is unknown"):
         checkpoint.decode(odd)
     monkeypatch.setattr(checkpoint, "VERSION", 0)
     data = checkpoint.encode(state)

@@ -133,11 +133,11 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     reflectance.unregister("phong")
     command = ["train", data, "-o", tmp_path / "run", "--resume"]
     view = ["render", tmp_path / "run", "-o", tmp_path / "view.exr"]
-    assert "export" not in refused(view, "model.json", "'phong' is unknown", "register it")
+    assert "export" not in refused(view, "model.json", "'phong' is unknown", "add --plugin ")
     reflectance.register(Phong())
     attributes.ATTRIBUTES.unregister("shininess")
-    assert "export" not in refused(view, "model.json", "'shininess' is unknown", "register it")
-    assert "damaged" not in refused(command, "0000006.npz: surfels: shininess", "register it")
+    assert "export" not in refused(view, "model.json", "'shininess' is unknown", "add --plugin ")
+    assert "damaged" not in refused(command, "0000006.npz: surfels: 'shininess' is unknown")
 
 
 def test_it_shades_what_traced_rays_hit() -> None:

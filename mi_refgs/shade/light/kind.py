@@ -30,6 +30,6 @@ class LightKind:
         return EnvironmentLight(raw)
 
 
-LIGHTS: Registry[type[LightKind]] = Registry("light")
+LIGHTS: Registry[type[LightKind]] = Registry("light", of=LightKind, classes=True)
 register = LIGHTS.register
 """Add a kind of light, which method files can name from then on."""

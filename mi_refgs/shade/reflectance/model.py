@@ -107,9 +107,6 @@ class Reflectance:
 
 def require_complete(model: Reflectance) -> None:
     """Raise InputError for a model that cannot render: a method is missing, or a value does not exist."""
-    if not isinstance(model, Reflectance):
-        what = "give an object of a subclass of Reflectance"
-        raise InputError(what, "reflectance model", abbreviated(model))
     traced = ("trace",) if model.visibility == "own" else ()
     sampled = ("lobe",) if "visibility_rays" in model.honoured else ()
     for name in ("required_attributes", "values", "shade", *traced, *sampled):
@@ -126,5 +123,5 @@ def require_complete(model: Reflectance) -> None:
             raise InputError(what, "reflectance model", model.name, f"use {' or '.join(allowed)}")
 
 
-MODELS: Registry[Reflectance] = Registry("reflectance model", require_complete)
+MODELS: Registry[Reflectance] = Registry("reflectance model", require_complete, of=Reflectance)
 """Every model by name. The first one whose attributes the surfels have is the plugin's default."""

@@ -115,5 +115,5 @@ class SplitSum(Reflectance):
     def lobe(self, points: ShadingPoints) -> tuple[Float, Color3f]:
         return points.roughness, base_reflectance(points)
 
-    def textures(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def textures(self, values: Mapping[str, Any]) -> dict[str, Any] | None:
         return {name: values[name] for name in MATERIALS}

@@ -159,12 +159,9 @@ def _check(primitive: Primitive) -> None:
             raise InputError(what, remedy="give it an attribute, or a number of columns, of its own")
 
 
-PRIMITIVES: Registry[Primitive] = Registry("primitive", _check)
-
-
-def register(primitive: Primitive) -> Primitive:
-    """Add a primitive, which is returned; raises InputError if another one has its name or its attributes."""
-    return PRIMITIVES.register(primitive)
+PRIMITIVES: Registry[Primitive] = Registry("primitive", _check, of=Primitive)
+register = PRIMITIVES.register
+"""Add a primitive; raises InputError if another one has its name or its attributes."""
 
 
 def nearest_primitive(raw: Mapping[str, Any]) -> tuple[Primitive, list[str]]:
