@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -22,11 +23,11 @@ ROUNDS, WARM_UP = 9, 2
 """Timed images of each size, and those before, which compile kernels."""
 
 
-def measure(run: Path) -> list[dict[str, float]]:
-    """Width, height and median milliseconds for each size."""
+def measure(run: Path, sizes: Sequence[int | tuple[int, int]] = SIZES) -> list[dict[str, float]]:
+    """Width, height and median milliseconds for each size: the longer side, or both."""
     found = load(run, write=False)
     draw, rows = found.trained.renderer(aovs=False), []
-    for size in SIZES:
+    for size in sizes:
         camera, times = found.camera(0).resized(size), []
         for _ in range(WARM_UP + ROUNDS):
             begin = time.perf_counter()

@@ -1,8 +1,9 @@
-"""Every test starts under llvm_ad_rgb with Dr.Jit's defaults, and leaves nothing behind for the next one."""
+"""Every test starts under one variant with Dr.Jit's defaults, and leaves nothing behind for the next one."""
 
 from __future__ import annotations
 
 import gc
+import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -35,6 +36,7 @@ settings.register_profile(
 settings.register_profile("thorough", settings.get_profile("mi_refgs"), max_examples=400, derandomize=False)
 settings.load_profile("mi_refgs")
 
+VARIANT = os.environ.get("MI_REFGS_TEST_VARIANT", "llvm_ad_rgb")
 THREADS = max(dr.thread_count(), MITSUBA_EXR_THREADS)  # Mitsuba must be able to read EXR files
 LONGEST = (
     "test_tutorials.py",
@@ -76,7 +78,7 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(scope="session")
 def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """day.exr, dusk.exr, the data set `data` of two balls under them, and a perfect reconstruction `run`."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     folder = tmp_path_factory.mktemp("known")
     write_known_run(write_known_data(folder), folder / "run")
     return folder
@@ -85,7 +87,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def llvm_ad_rgb() -> Iterator[None]:
     """Set variant and threads; afterwards wait for kernels, restore flags, return memory; kernels stay."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     if dr.thread_count() != THREADS:  # a command was run with --threads
         dr.set_thread_count(THREADS)
     yield
