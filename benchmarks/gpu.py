@@ -6,6 +6,7 @@ and has the error of a step that fails. `gpu.sh` sets up a bare machine. `--smal
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import os
 import subprocess
@@ -110,7 +111,7 @@ def _gsplat(workload: Workload) -> Row:
     opacity = 1 / (1 + np.exp(-raw["opacity"][:, 0]))
     leaves = [tensor(a) for a in (raw["position"], np.column_stack([w, x, y, z]), scale, opacity)]
     view = tensor(np.diag([-1, -1, 1, 1]) @ np.linalg.inv(p.to_world)).detach()[None]  # x right, y down
-    lens = tensor([[abs(p.fx), 0, p.cx], [0, abs(p.fy), p.cy], [0, 0, 1]]).detach()[None]
+    lens = tensor(np.array([[abs(p.fx), 0, p.cx], [0, abs(p.fy), p.cy], [0, 0, 1]])).detach()[None]
     calls: dict[str, Callable[[], Any]] = {}
     row: Row = {}
     for channels in (COLOUR, CHANNELS):
@@ -119,7 +120,7 @@ def _gsplat(workload: Workload) -> Row:
         for name, function in (("2d", rasterization_2dgs), ("3d", rasterization)):
 
             def draw(function: Any = function, colours: Any = colours) -> Any:
-                return function(*leaves, colours, view, lens, p.width, p.height, packed=False)
+                return function(*leaves, colours[None], view, lens, p.width, p.height, packed=False)
 
             def forward(draw: Any = draw) -> None:
                 with torch.no_grad():
@@ -211,10 +212,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--only", help="print the rows of a step")
-    options = parser.parse_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
     mi.set_variant(options.variant)
     mi.set_log_level(mi.LogLevel.Error)
     if options.only:
+        faulthandler.dump_traceback_later(0.9 * LIMITS[names[options.only]])  # says where a slow one was
         for row in names[options.only](options.small):
             print(json.dumps(row), flush=True)
         return 0

@@ -55,10 +55,13 @@ class PackedRows:
         return [value for group in groups for value in group]
 
     def add(self, row: UInt32, values: list[Float], active: Bool) -> None:
-        """Add values, one array per column, to rows; by copies per thread if they fit into COPIES_BYTES."""
+        """Add values, one array per column, to rows; on the CPU by copies per thread if they fit into
+        COPIES_BYTES."""
         # Dr.Jit itself always adds atomically to more than a million entries.
         copies = 4 * dr.width(self.data) * dr.thread_count()
         mode = dr.ReduceMode.Expand if copies <= COPIES_BYTES else dr.ReduceMode.Local
+        if dr.backend_v(self.data) == dr.JitBackend.CUDA:
+            mode = dr.ReduceMode.Direct  # sums within a warp first take eight times as long: docs/gpu.md
         for place, group in self._groups(row, values):
             dr.scatter_add(self.data, group, place, active, mode=mode)
 

@@ -1,0 +1,24 @@
+"""The script for a machine with a GPU: its small instance on the CPU, and a step that takes too long."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks import gpu
+from benchmarks.common.build import read_result
+from tests.helpers import run_process
+
+
+def test_small_instance(tmp_path: Path) -> None:
+    done = run_process("-m", "benchmarks.gpu", tmp_path, "--small", "splat", "volprim", "gsplat")
+    assert done.returncode == 0, done.stderr[-3000:]
+    steps = read_result(tmp_path / "gpu.json")["steps"]
+    (ours,), (theirs,) = steps["splat"], steps["volprim"]
+    assert 0 < ours["kernels_both"]["ms"] and 0.2 < ours["mean_alpha"] < 0.6
+    assert ours["both_ms"] > 0 and theirs["both_ms"] > 0 and steps["gsplat"] == []
+
+
+def test_step_beyond_its_limit_is_an_error(tmp_path: Path) -> None:
+    with open(tmp_path / "log", "a+") as log:
+        (row,) = gpu.run("values", 0.1, [str(tmp_path), "--small"], log)
+    assert "exit code -9" in row["error"]
