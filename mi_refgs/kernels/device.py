@@ -50,6 +50,20 @@ def require_supported_variant(what: str) -> None:
         raise InputError(f"'{mi.variant()}' is not supported", what, "variant", remedy)
 
 
+def children_of(parent: Any) -> dict[str, Any]:
+    """What an object of Mitsuba hands to `mi.traverse`: its objects, which that opens, and its values."""
+    found: dict[str, Any] = {}
+
+    class Children(mi.TraversalCallback):
+        def put(self, name: str, value: Any, *flags: Any) -> None:
+            found[name] = value
+
+        put_object = put_value = put
+
+    parent.traverse(Children())
+    return found
+
+
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
     """A flat copy aligned to SIMD vectors, LOOK_AHEAD zeros after its end: Dr.Jit has one kernel more for
     others."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import children_of
 from mi_refgs.kernels.memory import DERIVATIVE_SAMPLES, require_image
 from mi_refgs.render.passes import Band, bands
 from mi_refgs.render.pipeline import Frame
@@ -43,20 +45,11 @@ class FilmImage:
 
     def image(self) -> Any:
         """The image (h, w, c), without derivatives."""
-        views = []
-        for sensor in self._sensors:
-            parts = []
-            for band in self._bands(sensor, None):
-                parts.append(self._values(sensor, band))
-                if band.size[1] < self._size[0]:
-                    dr.eval(parts[-1])
-            views.append(parts)
-            del parts
-        return self._developed(self._joined(views))
+        return self._developed(self._joined(None, self._values))
 
     def adjoints(self, δ_image: Any) -> Iterator[tuple[Any, Any]]:
         """Attached values of each pass, and their adjoints; delete them before the next."""
-        found = [(one, band) for one in self._sensors for band in self._bands(one, DERIVATIVE_SAMPLES)]
+        found = self._passes(DERIVATIVE_SAMPLES)
         if len(found) == 1:
             yield self._developed(self._values(*found[0])), δ_image
             return
@@ -74,22 +67,13 @@ class FilmImage:
 
     def tangent(self) -> Any:
         """Tangent of the image for the tangents of the parameters; zero where none of these changes it."""
-        found = [(one, self._bands(one, DERIVATIVE_SAMPLES)) for one in self._sensors]
         # The tangents of the parameters stay: other losses and later passes read them, too.
-        flags = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
-        if sum(len(bands) for _, bands in found) == 1:
-            [(sensor, [band])] = found
-            return dr.forward_to(self._developed(self._values(sensor, band)), flags=flags)
-        views = []
-        for sensor, of_sensor in found:
-            parts = []
-            for band in of_sensor:
-                values = self._values(sensor, band)
-                parts.append(dr.forward_to(values, flags=flags))
-                dr.eval(parts[-1])
-                del values
-            views.append(parts)
-        return self._through_film(dr.ADMode.Forward, self._joined(views))
+        forward = partial(dr.forward_to, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
+        found = self._passes(DERIVATIVE_SAMPLES)
+        if len(found) == 1:
+            return forward(self._developed(self._values(*found[0])))
+        joined = self._joined(DERIVATIVE_SAMPLES, lambda *of: forward(self._values(*of)))
+        return self._through_film(dr.ADMode.Forward, joined)
 
     # ---------------- passes ----------------
 
@@ -109,34 +93,35 @@ class FilmImage:
     @property
     def _sensors(self) -> list[Any]:
         """The sensors of a `batch`, whose images are side by side in its film; else the sensor itself."""
+        inner = [one for one in children_of(self.sensor).values() if isinstance(one, mi.Sensor)]
+        return inner or [self.sensor]
+
+    def _passes(self, most: int | None) -> list[tuple[Any, Band]]:
+        """Bands of at most `most` samples of each sensor's view, one view after the other."""
         found = []
+        for sensor in self._sensors:
+            camera, channels = Camera.from_sensor(sensor), 5 + len(self.aovs)
+            size = camera.width, camera.height
+            require_image(size, self._samples, self.surfels, channels, most is not None)
+            parts = bands(camera, samples_per_axis(self._samples), self.neighbours, most)
+            found += [(sensor, band) for band in parts]
+        return found
 
-        class Inner(mi.TraversalCallback):
-            def put(self, name: str, value: Any, *flags: Any) -> None:
-                if isinstance(value, mi.Sensor):
-                    found.append(value)
-
-            put_object = put_value = put
-
-        self.sensor.traverse(Inner())
-        return found or [self.sensor]
-
-    def _joined(self, views: list[list[Any]]) -> Any:
-        """Values of all pixels of the film, from those of the bands of each view; empties the list."""
-        height, found = self._size[0], []
-        while views:
-            parts = views.pop(0)
-            found.append(dr.concat(parts) if len(parts) > 1 else parts[0])
-        if len(found) == 1:
-            return found[0]
-        rows = [mi.TensorXf(values, (height, dr.width(values) // height)) for values in found]
-        return dr.concat(rows, axis=1).array
-
-    def _bands(self, sensor: Any, most: int | None) -> list[Band]:
-        camera, channels = Camera.from_sensor(sensor), 5 + len(self.aovs)
-        size = camera.width, camera.height
-        require_image(size, self._samples, self.surfels, channels, most is not None)
-        return bands(camera, samples_per_axis(self._samples), self.neighbours, most)
+    def _joined(self, most: int | None, of: Callable[[Any, Band], Any]) -> Any:
+        """What `of` returns for all pixels of the film, pixel by pixel, from its passes."""
+        parts, (height, _), views = [], self._size, len(self._sensors)
+        for sensor, band in self._passes(most):
+            parts.append(of(sensor, band))
+            if band.size[1] < height:
+                dr.eval(parts[-1])
+        values = dr.concat(parts) if len(parts) > 1 else parts[0]
+        parts.clear()
+        if views == 1:
+            return values
+        row = dr.width(values) // (height * views)  # entries of a view's row
+        index = dr.arange(mi.UInt32, dr.width(values))
+        line = index // row
+        return dr.gather(mi.Float, values, (line % views * height + line // views) * row + index % row)
 
     def _values(self, sensor: Any, band: Band) -> Any:
         """Channels of the pixels of a band (mi.Float), pixel by pixel; under AD."""

@@ -47,14 +47,15 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
     return EnvironmentLight.from_radiance(tiled), mi.Transform4f()
 
 
-def emitter_light(emitter: Any, filtered: bool = True) -> Light:
-    """The light of an emitter, `filtered` or with `radiance` only, under AD by `scale`, `data` and
-    `to_world`, `radiance.value`, or `irradiance.value` and `to_world`. Raises InputError for resampled `data`
-    with gradients, and other emitters."""
+def emitter_light(emitter: Any, filtered: bool = True, other: Light | None = None) -> Light:
+    """The light of an emitter, and the `other` if it is directional; `filtered`, or with `radiance` only;
+    under AD by `scale`, `data` and `to_world`, `radiance.value`, or `irradiance.value` and `to_world`. Raises
+    InputError for resampled `data` with gradients, and other emitters."""
     params = mi.traverse(emitter)
     if "irradiance.value" in params:
         towards = -mi.Vector3f(params["to_world"] @ mi.Vector3f(0, 0, 1))
-        return DirectionalLight(dr.normalize(towards), mi.Color3f(params["irradiance.value"]))
+        other = other or ConstantLight(mi.Color3f(0))
+        return DirectionalLight(other, dr.normalize(towards), mi.Color3f(params["irradiance.value"]))
     if "data" not in params:
         return ConstantLight(_constant_radiance(params, emitter))
     radiance, resampled = _map_radiance(params, emitter)
@@ -70,8 +71,9 @@ def emitter_light(emitter: Any, filtered: bool = True) -> Light:
 
 @dataclass(frozen=True)
 class DirectionalLight:
-    """Light from one direction, which has highlights and diffuse reflection, but cannot be seen itself."""
+    """Light from one direction, beside another light: highlights and diffuse reflection, itself unseen."""
 
+    other: Light
     towards: Vector3f  # unit, world, to the light
     arriving: Color3f  # irradiance on a surface that faces it, under AD
 
@@ -81,29 +83,15 @@ class DirectionalLight:
         a, b = 0.5 * (1 + α2), 0.5 * (1 - α2)
         whole = (a / α2 - 1 + dr.log(α2 / a)) / dr.square(b) * (2 * dr.pi)
         cosine = dr.dot(direction, self.towards)
-        return self.arriving * (dr.maximum(cosine, 0) / (whole * dr.square(a - b * cosine)))
+        value = dr.maximum(cosine, 0) / (whole * dr.square(a - b * cosine))
+        return self.other.specular(direction, roughness) + self.arriving * value
 
     def irradiance(self, normal: Vector3f) -> Color3f:
-        return self.arriving * (dr.maximum(dr.dot(normal, self.towards), 0) / dr.pi)
+        cosine = dr.maximum(dr.dot(normal, self.towards), 0)
+        return self.other.irradiance(normal) + self.arriving * (cosine / dr.pi)
 
     def radiance(self, direction: Vector3f) -> Color3f:
-        return mi.Color3f(0)
-
-
-@dataclass(frozen=True)
-class SumOfLights:
-    """Several lights at once."""
-
-    lights: list[Light]
-
-    def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
-        return sum((light.specular(direction, roughness) for light in self.lights), mi.Color3f(0))
-
-    def irradiance(self, normal: Vector3f) -> Color3f:
-        return sum((light.irradiance(normal) for light in self.lights), mi.Color3f(0))
-
-    def radiance(self, direction: Vector3f) -> Color3f:
-        return sum((light.radiance(direction) for light in self.lights), mi.Color3f(0))
+        return self.other.radiance(direction)
 
 
 def light_of(shading: Shading, own: EnvironmentLight | None, to_world: Any, scene: Any) -> Light | None:
@@ -113,27 +101,32 @@ def light_of(shading: Shading, own: EnvironmentLight | None, to_world: Any, scen
         return None
     if (light := shading.light_of(own)) is not None:
         return rotated(light, to_world)
-    lights = [emitter_light(one, shading.model.light == "filtered") for one in used_emitters(shading, scene)]
-    if not lights:
+    found: Light | None = None
+    for emitter in used_emitters(shading, scene):
+        found = emitter_light(emitter, shading.model.light == "filtered", found)
+    if found is None:
         what = f"refgs takes none of {_named(scene.emitters())}" if scene.emitters() else "there is none"
         raise InputError(what, "refgs", "light", "nest an `envmap` in integrator or scene")
-    return lights[0] if len(lights) == 1 else SumOfLights(lights)
+    return found
 
 
 def used_emitters(shading: Shading, scene: Any) -> list[Any]:
-    """The emitters of a scene that light its surfels, unless the integrator has a light of its own."""
+    """The scene's emitters that light surfels if the integrator has no light, the environment first."""
     directional = ["DirectionalEmitter"] if shading.model.light == "filtered" else []
-    return [one for one in scene.emitters() if one.is_environment() or one.class_name() in directional]
+    found = [one for one in scene.emitters() if one.is_environment() or one.class_name() in directional]
+    return sorted(found, key=lambda one: not one.is_environment())
 
 
 def warn_of_ignored(scene: Any, used: list[Any]) -> None:
     """One warning that names the emitters that are not `used`, and one that names the scene's shapes."""
-    if unused := [emitter for emitter in scene.emitters() if not any(emitter is one for one in used)]:
-        what = f"refgs does not use the scene's emitters {_named(unused)}"
-        warnings.warn(f"{what}: its light is `light`, or an environment", RuntimeWarning, stacklevel=3)
-    if scene.shapes():
-        what = f"refgs does not render the scene's shapes {_named(scene.shapes())}"
-        warnings.warn(f"{what}: it renders surfels, which its `mesh` occludes", RuntimeWarning, stacklevel=3)
+    unused = [emitter for emitter in scene.emitters() if not any(emitter is one for one in used)]
+    for found, what, instead in (
+        (unused, "use the scene's emitters", "its light is `light`, or an environment"),
+        (scene.shapes(), "render the scene's shapes", "it renders surfels, which its `mesh` occludes"),
+    ):
+        if found:
+            message = f"refgs does not {what} {_named(found)}: {instead}"
+            warnings.warn(message, RuntimeWarning, stacklevel=3)
 
 
 def _named(objects: list[Any]) -> str:

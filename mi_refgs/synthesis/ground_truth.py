@@ -14,6 +14,7 @@ import trimesh
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import children_of
 from mi_refgs.occlusion.visibility import mesh_arrays
 from mi_refgs.types import Bool, Color3f, Float, Scene
 
@@ -77,17 +78,8 @@ class _Parameters:
     def __init__(self, bsdf: Any, si: Any, active: Bool) -> None:
         import mitsuba as mi
 
-        children: dict[str, Any] = {}
-
-        class Children(mi.TraversalCallback):
-            def put(self, name: str, value: Any, *flags: Any) -> None:
-                children[name] = value
-
-            put_object = put_value = put
-
-        bsdf.traverse(Children())
         self.bsdf, self.si, self.active = bsdf, si, active
-        self.children, self.values = children, mi.traverse(bsdf)
+        self.children, self.values = children_of(bsdf), mi.traverse(bsdf)
 
     def __contains__(self, name: str) -> bool:
         return name in self.children

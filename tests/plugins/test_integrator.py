@@ -16,6 +16,7 @@ from mi_refgs.plugins.light import LOBES, DirectionalLight
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
+from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
@@ -113,7 +114,7 @@ def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
 def test_the_lobe_of_a_directional_light_is_normalised() -> None:
     w = np.linspace(0, np.pi, 100_001)[1:]
     towards = mi.Vector3f(*(mi.Float(x.astype(np.float32)) for x in (np.sin(w), 0 * w, np.cos(w))))
-    light = DirectionalLight(mi.Vector3f(0, 0, 1), mi.Color3f(1))
+    light = DirectionalLight(ConstantLight(mi.Color3f(0)), mi.Vector3f(0, 0, 1), mi.Color3f(1))
     for roughness in (*LOBES, 0.3, 0.7):
         values = np.array(light.specular(towards, mi.Float(roughness)))[0]
         assert np.sum(values * np.sin(w)) * 2 * np.pi * w[0] == pytest.approx(1, abs=1e-2), roughness
