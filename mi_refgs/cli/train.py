@@ -39,6 +39,10 @@ class Train:
     purpose: Annotated[str | None, optional("{photographs,relighting}", name="for")] = None
     """choose the method by a purpose"""
     preset: Preset = None
+    light: Annotated[Path | None, optional("FILE")] = None
+    """start with this lat-long map (EXR, HDR) as the light; its first row is straight up, +z"""
+    light_fixed: Flag = False
+    """do not change the map of --light"""
     set: Settings = ()
     resume: Flag = False
     """continue the run from its newest checkpoint"""
@@ -59,6 +63,7 @@ class Train:
         begin = time.monotonic()
         given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
         given |= {"settings": joined(self.set), "purpose": self.purpose}
+        given |= {"light": self.light, "light_fixed": self.light_fixed}
         fit(self.data, self.method, progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None

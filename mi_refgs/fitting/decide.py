@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,9 +19,10 @@ from mi_refgs.fitting.initial import converted, with_columns
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import Event
-from mi_refgs.methods.method import APART, AROUND, LIGHT, Method
+from mi_refgs.methods.method import APART, AROUND, LIGHT, PLACEMENT, Method
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.runs.run import Run
+from mi_refgs.shade.light.maps import Map
 
 DECISIONS = "decisions.json"  # file of a run
 HOLDOUT = 8  # every so many training views validate
@@ -100,12 +101,14 @@ def as_decided(method: Method, decisions: Sequence[Mapping[str, Any]]) -> Method
 
 
 def differences(run: Run, now: Method) -> dict[str, tuple[Any, Any]]:
-    """Keys by which the method of a run differs from another one, with the run's decisions and image size."""
+    """Keys by which the method of a run differs from another one, with the run's decisions and sizes."""
     made = run.method()
     if (state := run.load_checkpoint()) is not None:
         made, now = (as_decided(method, decisions_of(state)) for method in (made, now))
     if now.data.downscale is None:
         now = now.downscaled(made.data.downscale)
+    if isinstance(now.light, Map) and now.light.height is None and isinstance(made.light, Map):
+        now = replace(now, light=replace(now.light, height=made.light.height))
     return methods.differences(made, now)
 
 
@@ -123,7 +126,7 @@ def fork(trainer: Trainer, method: Method) -> Trainer:
     wanted = converted(old, widths, method, rng)
     wanted |= {name: old[name] for name in old if name in APART or name.startswith(AROUND)}
     if method.light is None:
-        wanted.pop(LIGHT, None)
+        wanted = {name: values for name, values in wanted.items() if name not in (LIGHT, PLACEMENT)}
     dropped = (PARAMS, OPTIMISER) if method.has_mesh else (PARAMS, OPTIMISER, MESH)
     new = {name: value for name, value in state.items() if not name.startswith(dropped)}
     for name, values in wanted.items():

@@ -11,7 +11,7 @@ from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.methods.initialiser import INITIALISERS, Start, Wanted
-from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
+from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, PLACEMENT, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.light.maps import Learnt
@@ -36,8 +36,9 @@ def initial_parameters(
     if method.light is None:
         return params
     if open_scene and isinstance(method.light, Learnt):
-        return params | {LIGHT: seen_around(data, method.light.height).raw}
-    return params | {LIGHT: method.light.start()}
+        return params | {LIGHT: seen_around(data, method.light.rows).raw}
+    params |= {LIGHT: method.light.start()}
+    return params if (placement := method.light.placement()) is None else params | {PLACEMENT: placement}
 
 
 def started(names: Sequence[str], wanted: Wanted) -> Start:

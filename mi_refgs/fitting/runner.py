@@ -35,7 +35,7 @@ from mi_refgs.methods.method import POSE, Method
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import MODEL
-from mi_refgs.runs.views import read_views, sized, with_region
+from mi_refgs.runs.views import downscaled, lit, read_views, sized, with_region
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
 Tell = Callable[[str], None]  # is called with sentences for the user
@@ -131,12 +131,12 @@ def chosen(data: Path, choice: Choice, say: Tell = lambda _: None) -> tuple[Meth
     # Settings of anything but images may be those of the other method.
     of_images = [text for text in methods.assignments(choice.settings) if text.startswith("data.")]
     named = choice.named()
-    reads, views = sized(load_method(named, choice.preset, of_images), data, say)
+    reads, views = downscaled(load_method(named, choice.preset, of_images), data, say)
     name = _for_images(named, reads, views)
     if name != named:
         say(f"{data}: images without alpha: fitted with their background, by --method {name}")
     method = load_method(name, choice.preset, choice.settings)
-    return method.downscaled(views.downscale), views
+    return lit(method.downscaled(views.downscale), views, say), views
 
 
 def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:

@@ -19,7 +19,17 @@ from mi_refgs.fitting.events import place
 from mi_refgs.fitting.optim import LearningRate
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.event import EVENTS, Event
-from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, POSE, Method, Rates
+from mi_refgs.methods.method import (
+    AROUND,
+    BACKGROUND,
+    GAIN,
+    LIGHT,
+    PER_VIEW,
+    PLACEMENT,
+    POSE,
+    Method,
+    Rates,
+)
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.light.kind import FittedLight
@@ -29,8 +39,9 @@ from mi_refgs.surfels.attributes import attribute
 from mi_refgs.types import Float, TensorXf
 
 DEFAULT_RATES = Rates()
-GAIN_RATES, POSE_RATES = (1e-3, 1e-4), (2e-3, 6e-5)
-"""Learning rates of log gains and of corrections, radians or half widths, at the start and at the end."""
+LEARNT_BESIDE = {GAIN: (1e-3, 1e-4), POSE: (2e-3, 6e-5), PLACEMENT: (1e-2, 1e-4)}
+"""Learning rates of log gains, of corrections, radians or half widths, and of the rotation, radians, and log
+scale of a known light, at the start and at the end."""
 POSITION_STEPS, POSITION_FINAL = 0.6, 1.6e-6
 """Fraction of the iterations after which positions learn at their final rate, scene extents per step: after
 30,000 of 50,000 in the released Ref-Gaussian code."""
@@ -125,10 +136,10 @@ class FitSetup:
             table["position"] = replace(table["position"], centre=self.data.region.centre)
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = LearningRate(around.rate, around.rate * rates.decay, iterations)
-        if self.method.light is not None:
-            rate = rates.light if self.method.light.learnt else 0.0
-            groups[LIGHT] = LearningRate(rate, rate * rates.decay, iterations, relative=rates.light_relative)
-        for name, (rate, final) in {GAIN: GAIN_RATES, POSE: POSE_RATES}.items():
+        if self.method.light is not None and self.method.light.learns:
+            final = rates.light * rates.decay
+            groups[LIGHT] = LearningRate(rates.light, final, iterations, relative=rates.light_relative)
+        for name, (rate, final) in LEARNT_BESIDE.items():
             if name in params:
                 groups[name] = LearningRate(rate, final, iterations)
         return groups
@@ -145,7 +156,9 @@ class FitSetup:
             wanted |= {AROUND + name: (background.columns(name),) for name in around.names}
             wanted[BACKGROUND] = (2 * around.height, 3)
         if light is not None:
-            wanted[LIGHT] = tuple(light.start().shape[1:])
+            wanted[LIGHT] = light.columns()
+            if light.placement() is not None:
+                wanted[PLACEMENT] = (6,)
         found = {
             name: values.shape if name in PER_VIEW else values.shape[1:]
             for name, values in part(state, PARAMS).items()
@@ -187,30 +200,33 @@ class SharedPrefilter:
 
     def __init__(self) -> None:
         self._light: PrefilteredLight | None = None  # attached to the environment
-        self._leaf: Float = None  # its levels, which accumulate the gradients of the steps
+        self._leaf: Float = None  # its levels, which accumulate the gradients of the steps if it learns
 
     def light(self, environment: FittedLight | None, shading: Shading) -> Light | None:
         """The light of a step, under AD; a light that is not filtered stays attached to its environment."""
-        if self._light is not None and shading.model.light == "filtered":
-            return replace(self._light, levels=self._leaf)
-        light = shading.light_of(environment)
-        if not isinstance(light, PrefilteredLight):
-            return light
-        self._light, self._leaf = light, dr.detach(light.levels)
-        dr.enable_grad(self._leaf)
-        return replace(light, levels=self._leaf)
+        if environment is None:
+            return None
+        if self._light is None or shading.model.light != "filtered":
+            light = shading.light_of(environment.map)
+            if not isinstance(light, PrefilteredLight):
+                return None if light is None else environment.placed(light)
+            self._light, self._leaf = light, dr.detach(light.levels)
+            dr.set_grad_enabled(self._leaf, dr.grad_enabled(light.levels))
+        return environment.placed(replace(self._light, levels=self._leaf))
 
     def close(self) -> None:
-        """Add the accumulated gradient to that of the environment."""
-        if self._light is not None:
-            dr.set_grad(self._light.levels, dr.grad(self._leaf))
-            dr.enqueue(dr.ADMode.Backward, self._light.levels)
-            dr.traverse(dr.ADMode.Backward)
+        """Add the accumulated gradient to that of the environment; a fixed light stays filtered."""
+        if self._light is None or not dr.grad_enabled(self._leaf):
+            return
+        dr.set_grad(self._light.levels, dr.grad(self._leaf))
+        dr.enqueue(dr.ADMode.Backward, self._light.levels)
+        dr.traverse(dr.ADMode.Backward)
         self._light = self._leaf = None
 
     def state(self) -> dict[str, np.ndarray]:
         """The accumulated gradient for a checkpoint; empty if there is none."""
-        return {} if self._leaf is None else {GATHERED: np.array(dr.grad(self._leaf), dtype=np.float32)}
+        learns = self._leaf is not None and dr.grad_enabled(self._leaf)
+        return {} if not learns else {GATHERED: np.array(dr.grad(self._leaf), dtype=np.float32)}
 
     def restore(
         self, environment: FittedLight | None, shading: Shading, state: Mapping[str, np.ndarray]

@@ -25,11 +25,12 @@ from mi_refgs.surfels.primitives import PRIMITIVES
 
 # Names among the parameters of a fit, beside the attributes of the surfels:
 LIGHT, BACKGROUND = "light", "background"  # the environment maps
+PLACEMENT = "light_placement"  # rotation and scale of a known light
 GAIN = "gain"  # log exposure gains of the training views
 POSE = "pose"  # corrections of their cameras
 PER_VIEW = (GAIN, POSE)  # parameters with a row per training view, which a fit may lack
 AROUND = "surroundings/"  # prefix of the background Gaussians' attributes
-APART = (LIGHT, BACKGROUND, *PER_VIEW)  # parameters that are not attributes of surfels
+APART = (LIGHT, PLACEMENT, BACKGROUND, *PER_VIEW)  # parameters that are not attributes of surfels
 AT_ONCE = Window(0, 3, 1)  # one SH degree more in each of the first three iterations
 LEAST_CROP = 64 * 64  # pixels; SSIM compares windows of 11 × 11
 
@@ -269,6 +270,7 @@ class Method:
         _require_known("rates.attribute", self.rates.attribute, {*ATTRIBUTES})
         _require_known("rates.rest", self.rates.rest, harmonics)
         self.require_registered()
+        lit = False
         for name, stage in self.stages():
             _require_known(f"stage.{name}.restart", stage.restart, {*surfels.attributes} | others)
             _require_known(f"stage.{name}.rates", stage.rates, attributes | others)
@@ -277,6 +279,9 @@ class Method:
                 resolved.require_inputs(attributes, self.light is not None)
             except InputError as error:
                 raise error.at(field=f"stage.{name}") from error
+            lit |= resolved.model.light != "none"
+        if self.light is not None and not lit:
+            raise InputError("no stage uses it", field="light", remedy="choose a method with materials")
 
     def require_registered(self) -> None:
         """Raise InputError for an event, a loss or an initialiser that is not registered, or whose inputs the

@@ -19,8 +19,10 @@ from mi_refgs.errors import InputError, UnknownNameError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.build import build, plain, scaled
+from mi_refgs.methods.build import settings as keys_of
 from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method
 from mi_refgs.registry import load_again, plugin_files
+from mi_refgs.shade.light.kind import LIGHTS
 
 DEFAULT_LOSSES = plain(LOSS_WEIGHTS)
 MAX_TEXT, MAX_LINE = 2**16, 2000
@@ -178,6 +180,8 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
     if path.resolve() in above:
         raise InputError("the file extends itself", path, "extends", "break the circle")
     table = _read(path)
+    if isinstance(light := table.get("light"), dict) and isinstance(light.get("file"), str):
+        light["file"] = str(path.parent.resolve() / light["file"])
     base, dropped = table.pop("extends", None), table.pop("drop", [])
     if base is None and not dropped:
         return table
@@ -246,6 +250,10 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
         if not isinstance(inner, dict):
             raise InputError(f"'{parent}' is not a table", "--set", key.strip(), "check the key")
         table = inner
+    if parents == ["light"] and last == "kind":  # keys of the former kind that this one lacks are dropped
+        known = keys_of(LIGHTS.find(value, "light.kind"))
+        for name in [name for name in table if name not in known]:
+            del table[name]
     if parents == ["event"] and value is False:
         table.pop(last, None)
     else:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.fitting import runner
@@ -31,6 +32,8 @@ def fit(
     preset: str | None = None,
     settings: runner.Settings = (),
     purpose: str | None = None,
+    light: str | Path | None = None,
+    light_fixed: bool = False,
     output: str | Path | None = None,
     resume: bool = False,
     progress: bool | Progress = True,
@@ -42,6 +45,10 @@ def fit(
     long, "quick", "standard" (the default), "paper", or iterations and largest number of surfels,
     "1000:20000". settings: changes of the method, {"loss.ssim": 0.1} or ["loss.ssim=0.1"]. purpose:
     "photographs" or "relighting", in place of a method.
+
+    light: a lat-long map (EXR, HDR, PNG, JPEG) with which the light starts, or which it is if `light_fixed`.
+    Its first row is straight up, +z, unless it is the data set's environment.exr. Its settings are
+    `light.world`, `.rotate` and `.exposure`, as in `Reconstruction.relight`, and `.learn`: ["azimuth", "scale"].
 
     output: the run folder. Without one a temporary folder is used, which is removed with the last
     `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`;
@@ -60,6 +67,7 @@ def fit(
         output = temporary.path
         listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")
     try:
+        settings = [*_light_settings(light, light_fixed, Path(data)), *methods.assignments(settings)]
         named = str(method) if isinstance(method, Path) else method
         choice = runner.Choice(named, preset, settings, purpose)
         runner.fit(Path(data), Path(output), choice, resume=resume, progress=listener)
@@ -68,6 +76,18 @@ def fit(
             temporary.remove.detach()  # keeps the checkpoints, from which the fit can be resumed
         raise
     return replace(load(output), _temporary=temporary)
+
+
+def _light_settings(file: str | Path | None, fixed: bool, data: Path) -> list[str]:
+    """The assignments of a method whose light is a file."""
+    if file is None:
+        if fixed:
+            raise InputError("no map is given", "light_fixed", remedy="name its file as `light`")
+        return []
+    path, own = Path(file).resolve(), data / "environment.exr"
+    world = path.is_file() and own.is_file() and path.read_bytes() == own.read_bytes()
+    chosen = {"kind": "file", "file": str(path), "fixed": fixed, "world": world}
+    return methods.assignments({f"light.{key}": value for key, value in chosen.items()})
 
 
 class _TemporaryFolder:

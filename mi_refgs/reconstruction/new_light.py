@@ -7,9 +7,8 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import REGION_FILE
@@ -17,12 +16,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import require_file
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light_file import read_radiance
-from mi_refgs.synthesis.pathtrace import ENVIRONMENT_OVERSAMPLING, environment_image
-from mi_refgs.synthesis.settings import RELIGHT, Z_UP, recorded_lights
-
-HEIGHT = 256  # maximum number of rows of a light: a texel is 0.7°, an eighth of the lobe of roughness 0.1
-READ_ROWS = ENVIRONMENT_OVERSAMPLING * HEIGHT  # to which a larger map is averaged first
-EXPOSURE_MAX = 10.0  # stops; a light stores no radiance below 1e-4
+from mi_refgs.shade.light.maps import READ_ROWS, require_range, world_light
+from mi_refgs.synthesis.settings import RELIGHT, recorded_lights
 
 
 @dataclass(frozen=True)
@@ -36,7 +31,7 @@ class NewLight:
 
     def __post_init__(self) -> None:
         require_file(self.path)
-        _require_range(self.rotate, self.exposure)
+        require_range(self.rotate, self.exposure)
 
     @property
     def identity(self) -> str:
@@ -47,34 +42,6 @@ class NewLight:
     def read(self) -> EnvironmentLight:
         """Read the light, of at most HEIGHT rows."""
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
-
-
-def _require_range(rotate: float, exposure: float) -> None:
-    if not np.isfinite(rotate):
-        raise InputError(f"{rotate} is no angle", "light", "rotation", "give degrees")
-    if not abs(exposure) <= EXPOSURE_MAX:
-        allowed = f"give stops from {-EXPOSURE_MAX:g} to {EXPOSURE_MAX:g}"
-        raise InputError(f"{exposure} is out of range", "light", "exposure", allowed)
-
-
-def world_light(
-    radiance: np.ndarray, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
-) -> EnvironmentLight:
-    """Convert lat-long radiance (h, w, 3) to a light of at most HEIGHT rows; options as in `NewLight`."""
-    _require_range(rotate, exposure)
-    radiance = np.ascontiguousarray(radiance, dtype=np.float32)
-    if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
-        remedy = "give linear radiance (h, w, 3)"
-        raise InputError(f"{radiance.shape} is no lat-long map", "light", remedy=remedy)
-    turned: Any = mi.ScalarTransform4f()
-    if rotate % 360:
-        turned = turned.rotate([0, 0, 1], rotate)
-    if not world:
-        turned = turned.rotate(*Z_UP)
-    emitter = {"type": "envmap", "bitmap": mi.Bitmap(radiance), "to_world": turned}
-    height = min(HEIGHT, max(len(radiance) // 4 * 4, 8))
-    image = environment_image(mi.load_dict({"type": "scene", "light": emitter}), height)
-    return EnvironmentLight.from_radiance(image * np.float32(2.0**exposure))
 
 
 AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray

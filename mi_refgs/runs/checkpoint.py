@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.kernels.device import upload_tensor
-from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT
+from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT, PLACEMENT
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.kind import FittedLight, LightKind
@@ -31,7 +31,10 @@ def channels_of(params: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def light_of(kind: LightKind | None, params: Mapping[str, Any]) -> FittedLight | None:
     """The light that the object reflects, if there is one; raises InputError for a wrong shape."""
-    return None if kind is None or LIGHT not in params else kind.of(params[LIGHT])
+    if kind is None or LIGHT not in params:
+        return None
+    raw, placement = params[LIGHT], params.get(PLACEMENT)
+    return kind.of(raw) if placement is None else kind.placed(raw, placement)
 
 
 def surroundings_of(params: Mapping[str, Any]) -> Surroundings | None:

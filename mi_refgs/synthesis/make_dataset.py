@@ -35,6 +35,7 @@ from mi_refgs.io.files import write_json
 from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
 from mi_refgs.io.progress import say, with_bar
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
+from mi_refgs.shade.light.latlong import environment_image
 from mi_refgs.synthesis.ground_truth import surface_mesh
 from mi_refgs.synthesis.options import DatasetOptions, LightFile
 from mi_refgs.synthesis.pathtrace import (
@@ -42,7 +43,6 @@ from mi_refgs.synthesis.pathtrace import (
     Cameras,
     Tracer,
     bounding_sphere,
-    environment_image,
     incident_image,
     object_of,
     reach,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +12,12 @@ import numpy as np
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
-from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.latlong import OVERSAMPLING, lat_long
 from mi_refgs.synthesis.ground_truth import materials_at, triangles
 from mi_refgs.synthesis.options import DatasetOptions
 from mi_refgs.types import Color3f, Scene, Vector3f
 
 SAMPLES_PER_LAUNCH = 1 << 24  # most paths per launch; the path tracer keeps about 100 bytes for each
-ENVIRONMENT_OVERSAMPLING = 4  # directions per texel and axis of a rotated map: a small sun keeps its energy
 FILL = 0.95  # of the shorter side that the object's bounding sphere fills, unless distances are given
 BACKDROP = 2.0  # radii of the object: a flat shape that is larger is a floor or a wall
 FLAT = 0.05  # least over largest spread of the points of a flat shape: the top of a table is one
@@ -95,28 +94,6 @@ def camera_poses(
     return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
 
 
-def environment_image(scene: Scene, height: int) -> np.ndarray:
-    """Radiance (height, 2·height, 3) of the scene's environment, on the grid of Mitsuba's `envmap`. First row
-    at +y, last at -y; column 0 beside −z, turning to +x. An `envmap` of this size that is not rotated is
-    returned unchanged; finer ones are averaged."""
-    import drjit as dr
-    import mitsuba as mi
-
-    emitter = scene.environment()
-    params = mi.traverse(emitter)
-    if "data" in params and np.array_equal(np.array(params["to_world"].matrix).reshape(4, 4), np.eye(4)):
-        # Without the columns that Mitsuba adds on either side for its interpolation.
-        texels = np.array(params["data"], dtype=np.float64)[:, 1:-1, :3]
-        return (lobe_matrices.resample(texels, height) * np.array(params["scale"])).astype(np.float32)
-
-    def radiance(direction: Vector3f) -> Color3f:
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
-        si.wi = -direction
-        return emitter.eval(si)
-
-    return _panorama(radiance, height)
-
-
 def incident_image(scene: Scene, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
     """Path-traced radiance that arrives at a point (3,), on the grid of `environment_image`."""
     import drjit as dr
@@ -124,7 +101,7 @@ def incident_image(scene: Scene, point: np.ndarray, options: DatasetOptions) -> 
 
     integrator = mi.load_dict({"type": "path", "max_depth": options.max_depth})
     sampler = mi.load_dict({"type": "independent"})
-    passes = max(1, options.spp // ENVIRONMENT_OVERSAMPLING**2)
+    passes = max(1, options.spp // OVERSAMPLING**2)
     seeds = iter(np.random.SeedSequence(options.seed).generate_state(passes))
 
     def radiance(direction: Vector3f) -> Color3f:
@@ -132,25 +109,7 @@ def incident_image(scene: Scene, point: np.ndarray, options: DatasetOptions) -> 
         ray = mi.RayDifferential3f(mi.Point3f(*map(float, point)), direction)
         return integrator.sample(scene, sampler, ray)[0]
 
-    return np.mean([_panorama(radiance, options.environment_height) for _ in range(passes)], axis=0)
-
-
-def _panorama(radiance: Callable[[Vector3f], Color3f], height: int) -> np.ndarray:
-    """Radiance (height, 2·height, 3) by world direction, on the grid of `environment_image`."""
-    import drjit as dr
-    import mitsuba as mi
-
-    rows = (height - 1) * ENVIRONMENT_OVERSAMPLING + 1
-    columns = 2 * height * ENVIRONMENT_OVERSAMPLING
-    index = dr.arange(mi.UInt32, rows * columns)
-    phi = (index % columns + 0.5) * (2 * dr.pi / columns)
-    theta = (index // columns) * (dr.pi / (rows - 1))
-    direction = mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
-    # A constant emitter returns one value for all directions.
-    found = np.array(radiance(direction) + dr.zeros(mi.Float, rows * columns))
-    image = lobe_matrices.resample(found.T.reshape(rows, columns, 3), height)
-    image[[0, -1]] = image[[0, -1]].mean(axis=1, keepdims=True)  # a pole is one point
-    return image.astype(np.float32)
+    return np.mean([lat_long(radiance, options.environment_height) for _ in range(passes)], axis=0)
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import mitsuba_exr
 from mi_refgs.io.files import make_folder, read_json, write_json
+from mi_refgs.shade.light.latlong import Z_UP
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.options import LightFile
 from mi_refgs.types import Scene
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
-Z_UP = (1, 0, 0), 90.0  # axis and degrees that rotate y of a lat-long map to z
 RELIGHT = "relight"  # folder of the test views under other environment maps
 FILES = (
     "transforms_*.json",

@@ -140,7 +140,7 @@ def test_a_constant_light_learns_one_colour_and_a_known_one_none(
     assert 1e-4 < np.abs(found - 0.7).max() < 0.3
     sky = rng.uniform(0.2, 1, (8, 16, 3)).astype(np.float32)
     write_exr(tmp_path / "sky.exr", sky)
-    known = lit(tmp_path / "known", f'kind = "file"\nfile = "{tmp_path}/sky.exr"')
+    known = lit(tmp_path / "known", f'kind = "file"\nfile = "sky.exr"\nfixed = true\nworld = true', tmp_path)
     np.testing.assert_allclose(known, sky, rtol=1e-5)
-    with pytest.raises(InputError, match=r"light\.file"):
-        LIGHTS["file"]().start()
+    with pytest.raises(InputError, match=r"file: none is named"):
+        LIGHTS["file"]()

@@ -17,6 +17,7 @@ import pytest
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.io.exr import write_exr
 from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.latlong import environment_image
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.options import DatasetOptions
@@ -63,7 +64,7 @@ def test_depth_and_normals_are_those_of_the_sphere(made: Path) -> None:
 
 def test_radiance_is_that_of_the_lit_sphere(made: Path) -> None:
     data = read_loaded(made, "train", images="exr", background="black")
-    check_brightness(data, data, pathtrace.environment_image(mi.load_string(SCENE), 16))
+    check_brightness(data, data, environment_image(mi.load_string(SCENE), 16))
 
 
 def check_brightness(radiance: Dataset, shape: Dataset, light: np.ndarray) -> None:
@@ -104,7 +105,7 @@ def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
     turn = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 50)
     light = {"type": "envmap", "bitmap": mi.Bitmap(sky(64)), "to_world": turn}
     scene = mi.load_dict({"type": "scene", "e": light})
-    image = pathtrace.environment_image(scene, 64)
+    image = environment_image(scene, 64)
     copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
     directions = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(2000, 3))])
     si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
@@ -114,9 +115,7 @@ def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(seen, truth, rtol=0.02)  # beside a pole a texel is narrow
     colour = {"type": "rgb", "value": [1, 2, 3]}
     scene = mi.load_dict({"type": "scene", "e": {"type": "constant", "radiance": colour}})
-    np.testing.assert_allclose(
-        pathtrace.environment_image(scene, 4), np.full((4, 8, 3), [1, 2, 3]), rtol=1e-5
-    )
+    np.testing.assert_allclose(environment_image(scene, 4), np.full((4, 8, 3), [1, 2, 3]), rtol=1e-5)
 
 
 def test_camera_poses_are_seeded_and_evenly_spread() -> None:
@@ -289,7 +288,7 @@ def test_relit_radiance_is_that_of_its_environment(relit: Path) -> None:
         data = read_loaded(relit / "relight" / name, "test", images="exr", background="black")
         assert data.environment is not None
         lit = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(data.environment)}})
-        check_brightness(data, read_loaded(relit, "test"), pathtrace.environment_image(lit, 16))
+        check_brightness(data, read_loaded(relit, "test"), environment_image(lit, 16))
 
 
 def test_replacement_light_is_rotated_like_the_scenes_own(made: Path, tmp_path: Path) -> None:

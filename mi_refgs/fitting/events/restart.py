@@ -34,6 +34,6 @@ class Restart(Event[Trainer]):
             count, width = raw[name].shape
             raw[name] = attribute(name).start(count, width, rng, method.surfels.first(name))
         fit.tables[0].replace(Surfels.from_numpy(raw), cleared=names)
-        if LIGHT in stage.restart and method.light is not None:
+        if LIGHT in stage.restart and method.light is not None and method.light.learns:
             fit.params[LIGHT] = method.light.start()
             fit.optimiser.reset(LIGHT)

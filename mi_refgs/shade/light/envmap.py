@@ -28,6 +28,7 @@ from mi_refgs.io.exr import write_exr
 from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.kernels.timing import phase
 from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.latlong import lat_long
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
@@ -177,10 +178,21 @@ class FittedLight:
 
     def environment(self) -> EnvironmentLight:
         """The map that a run saves, which every application shows, edits and exports."""
-        directions = lobe_matrices.map_directions(DEFAULT_HEIGHT)
-        light = self.prefilter().radiance(mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)))
-        radiance = np.broadcast_to(light.numpy(), (3, directions.size // 3))  # a constant has width 1
-        return EnvironmentLight.from_radiance(radiance.T.reshape(directions.shape))
+        return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, self.saved_height))
+
+    @property
+    def saved_height(self) -> int:
+        """Rows of `environment`."""
+        return DEFAULT_HEIGHT
+
+    @property
+    def map(self) -> FittedLight:
+        """The light without the rotation and scale that `placed` gives it."""
+        return self
+
+    def placed(self, light: Light) -> Light:
+        """A lookup of `map`, as `prefilter` returns it, with the learnt rotation and scale, under AD."""
+        return light
 
     def unusable(self) -> int:
         """Number of raw values that are not < RAW_LIMIT; waits for the device."""

@@ -4,7 +4,7 @@ LIGHTS."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from mi_refgs.registry import Registry
 from mi_refgs.shade.light.envmap import EnvironmentLight, FittedLight
@@ -19,10 +19,30 @@ class LightKind:
     every: int = field(default=1, metadata={"allowed": (lambda n: n >= 1, "1 or more")})
 
     name: ClassVar[str] = ""
-    learnt: ClassVar[bool] = True  # whether a fit changes the raw values
+
+    @property
+    def learns(self) -> bool:
+        """Whether a fit changes the raw values."""
+        return True
+
+    def sized(self, pixels: int) -> Self:
+        """The settings for images of so many pixels; raises InputError if one cannot be used."""
+        return self
 
     def start(self) -> TensorXf:
         """Raw values that a fit begins with; raises InputError if a setting cannot be used."""
+        raise NotImplementedError
+
+    def columns(self) -> tuple[int, ...]:
+        """Shape of the raw values without their rows."""
+        return tuple(self.start().shape[1:])
+
+    def placement(self) -> TensorXf | None:
+        """Rotation and scale (`placed.PlacedLight`) that a fit begins with, if it learns them."""
+        return None
+
+    def placed(self, raw: TensorXf, placement: TensorXf) -> FittedLight:
+        """`of`, with a rotation and scale."""
         raise NotImplementedError
 
     def of(self, raw: TensorXf) -> FittedLight:

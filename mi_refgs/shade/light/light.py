@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
-from mi_refgs.kernels.motion import turned_by
+from mi_refgs.kernels.motion import part_of, turned_by
 from mi_refgs.types import Color3f, Float, Vector3f
 
 
@@ -26,20 +26,24 @@ class Light(Protocol):
 
 @dataclass(frozen=True)
 class RotatedLight:
-    """A light seen through a rotation or in a mirror."""
+    """A light seen through a rotation or in a mirror, and scaled."""
 
     light: Light
     light_from_world: Any  # mi.Matrix3f, detached
     motion: Float | None = None  # (3,) of `kernels.motion`, of the light in the world
+    scale: Float | None = None  # (3,) factor per channel, under AD
 
     def _inside(self, direction: Vector3f) -> Vector3f:
         return self.light_from_world @ turned_by(self.motion, mi.Vector3f(direction), -1)
 
+    def _scaled(self, colour: Color3f) -> Color3f:
+        return colour if self.scale is None else colour * mi.Color3f(part_of(self.scale, 0, colour))
+
     def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
-        return self.light.specular(self._inside(direction), roughness)
+        return self._scaled(self.light.specular(self._inside(direction), roughness))
 
     def irradiance(self, normal: Vector3f) -> Color3f:
-        return self.light.irradiance(self._inside(normal))
+        return self._scaled(self.light.irradiance(self._inside(normal)))
 
     def radiance(self, direction: Vector3f) -> Color3f:
-        return self.light.radiance(self._inside(direction))
+        return self._scaled(self.light.radiance(self._inside(direction)))
