@@ -14,8 +14,6 @@ import pytest
 
 import mi_refgs
 from mi_refgs.cli import main
-from mi_refgs.errors import InputError
-from mi_refgs.io.exr import write_exr
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -121,26 +119,3 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.radiance().numpy(), saved, rtol=1e-5)
     relit = run.relight(EnvironmentLight.constant(0.5, 8))
     assert np.isfinite(np.asarray(relit.render(0))).all()
-
-
-def lit(folder: Path, light: str) -> Any:
-    """Radiance of the light of a short fit with this table."""
-    folder.mkdir()
-    text = METHOD.replace('kind = "sun"\nelevation = 60', light)
-    assert main(train_command(write_data(folder / "data"), folder / "run", method(folder, text))) == 0
-    run: Any = mi_refgs.load(folder / "run")
-    return run.trained.light.radiance().numpy()
-
-
-def test_a_constant_light_learns_one_colour_and_a_known_one_none(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
-    found = lit(tmp_path / "constant", 'kind = "constant"\nradiance = 0.7')
-    np.testing.assert_allclose(found, np.broadcast_to(found[0, 0], found.shape), rtol=1e-5)
-    assert 1e-4 < np.abs(found - 0.7).max() < 0.3
-    sky = rng.uniform(0.2, 1, (8, 16, 3)).astype(np.float32)
-    write_exr(tmp_path / "sky.exr", sky)
-    known = lit(tmp_path / "known", f'kind = "file"\nfile = "sky.exr"\nfixed = true\nworld = true', tmp_path)
-    np.testing.assert_allclose(known, sky, rtol=1e-5)
-    with pytest.raises(InputError, match=r"file: none is named"):
-        LIGHTS["file"]()

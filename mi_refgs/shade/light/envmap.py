@@ -178,7 +178,7 @@ class FittedLight:
 
     def environment(self) -> EnvironmentLight:
         """The map that a run saves, which every application shows, edits and exports."""
-        return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, self.saved_height))
+        return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, self.saved_height, 1))
 
     @property
     def saved_height(self) -> int:

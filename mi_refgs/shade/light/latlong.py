@@ -15,10 +15,12 @@ Z_UP = (1, 0, 0), 90.0  # axis and degrees that rotate y of a lat-long map to z
 OVERSAMPLING = 4  # directions per texel and axis of a rotated map: a small sun keeps its energy
 
 
-def lat_long(radiance: Callable[[Vector3f], Color3f], height: int) -> np.ndarray:
+def lat_long(
+    radiance: Callable[[Vector3f], Color3f], height: int, oversampling: int = OVERSAMPLING
+) -> np.ndarray:
     """Radiance (height, 2·height, 3) by world direction, on the grid of `environment_image`."""
-    rows = (height - 1) * OVERSAMPLING + 1
-    columns = 2 * height * OVERSAMPLING
+    rows = (height - 1) * oversampling + 1
+    columns = 2 * height * oversampling
     index = dr.arange(mi.UInt32, rows * columns)
     phi = (index % columns + 0.5) * (2 * dr.pi / columns)
     theta = (index // columns) * (dr.pi / (rows - 1))

@@ -50,7 +50,7 @@ class PlacedLight(FittedLight):
         vector = mi.Vector3f(*about)
         angle = dr.sqrt(dr.squared_norm(vector) + SMALLEST**2)
         axis = vector * (dr.sin(0.5 * angle) / angle)
-        return mi.Matrix3f(dr.quat_to_matrix(mi.Quaternion4f(*axis, dr.cos(0.5 * angle)), size=3))
+        return dr.quat_to_matrix(mi.Matrix3f, mi.Quaternion4f(*axis, dr.cos(0.5 * angle)))
 
     def scale(self) -> Float:
         """Factor of the radiance per channel (3,)."""

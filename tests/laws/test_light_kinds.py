@@ -1,0 +1,205 @@
+"""Every kind of light × resume, render, export, edit, relight: they keep the light of the fit."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import mi_refgs
+from mi_refgs import methods
+from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.fitting.decide import differences
+from mi_refgs.fitting.objective import LossInputs, objective
+from mi_refgs.fitting.runner import Choice, chosen
+from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.exr import write_exr
+from mi_refgs.methods.method import LIGHT, PLACEMENT
+from mi_refgs.render.pipeline import Request, SurfelScene, render
+from mi_refgs.runs.checkpoint import PARAMS
+from mi_refgs.runs.run import Run
+from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.shade.light import lobe_matrices
+from mi_refgs.shade.light.maps import LARGEST_HEIGHT, Learnt
+from mi_refgs.shade.light.placed import PlacedLight
+from tests.helpers import refused, unit
+from tests.helpers import vector as vector3
+from tests.scenes.tiny import METHOD, SETTINGS, train_command, write_data, write_open_data
+
+FILE = 'kind = "file"\nfile = "sky.exr"\nworld = true\n'
+PHOTOGRAPHS = """[surroundings]
+degree = 1
+[event.photograph_light]
+when = { start = 0, until = 6, every = 2 }
+[loss]
+photographed = 1.0
+"""
+KINDS = {  # the table [light], and what else the method has
+    "learnt": "height = 8\n",
+    "constant": 'kind = "constant"\nradiance = 0.7\n',
+    "initial": FILE + "height = 8\n",
+    "fixed": "every = 2\nradiance = 0.8\n",  # by options of the command line
+    "placed": FILE + 'fixed = true\nrotate = 20\nlearn = ["rotation", "colour"]\n',
+    "photographed": "height = 8\n" + PHOTOGRAPHS,  # whose light is near, too
+}
+SKY = np.linspace(0.1, 2, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32)  # the map of the tiny data set
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def fitted(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """A kind, and the folder of a short fit with it."""
+    folder, kind = tmp_path_factory.mktemp(request.param), request.param
+    write_exr(folder / "sky.exr", SKY)
+    (folder / "own.toml").write_text(METHOD.replace("height = 8\n", KINDS[kind]))
+    data = (write_open_data if kind == "photographed" else write_data)(folder / "data")
+    options = {
+        "fixed": ["--light-fixed", "--light", str(data / "environment.exr")],
+        "photographed": ["--set", "surroundings.count=60", "surroundings.max_count=90"],
+    }
+    command = train_command(data, folder / "run", folder / "own.toml")
+    assert main([*command, *options.get(kind, [])]) == 0
+    (folder / "sky.exr").unlink()  # a run has all of its light
+    return kind, folder
+
+
+def radiance(light: Any) -> np.ndarray:
+    return np.asarray(light.environment().radiance().numpy())
+
+
+def state_of(run: Path) -> dict[str, Any]:
+    state = Run(run).load_checkpoint()
+    assert state is not None
+    return state
+
+
+def test_a_run_saves_what_was_fitted(fitted: tuple[str, Path]) -> None:
+    kind, folder = fitted
+    run: Any = mi_refgs.load(folder / "run")
+    assert run.method.light.every == (2 if kind == "fixed" else 1)
+    saved, state = radiance(run.trained.light), state_of(folder / "run")
+    scene: Any = TrainedScene.from_state(run.method, state)
+    np.testing.assert_allclose(saved, radiance(scene.light), rtol=1e-5)
+    assert (run.trained.near is not None) == (scene.near is not None) == (kind == "photographed")
+    if kind == "constant":
+        np.testing.assert_allclose(saved, np.broadcast_to(saved[0, 0], saved.shape), rtol=1e-5)
+    if kind == "fixed":
+        np.testing.assert_allclose(saved, SKY, rtol=1e-5)
+    elif kind == "initial":
+        assert 1e-4 < np.abs(saved - SKY).max() < 0.5
+    placement = state.get(PARAMS + PLACEMENT)
+    assert (placement is not None) == (kind == "placed")
+    if placement is not None:
+        assert np.all(np.abs(placement) > 1e-4) and np.all(np.abs(placement) < 0.2)
+
+
+def test_resumed_fits_repeat(fitted: tuple[str, Path], tmp_path: Path) -> None:
+    _, folder = fitted
+    shutil.copytree(folder / "run", tmp_path / "run")
+    newest = Run(tmp_path / "run").checkpoints()[-1]
+    newest.unlink()
+    assert main(["train", str(folder / "data"), "-o", str(tmp_path / "run"), "--resume"]) == 0
+    before, after = state_of(folder / "run"), state_of(tmp_path / "run")
+    for name in [name for name in before if LIGHT in name]:
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-3, atol=1e-5, err_msg=name)
+
+
+def test_commands_keep_the_light(fitted: tuple[str, Path], tmp_path: Path) -> None:
+    kind, folder = fitted
+    run: Any = mi_refgs.load(folder / "run")
+    light = run.trained.light
+    image = np.array(mi.render(mi.load_file(str(folder / "run" / "scene.xml")), spp=1))
+    np.testing.assert_allclose(image, run.render(0), atol=2e-3)
+    edited = run.edit(set={"roughness": 0.3}).save(tmp_path / "edited").trained
+    np.testing.assert_allclose(radiance(edited.light), radiance(light), rtol=1e-5)
+    assert (edited.near is not None) == (edited.surroundings is not None) == (kind == "photographed")
+    relit = run.relight(light).trained
+    np.testing.assert_allclose(radiance(relit.light), radiance(light), rtol=1e-5)
+    assert relit.near is None
+
+
+def test_height_follows_the_size_of_images(tmp_path: Path) -> None:
+    """From the images of the presets on, and wherever a method says it, as ever; a run keeps its own."""
+    rows = [Learnt().sized(side**2).height for side in (20, 96, 128, 162, 400)]
+    assert rows == [16, 76, 104, LARGEST_HEIGHT, LARGEST_HEIGHT]
+    assert Learnt(height=8).sized(96**2).height == 8
+    (tmp_path / "own.toml").write_text(METHOD.replace("height = 8\n", ""))
+    data, own, said = write_data(tmp_path / "data"), str(tmp_path / "own.toml"), []
+    method, _ = chosen(data, Choice(own, "quick"), said.append)
+    assert method.light == Learnt(height=16) and "16 rows" in said[0]
+    Run(tmp_path / "run").create(method, str(data))
+    assert differences(Run(tmp_path / "run"), methods.load(own, "quick")) == {}
+
+
+def test_what_no_light_can_be(tmp_path: Path) -> None:
+    data, learns = write_data(tmp_path / "data"), ["light.kind=file", "light.file=a", "light.learn=['scale']"]
+    refused(lambda: methods.load("ref_gaussian", "quick", learns), "add fixed = true")
+    refused(lambda: methods.load("ref_gaussian", "quick", learns[:1]), "light: file: none is named")
+    command = ["train", str(data), "-o", str(tmp_path / "run"), "--method", "base_2dgs"]
+    refused([*command, "--light", str(data / "environment.exr")], "light: no stage uses it")
+    refused([*command, "--light-fixed"], "light_fixed: no map is given")
+
+
+PLACEMENT_AT = np.array([[0.3, -0.2, 0.5, 0.1, 0.2, -0.3]], np.float32)
+
+
+def test_placed_light_is_the_map_turned_and_scaled() -> None:
+    """In lookups, and in the map that a run saves."""
+    raw = mi_refgs.EnvironmentLight.from_radiance(
+        np.tile(np.linspace(0.1, 1, 16)[:, None, None], (1, 32, 3))
+    ).raw
+    for learn, vector, scale in (
+        (("rotation", "colour"), PLACEMENT_AT[0, :3], PLACEMENT_AT[0, 3:]),
+        (("azimuth", "scale"), [0, 0, 0.5], [0.1, 0.1, 0.1]),
+    ):
+        light = PlacedLight(raw, mi.TensorXf(PLACEMENT_AT), learn)
+        d = unit(np.random.default_rng(1).normal(size=(200, 3)))
+        expected = np.exp(scale) * light.map.unfiltered().radiance(vector3(d)).numpy().T
+        turned = Rotation.from_rotvec(vector).apply(d)
+        for found in (light.unfiltered(), light.environment().unfiltered()):
+            np.testing.assert_allclose(found.radiance(vector3(turned)).numpy().T, expected, atol=0.01)
+
+
+def test_derivatives_of_rotation_and_scale_with_other_losses(tmp_path: Path) -> None:
+    """Of the objective without L1, which has kinks, against central differences; at 0 too."""
+    sky = 0.6 + 0.3 * lobe_matrices.map_directions(16)
+    write_exr(tmp_path / "sky.exr", sky.astype(np.float32))
+    (tmp_path / "own.toml").write_text(METHOD.replace("height = 8\n", KINDS["placed"]))
+    more = [
+        "loss.ssim=1",
+        "loss.smooth=0.1",
+        "loss.half_metal=0.1",
+        "loss.normal=0.1",
+        "surfels.initial={metallic=0.9}",
+    ]
+    method = methods.load(str(tmp_path / "own.toml"), "quick", [*SETTINGS, *more])
+    trainer = Trainer(method, read_dataset(write_data(tmp_path / "data"), "train"))
+    trainer.train()
+    target, fit = trainer.targets.at(6, 0), trainer.fit
+
+    def objective_at(numbers: np.ndarray) -> tuple[Any, Any]:
+        fit.params[PLACEMENT] = mi.TensorXf(numbers.astype(np.float32))
+        dr.enable_grad(fit.params[PLACEMENT])
+        shading = trainer.shading()
+        light = shading.light_of(fit.light)
+        frame = render(
+            SurfelScene(fit.surfels, shading, light, fit.occluder), target.camera, Request(("normal",))
+        )
+        return fit.params[PLACEMENT], objective(
+            LossInputs.of(frame, target, trainer.data, light), method.loss, 6
+        )[0]
+
+    for at in (PLACEMENT_AT, np.zeros((1, 6))):
+        leaf, loss = objective_at(at)
+        dr.backward(loss)
+        found, steps = dr.grad(leaf).numpy()[0], 0.05 * np.eye(6)[:, None]
+        sides = [[float(objective_at(at + sign * step)[1][0]) for sign in (1, -1)] for step in steps]
+        expected = np.array([(above - below) / 0.1 for above, below in sides])
+        for part in (slice(0, 3), slice(3, 6)):
+            np.testing.assert_allclose(found[part], expected[part], atol=0.03 * np.abs(expected[part]).max())
