@@ -36,6 +36,7 @@ from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import MODEL
 from mi_refgs.runs.views import downscaled, lit, read_views, sized, with_region
+from mi_refgs.shade.light.placed import PlacedLight
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
 Tell = Callable[[str], None]  # is called with sentences for the user
@@ -269,6 +270,8 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     if POSE in params:
         poses = [camera_of(setup, params, i).pose().tolist() for i in range(len(names))]
         run.write_json(CAMERAS, {"to_world": dict(zip(names, poses, strict=True))})
+    if isinstance(light := trainer.fit.light, PlacedLight):
+        run.write_json("light.json", light.record())
     if trainer.fit.region is not None:
         run.write_dataset(str(trainer.data.path.resolve()), trainer.fit.region)
     warning, camera = None, trainer.camera(0)

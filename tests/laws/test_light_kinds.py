@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,10 @@ def test_a_run_saves_what_was_fitted(fitted: tuple[str, Path]) -> None:
     assert (placement is not None) == (kind == "placed")
     if placement is not None:
         assert np.all(np.abs(placement) > 1e-4) and np.all(np.abs(placement) < 0.2)
+        found = json.loads((folder / "run" / "light.json").read_text())
+        turn = Rotation.from_rotvec(placement[0, :3]).as_matrix()
+        np.testing.assert_allclose(found["world_from_map"], turn, atol=1e-5)
+        np.testing.assert_allclose(found["scale"], np.exp(placement[0, 3:]), atol=1e-5)
 
 
 def test_resumed_fits_repeat(fitted: tuple[str, Path], tmp_path: Path) -> None:

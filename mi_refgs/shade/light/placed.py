@@ -60,6 +60,11 @@ class PlacedLight(FittedLight):
             return dr.opaque(mi.Float, 1, 3)
         return dr.exp(dr.gather(mi.Float, self.placement.array, mi.UInt32(used)))
 
+    def record(self) -> dict[str, list[float]]:
+        """Rotation matrix from the map to the world, row by row, and scale per channel."""
+        turn = np.array(self.rotation(), np.float64).reshape(3, 3)
+        return {"world_from_map": turn.round(6).tolist(), "scale": self.scale().numpy().round(6).tolist()}
+
     def prefilter(self) -> Light:
         return self.placed(self.map.prefilter())
 
