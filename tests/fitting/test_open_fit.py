@@ -472,9 +472,9 @@ def test_images_without_alpha_have_a_method_of_their_own(
 
     monkeypatch.setattr(READERS, "values", counted)
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
-    assert method.name == without and bool(said) == (without != purpose)
+    assert method.name == without and any(without in text for text in said) == (without != purpose)
     assert len(reads) == 1 and views.split == "train"
     monkeypatch.undo()
     objects = write_data(tmp_path, views=3, truth=False)
-    assert chosen(objects, Choice(purpose=purpose), pytest.fail)[0].name == alpha
+    assert chosen(objects, Choice(purpose=purpose))[0].name == alpha
     assert method.surroundings is not None and isinstance(method.event["photograph_light"], PhotographLight)
