@@ -19,17 +19,7 @@ from mi_refgs.fitting.events import place
 from mi_refgs.fitting.optim import LearningRate
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.event import EVENTS, Event
-from mi_refgs.methods.method import (
-    AROUND,
-    BACKGROUND,
-    GAIN,
-    LIGHT,
-    PER_VIEW,
-    PLACEMENT,
-    POSE,
-    Method,
-    Rates,
-)
+from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, PLACEMENT, POSE, Method, Rates
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.light.kind import FittedLight

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.kernels.motion import motion_of
 from mi_refgs.shade.light.envmap import EnvironmentLight, FittedLight
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.types import Float, TensorXf
@@ -38,8 +39,9 @@ class PlacedLight(FittedLight):
 
     def placed(self, light: Light) -> RotatedLight:
         turn, scale = self.rotation(), self.scale()
-        dr.eval(turn, scale)  # lookups may be in a loop, which cannot evaluate
-        return RotatedLight(light, turn.T, scale)
+        motion = motion_of(turn)
+        dr.eval(turn, motion, scale)  # lookups may be in a loop, which cannot evaluate
+        return RotatedLight(light, dr.detach(turn).T, motion, scale)
 
     def rotation(self) -> Any:
         """Matrix from directions in the map to the world, mi.Matrix3f."""
