@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from mi_refgs.errors import InputError, UnknownNameError, abbreviated
 
@@ -46,7 +46,7 @@ class Registry(Mapping[str, T], Generic[T]):
         check: Callable[[T], None] = lambda item: None,
         package: str | None = None,
         *,
-        of: type = object,
+        of: type[Any] = object,
         classes: bool = False,
         newest_first: bool = False,
     ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 import sys
 import time
 from dataclasses import dataclass
@@ -104,7 +103,7 @@ class Compare:
             what = f"{' '.join(self.seeds)}: not integers"
             raise InputError(what, "--seeds", remedy="write them as 0 1") from error
         preset, settings = self.preset or DEFAULT_PRESET, tuple(joined(self.set))
-        plugins = tuple(os.path.abspath(file) for file in self.common.plugin)
+        plugins = tuple(str(file.absolute()) for file in self.common.plugin)
         shared = jobs.Shared(preset, settings, self.common.mitsuba_variant, threads, plugins)
         planned = jobs.plan(self.output, self.data, methods, seeds, shared)
         jobs.begin(self.output, planned, workers, sys.argv[1:])

@@ -9,7 +9,6 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
-from mi_refgs.errors import InputError
 from mi_refgs.registry import Registry
 
 
@@ -42,13 +41,6 @@ class Initialiser:
     start: Callable[[Wanted], Start | None]  # None: not with these data
 
 
-def _check(initialiser: Initialiser) -> None:
-    if not callable(initialiser.start):
-        raise InputError("start is no function", "initialiser", initialiser.name, "give one of `Wanted`")
-
-
-INITIALISERS = Registry[Initialiser](
-    "initialiser", _check, package="mi_refgs.fitting.initialisers", of=Initialiser
-)
+INITIALISERS = Registry("initialiser", package="mi_refgs.fitting.initialisers", of=Initialiser)
 register = INITIALISERS.register
 """Add an initialiser, which methods can name from then on."""

@@ -31,8 +31,6 @@ def _check(loss: Loss[Any]) -> None:
     if not re.fullmatch("[A-Za-z0-9_-]+", loss.name):
         what = f"'{loss.name}' has characters besides letters, digits, _ and -"
         raise InputError(what, "loss", remedy="choose another name")
-    if not callable(loss.value):
-        raise InputError("value is no function", "loss", loss.name, "give one of `LossInputs`")
 
 
 LOSSES = Registry[Loss[Any]]("loss", _check, package="mi_refgs.fitting.objective", of=Loss)

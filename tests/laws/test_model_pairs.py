@@ -38,7 +38,8 @@ from tests.scenes.integrator import raw_channels, sky, two_balls
 from tests.scenes.tiny import METHOD, train_command, write_data
 
 COAT = Path(__file__).parents[1] / "scenes" / "coat.py"
-FIT_ONLY, NEEDED = (LOSSES, EVENTS, INITIALISERS), (MODELS, ATTRIBUTES, LIGHTS)
+FIT_ONLY: list[Any] = [LOSSES, EVENTS, INITIALISERS]
+NEEDED: list[Any] = [MODELS, ATTRIBUTES, LIGHTS]
 OWN = METHOD.replace('indirect_sh"]', 'indirect_sh", "coat"]\nstart = ["nowhere", "random"]')
 OWN = OWN.replace("[light]", '[light]\nkind = "sky"').replace("0\nat =", '0\nreflectance = "coated"\nat =')
 OWN += "[event.rest]\n[loss]\nthin = 0.01\n"
@@ -183,16 +184,23 @@ def test_a_run_whose_plugin_is_not_loaded_names_it(command: str, place: Path) ->
     refused([name, *given, *options], run, "'sky' is unknown", f"add --plugin {COAT}, or import it")
 
 
-def test_what_a_fit_needs_is_needed_to_continue_it(place: Path, coat: None) -> None:
-    command = ["train", place / "data", "-o", place / "coated", "--resume"]
-    refused(command, "surfels.start: 'nowhere' is unknown", f"add --plugin {COAT}")
+def test_what_is_missing_is_named_wherever_it_is_read(place: Path, coat: None, tmp_path: Path) -> None:
+    """What only a fit needs, when it goes on; else the model in model.json, attributes in checkpoints."""
+    fit = ["train", place / "data", "-o", place / "coated", "--resume"]
+    refused(fit, "surfels.start: 'nowhere' is unknown", f"add --plugin {COAT}")
+    forget(MODELS)
+    export = ["export", place / "coated", "-o", tmp_path / "out"]
+    refused(["render", place / "coated", "-o", "x.exr"], "model.json: ", "'coated' is unknown", COAT)
+    forget(ATTRIBUTES)
+    refused(export, ".npz: surfels: 'coat' is unknown", f"add --plugin {COAT}")
 
 
-@pytest.mark.parametrize("one", [registry_.kind for registry_ in (*FIT_ONLY, *NEEDED)])
-def test_what_is_no_such_thing_is_refused_at_registration(one: str) -> None:
-    [chosen] = [known for known in (*FIT_ONLY, *NEEDED) if known.kind == one]
-    for wrong in (len, Surfels, MODELS["radiance"] if chosen is not MODELS else type(MODELS["radiance"])):
-        refused(partial(chosen.register, wrong), f"{one}: ", "cannot be registered; give ")
+def test_what_is_no_such_thing_is_refused_at_registration() -> None:
+    """A function; a class in place of an object, or an object in place of a class; a class that is none."""
+    for known in (*FIT_ONLY, *NEEDED):
+        one: Any = next(iter(known.values()))
+        for wrong in (len, type(one) if not isinstance(one, type) else object(), Surfels):
+            refused(partial(known.register, wrong), f"{known.kind}: ", "cannot be registered; give ")
 
 
 def test_entry_points_are_loaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
