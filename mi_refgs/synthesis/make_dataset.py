@@ -1,22 +1,8 @@
-"""Path tracing of a multi-view data set of a Mitsuba scene: images, maps, environment, surface and cameras.
+"""Path tracing of a multi-view data set of a Mitsuba scene: the files that docs/formats.md lists.
 
-A data set folder contains
-
-    transforms_train.json, transforms_test.json   cameras in the Blender / NeRF convention, written last
-    train/r_000.png    RGBA, 8 bit: straight alpha, colour = sRGB(radiance / alpha), clipped
-    train/r_000.exr    RGBA, float32, linear: premultiplied radiance and alpha
-    train/r_000_NAME.exr   maps at pixel centres, 0 off the object: normal (X, Y, Z: unit, world space,
-                       towards the camera), depth (Y: along the viewing axis), and with A = 1 where the BSDF
-                       defines them albedo (R, G, B, A), roughness (Y, A: √α of GGX) and metallic (Y, A)
-    environment.exr    lat-long radiance of the environment for a Mitsuba `envmap` without `to_world`; in an
-                       open scene the radiance that arrives at the object's centre without the object
-    surface.ply        triangles of all shapes, world space
-    region.json        only for an open scene: a sphere around the object
-    relight/NAME/      the test views under another environment map, a data set with a test split
-    dataset.json       the settings, which decide whether a folder may be resumed; and other environment maps
-
-An open scene is an object in its surroundings: images are RGB without alpha, maps and surface are those of
-the object only, and so are relit views, which have alpha."""
+Of an object among other shapes, images are RGB without alpha, and maps and surface are those of the object.
+The transforms are written last. dataset.json has the settings, which decide whether a folder is continued.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +83,6 @@ def make_dataset(
         what = f"the object is {_names(shapes)}; around it: {_names(around)}; lamps do not count"
         say(f"{scene.name}: {what}; `--object ID …` decides")
     about = about or (shapes if around else [])
-    lit = loaded if given.light is None else under_light(loaded, Path(given.light))
     relit = [under_light(loaded, other.path, about) for other in others]
     cameras = Cameras(given, centre, radius, farthest, about)
     x, y, z = (float(c) for c in centre)
@@ -111,7 +96,7 @@ def make_dataset(
     if not (out / SURFACE).exists():
         voxel = 2 * radius / SURFACE_VOXELS
         write_mesh(out / SURFACE, Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel))
-    tracer = Tracer(lit, cameras)
+    tracer = Tracer(loaded, cameras)
     write_views(out, ("train", "test"), tracer, MAPS, progress)
     for other, scene_there in zip(others, relit, strict=True):
         alone = Tracer(scene_there, replace(cameras, objects=()))

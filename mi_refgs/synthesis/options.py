@@ -68,8 +68,6 @@ class DatasetOptions:
     """largest path depth"""
     environment_height: Annotated[int, Suppress] = 256
     """rows of environment.exr; 0 writes none"""
-    light: Annotated[str | Path | None, optional(metavar="ENV")] = None
-    """lat-long map (EXR, HDR) instead of the scene's environment map, rotated as that is"""
 
     @property
     def resolution(self) -> tuple[int, int]:
@@ -98,7 +96,6 @@ class DatasetOptions:
 
     def record(self, scene: Path) -> dict[str, Any]:
         """The content of dataset.json."""
-        light = None if self.light is None else LightFile.of(Path(self.light))
         width, height = self.resolution
         values = vars(self) | {
             "scene": scene.name,
@@ -106,8 +103,6 @@ class DatasetOptions:
             "test_views": self.count("test"),
             "size": width,
             "height": 0 if height == width else height,
-            "light": "" if light is None else light.path.name,
-            "light_sha256": "" if light is None else light.sha256,
             "distance": self.distance or (0, 0),
         }
         content: dict[str, Any] = json.loads(json.dumps(values))  # tuples become lists

@@ -117,7 +117,7 @@ def prepare_folder(
 def _option(field: str) -> str:
     """The option of `refgs dataset` that sets a field, or the scene file."""
     names = {"scene": "the scene file", "scene_sha256": "the scene file", "height": "--size"}
-    names |= {"light_sha256": "--light", "objects": "--object", "spp": "--samples"}
+    names |= {"objects": "--object", "spp": "--samples"}
     return names.get(field) or f"--{field.replace('_', '-')}"
 
 

@@ -85,11 +85,8 @@ def test_terms_add_up_and_radiance_needs_no_light() -> None:
 def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
     """A directional light and a constant one."""
     sky = {"type": "constant", "radiance": 0.3}
-    sun = {
-        "type": "directional",
-        "direction": [-1, -1, -0.5],
-        "irradiance": {"type": "rgb", "value": [3, 2, 1]},
-    }
+    warm = {"type": "rgb", "value": [3, 2, 1]}
+    sun = {"type": "directional", "direction": [-1, -1, -0.5], "irradiance": warm}
 
     def lit(**emitters: dict) -> mi.Scene:
         inner = integrator(diffuse="irradiance")
