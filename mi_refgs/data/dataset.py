@@ -9,8 +9,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -160,7 +161,7 @@ def make_view(
 class Dataset:
     """The views of one split."""
 
-    path: Path
+    path: Path  # its folder; of one in memory only a name
     split: str
     views: tuple[View, ...]
     background: np.ndarray  # (3,) float32, in the colour space of the images
@@ -172,6 +173,27 @@ class Dataset:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # subtracted from all positions of the files
     unknown: PixelRays | None = None  # pixels whose depth stereo has not found; None: it has not been tried
     downscale: int = 1  # side of the blocks of pixels that are averaged
+
+    @staticmethod
+    def from_mitsuba(scene: Any, sensors: Any = None, **options: Any) -> Dataset:
+        """Path-trace views of a Mitsuba scene in memory: what `make_dataset` writes, and a fit takes.
+
+        scene: an `mi.Scene` or its file. sensors: Mitsuba sensors or `Camera`s, a number of views around the
+        object, or None for the sensors of the scene. Images are linear radiance (H, W, 3) over white with
+        alpha, without visible emitters; normals, depth and materials are at pixel centres.
+        options: split ("train", or "test" for other cameras and seeds), maps (True: with normals, depth and
+        materials), spp, seed, max_depth, and for views around the object size, fov, distance,
+        elevation, azimuth, as in `DatasetOptions`. Raises InputError as `make_dataset` does, and for a sensor
+        that is no pinhole.
+        """
+        # By name, as a registry finds what is registered: `synthesis` imports this module.
+        made: Dataset = import_module("mi_refgs.synthesis.in_memory").traced(scene, sensors, **options)
+        return made
+
+    @property
+    def folder(self) -> str | None:
+        """The folder that a run records, from which commands read views again; None in memory."""
+        return str(self.path.resolve()) if self.path.is_dir() else None
 
     @property
     def has_alpha(self) -> bool:

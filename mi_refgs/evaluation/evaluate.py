@@ -43,7 +43,9 @@ MEANS = """psnr psnr_gain psnr_registered ssim flip lpips psnr_region ssim_regio
     normal_mae_deg_full""".split()  # scores of views whose means are reported
 
 
-def evaluate(run: Run, data: Path | None = None, progress: bool = False, samples: int = 1) -> dict[str, Any]:
+def evaluate(
+    run: Run, data: Path | Dataset | None = None, progress: bool = False, samples: int = 1
+) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and a contact sheet.
 
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.

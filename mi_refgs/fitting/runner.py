@@ -91,7 +91,7 @@ class Progress:
         """Is called after the last step, and when the fit is interrupted or fails."""
 
 
-def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Progress) -> Trainer:
+def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, progress: Progress) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
 
     resume: continue the run in the folder; the choice has to be the run's own.
@@ -110,16 +110,17 @@ def fit(data: Path, output: Path, choice: Choice, *, resume: bool, progress: Pro
         method, views = chosen(data, choice, progress.say)
         method.require_registered()
     if note := few_views(len(views.views)):
-        progress.warn(f"{data}: {note}")
+        progress.warn(f"{views.path}: {note}")
     if not views.has_alpha and (method.surroundings is None or views.region is None):
-        progress.warn(f"{data}: images without alpha: surfels start at random, and model the background too")
+        what = "surfels start at random, and model the background too"
+        progress.warn(f"{views.path}: images without alpha: {what}")
     with run.alone():
         if not resume:  # asked again: another process may have begun a run while the data was read
             run.require_none()
         return _fit(method, views, run, progress)
 
 
-def chosen(data: Path, choice: Choice, say: Tell = lambda _: None) -> tuple[Method, Dataset]:
+def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> tuple[Method, Dataset]:
     """The method of a new fit, with the size of images decided, and the training views.
 
     Without a name, images without alpha have `about.without_alpha` of the method. Raises InputError for an
@@ -135,7 +136,7 @@ def chosen(data: Path, choice: Choice, say: Tell = lambda _: None) -> tuple[Meth
     reads, views = downscaled(load_method(named, choice.preset, of_images), data, say)
     name = _for_images(named, reads, views)
     if name != named:
-        say(f"{data}: images without alpha: fitted with their background, by --method {name}")
+        say(f"{views.path}: images without alpha: fitted with their background, by --method {name}")
     method = load_method(name, choice.preset, choice.settings)
     return lit(method.downscaled(views.downscale), views, say), views
 
@@ -147,10 +148,10 @@ def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:
 
 def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Trainer:
     """Train to the last iteration and write the artefacts, with the run locked."""
-    data, output, resumed = views.path, run.path, run.exists()
+    output, resumed = run.path, run.exists()
     trainer = begin(method, views, run, progress.say, progress.warn)
     if resumed:
-        _record_data(run, data, progress)  # what cannot be resumed with it has been refused
+        _record_data(run, views, progress)  # what cannot be resumed with it has been refused
         progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
 
     progress.begin(trainer)
@@ -160,7 +161,7 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Traine
         kept = "" if run.checkpoints() else " (before the first iteration was done)"
         raise type(error)(
             f"interrupted at iteration {trainer.iteration}{kept}; "
-            f"resume with: refgs train {data} -o {output} --resume"
+            f"resume with: refgs train {views.folder or 'DATA'} -o {output} --resume"
         ) from None
     except InputError as error:  # a full disk, no surfel left
         saved = run.checkpoints()
@@ -208,7 +209,7 @@ def begin(
     if resumed:
         run.rewind(trainer.iteration)
     else:
-        run.create(method, str(views.path.resolve()), views.region)
+        run.create(method, views.folder, views.region)
         if len(views.views) < HOLDOUT and (names := waiting(trainer)):
             few = f"{len(views.views)} views: too few to hold some out"
             tell(f"{views.path}: {few}, so {' and '.join(names)} are not decided")
@@ -273,10 +274,11 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     if isinstance(light := trainer.fit.light, PlacedLight):
         run.write_json("light.json", light.record())
     if trainer.fit.region is not None:
-        run.write_dataset(str(trainer.data.path.resolve()), trainer.fit.region)
+        run.write_dataset(trainer.data.folder, trainer.fit.region)
     warning, camera = None, trainer.camera(0)
     try:
-        camera = read_views(trainer.method, trainer.data.path, "test").views[0].camera()
+        if trainer.data.folder is not None:
+            camera = read_views(trainer.method, trainer.data.path, "test").views[0].camera()
     except InputError as error:
         warning = f"{error} (scene.xml gets a training camera, and `refgs eval` will need test views)"
     write_if_stale(run, trainer.method, lambda _: camera)
@@ -311,9 +313,9 @@ def _require_same(run: Run, made: Method, choice: Choice, views: Dataset) -> Non
         )
 
 
-def _record_data(run: Run, data: Path, progress: Progress) -> None:
+def _record_data(run: Run, data: Dataset, progress: Progress) -> None:
     """Record another data set, with a warning: commands that follow read that of the last fit."""
     before = run.dataset()
-    if before is not None and before.resolve() != data.resolve():
-        progress.warn(f"{run.path}: was fitted to {before.resolve()} before, now to {data}")
-        run.write_dataset(str(data.resolve()), run.region())
+    if before is not None and str(before.resolve()) != data.folder:
+        progress.warn(f"{run.path}: was fitted to {before.resolve()} before, now to {data.path}")
+        run.write_dataset(data.folder, run.region())

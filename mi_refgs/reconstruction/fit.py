@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs import methods
+from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, panels
 from mi_refgs.fitting import runner
@@ -26,7 +27,7 @@ PSNR_MEMORY = 0.9  # weight of the old value in the running PSNR of the bar
 
 
 def fit(
-    data: str | Path,
+    data: str | Path | Dataset,
     method: str | Path | Method | None = None,
     *,
     preset: str | None = None,
@@ -40,6 +41,9 @@ def fit(
 ) -> Reconstruction:
     """Fit surfels, materials and an environment map to the images in folder `data`, as `refgs train` does.
 
+    data: or the training views in memory, `Dataset.from_mitsuba` or those of `read_dataset` after a change.
+    The run of one that no folder has does not keep it: give its test views to `evaluate`, and a folder to
+    commands (--data).
     method: a method of the package (`variants/`), the path of a .toml, or a `Method`; None fits what the
     scene needs of the full method (`auto`), and to images without alpha background Gaussians too. preset: how
     long, "quick", "standard" (the default), "paper", or iterations and largest number of surfels,
@@ -68,10 +72,12 @@ def fit(
         output = temporary.path
         listener.say(f"{output}: the run, removed with its last Reconstruction; `save` keeps one")
     try:
-        settings = [*_light_settings(light, light_fixed, Path(data)), *methods.assignments(settings)]
+        source = data if isinstance(data, Dataset) else Path(data)
+        folder = source.path if isinstance(source, Dataset) else source
+        settings = [*_light_settings(light, light_fixed, folder), *methods.assignments(settings)]
         named = str(method) if isinstance(method, Path) else method
         choice = runner.Choice(named, preset, settings, purpose)
-        runner.fit(Path(data), Path(output), choice, resume=resume, progress=listener)
+        runner.fit(source, Path(output), choice, resume=resume, progress=listener)
     except KeyboardInterrupt:
         if temporary is not None:
             temporary.remove.detach()  # keeps the checkpoints, from which the fit can be resumed

@@ -256,14 +256,14 @@ class Reconstruction:
         return replace(self, trained=trained, folder=None)
 
     def evaluate(
-        self, data: str | Path | None = None, *, samples: int = 1, progress: bool = False
+        self, data: str | Path | Dataset | None = None, *, samples: int = 1, progress: bool = False
     ) -> dict[str, Any]:
-        """Measure the run on its test views, or on those of `data`, as `refgs eval` does.
+        """Measure the run on its test views, or on those of `data`, a folder or in memory, as `refgs eval`.
 
         Raises InputError for a reconstruction in memory, and as `evaluation.evaluate.evaluate` does."""
         if self.folder is None:
             raise InputError("only in memory", "evaluate", "folder", "measure what save(folder) returns")
-        data = None if data is None else Path(data)
+        data = Path(data) if isinstance(data, str) else data
         return evaluation.evaluate(Run(self.folder), data, progress, samples)
 
 

@@ -80,15 +80,15 @@ class Run:
         except BusyError:
             return True
 
-    def create(self, method: Method, dataset: str, region: Region | None = None) -> None:
-        """Start a run on the data set in folder `dataset`; raises InputError as `require_none` does."""
+    def create(self, method: Method, dataset: str | None, region: Region | None = None) -> None:
+        """Start a run on the data set in folder `dataset`, None in memory; raises as `require_none`."""
         self.require_none()
         own_folder(self.path, RUN)
         self._make_folders()
         self.write_dataset(dataset, region)
         self.write_method(method)
 
-    def write_dataset(self, dataset: str, region: Region | None) -> None:
+    def write_dataset(self, dataset: str | None, region: Region | None) -> None:
         record = {"path": dataset} | ({} if region is None else {"region": region.content})
         write_bytes(self.path / DATASET, json.dumps(record).encode())
 

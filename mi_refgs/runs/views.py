@@ -20,14 +20,16 @@ from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.shade.light.maps import Map
 
 
-def sized(method: Method, path: Path, tell: Callable[[str], None] = lambda _: None) -> tuple[Method, Dataset]:
+def sized(
+    method: Method, path: Path | Dataset, tell: Callable[[str], None] = lambda _: None
+) -> tuple[Method, Dataset]:
     """The method with its image size (`downscaled`) and size of the light (`lit`) decided, and the views."""
     method, views = downscaled(method, path, tell)
     return lit(method, views, tell), views
 
 
 def downscaled(
-    method: Method, path: Path, tell: Callable[[str], None] = lambda _: None
+    method: Method, path: Path | Dataset, tell: Callable[[str], None] = lambda _: None
 ) -> tuple[Method, Dataset]:
     """The method with its image size decided, and training views without ground truth: `data.downscale`, or
     the least for its preset's pixels, which calls `tell`. Raises InputError as `read_dataset` does."""
@@ -37,7 +39,7 @@ def downscaled(
         first = views.views[0]
         file = first.file or first
         tell(
-            f"{path}: images of {file.width} × {file.height} pixels are read as {first.width} × "
+            f"{views.path}: images of {file.width} × {file.height} pixels are read as {first.width} × "
             f"{first.height}; preset {method.preset} takes {pixels:,} pixels at most, --set "
             f"data.downscale=1 reads them whole"
         )
@@ -56,9 +58,14 @@ def lit(method: Method, views: Dataset, tell: Callable[[str], None] = lambda _: 
 
 
 def read_views(
-    method: Method, path: Path, split: str, truth: bool = True, pixels: int = sys.maxsize
+    method: Method, path: Path | Dataset, split: str, truth: bool = True, pixels: int = sys.maxsize
 ) -> Dataset:
-    """A split of a data set, read as a method says; raises InputError as `read_dataset` does."""
+    """A split of a data set, read as a method says, or one in memory as it is; raises InputError as
+    `read_dataset` does, and for another split."""
+    if isinstance(path, Dataset):
+        if path.split != split:
+            raise InputError(f"it has {path.split} views", path.path, "split", f"give {split} views")
+        return path
     options = method.data
     return read_dataset(
         path,
@@ -71,7 +78,7 @@ def read_views(
     )
 
 
-def views_of_run(run: Run, method: Method, split: str, path: Path | None = None) -> Dataset:
+def views_of_run(run: Run, method: Method, split: str, path: Path | Dataset | None = None) -> Dataset:
     """A split of the data set of a run (or at `path`), with the run's region of interest. Raises InputError
     as `read_dataset` and `Run.region` do, and if the run records no data set or it is gone."""
     if path is None:

@@ -34,6 +34,7 @@ from mi_refgs.synthesis.pathtrace import (
     reach,
 )
 from mi_refgs.synthesis.settings import RELIGHT, SURFACE, load_scene, prepare_folder, under_light, without
+from mi_refgs.types import Scene
 
 SURFACE_VOXELS = 2048  # along the diameter of surface.ply: rays start 2 off, ten times a sphere's error
 REGION_MARGIN = 1.2  # radius of the region over that of the object's bounding sphere: adjacent surfaces
@@ -58,43 +59,19 @@ def make_dataset(
     for foreign files."""
     # Settings.
     scene, out = Path(scene), Path(out)
-    known = [field.name for field in fields(DatasetOptions)]
-    for name in options.keys() - known:
-        raise InputError("unknown option", "make_dataset", name, f"use some of {', '.join(known)}")
-    given = DatasetOptions(**options)
-    given.check(scene)
+    given = options_of("make_dataset", scene, options)
     lights = [relight] if isinstance(relight, str | Path) else relight
     settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
     # The scene under each light, and its surface.
     loaded = load_scene(scene)
-    named = {shape.id(): shape for shape in loaded.shapes() if shape.id()}
-    for name in {*given.objects} - {*named}:
-        remedy = f"give one of {', '.join(sorted(named)) or 'none'}"
-        raise InputError(f"no shape has the id '{name}'", scene, "--object", remedy)
-    about = [named[name] for name in dict.fromkeys(given.objects)]
-    try:
-        shapes, around = (about, []) if about else object_of(loaded.shapes(), given)
-        vertices, faces = surface_mesh(shapes)
-        centre, radius = bounding_sphere(shapes)
-        farthest = reach(loaded.shapes(), centre)
-    except InputError as error:
-        raise error.at(file=scene) from error
-    if progress and not about and len(shapes) < len(loaded.shapes()):
-        what = f"the object is {_names(shapes)}; around it: {_names(around)}; lamps do not count"
-        say(f"{scene.name}: {what}; `--object ID …` decides")
-    about = about or (shapes if around else [])
-    relit = [under_light(loaded, other.path, about) for other in others]
-    cameras = Cameras(given, centre, radius, farthest, about)
-    x, y, z = (float(c) for c in centre)
-    region = Region((x, y, z), REGION_MARGIN * radius, estimated=True)  # fits look for what supports it
-    if about and cameras.distance[0] <= region.radius:
-        what = f"{cameras.distance[0]:.4g} is inside of the region around the object"
-        raise InputError(f"{what}, whose radius is {region.radius:.4g}", scene, "--distance", "give more")
+    cameras, shapes, region = around_object(loaded, given, scene, progress)
+    vertices, faces = surface_mesh(shapes)
+    relit = [under_light(loaded, other.path, cameras.objects) for other in others]
     prepare_folder(out, settings, overwrite, others)
-    if about:
+    if region is not None:
         write_region(out, region)
     if not (out / SURFACE).exists():
-        voxel = 2 * radius / SURFACE_VOXELS
+        voxel = 2 * cameras.radius / SURFACE_VOXELS
         write_mesh(out / SURFACE, Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel))
     tracer = Tracer(loaded, cameras)
     write_views(out, ("train", "test"), tracer, MAPS, progress)
@@ -102,6 +79,46 @@ def make_dataset(
         alone = Tracer(scene_there, replace(cameras, objects=()))
         write_views(out / RELIGHT / other.name, ("test",), alone, {}, progress)
     return out
+
+
+def options_of(who: str, scene: Path, options: dict[str, Any]) -> DatasetOptions:
+    """The options of a function; raises InputError for an unknown name or a value out of range."""
+    known = [field.name for field in fields(DatasetOptions)]
+    for name in options.keys() - known:
+        raise InputError("unknown option", who, name, f"use some of {', '.join(known)}")
+    given = DatasetOptions(**options)
+    given.check(scene)
+    return given
+
+
+def around_object(
+    loaded: Scene, given: DatasetOptions, scene: Path, tell: bool = False
+) -> tuple[Cameras, list[Any], Region | None]:
+    """Cameras around the object of a scene, its shapes, and in an open scene the region around it."""
+    named = {shape.id(): shape for shape in loaded.shapes() if shape.id()}
+    for name in {*given.objects} - {*named}:
+        remedy = f"give one of {', '.join(sorted(named)) or 'none'}"
+        raise InputError(f"no shape has the id '{name}'", scene, "--object", remedy)
+    about = [named[name] for name in dict.fromkeys(given.objects)]
+    try:
+        shapes, around = (about, []) if about else object_of(loaded.shapes(), given)
+        centre, radius = bounding_sphere(shapes)
+        farthest = reach(loaded.shapes(), centre)
+    except InputError as error:
+        raise error.at(file=scene) from error
+    if tell and not about and len(shapes) < len(loaded.shapes()):
+        what = f"the object is {_names(shapes)}; around it: {_names(around)}; lamps do not count"
+        say(f"{scene.name}: {what}; `--object ID …` decides")
+    about = about or (shapes if around else [])
+    cameras = Cameras(given, centre, radius, farthest, about)
+    if not about:
+        return cameras, shapes, None
+    x, y, z = (float(c) for c in centre)
+    region = Region((x, y, z), REGION_MARGIN * radius, estimated=True)  # fits look for what supports it
+    if cameras.distance[0] <= region.radius:
+        what = f"{cameras.distance[0]:.4g} is inside of the region around the object"
+        raise InputError(f"{what}, whose radius is {region.radius:.4g}", scene, "--distance", "give more")
+    return cameras, shapes, region
 
 
 def _names(shapes: Sequence[Any]) -> str:

@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.constants import GOLDEN_ANGLE
+from mi_refgs.constants import GOLDEN_ANGLE, MAX_NUMBER
 from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light.latlong import OVERSAMPLING, lat_long
+from mi_refgs.splat.camera import Camera
 from mi_refgs.synthesis.ground_truth import materials_at, triangles
 from mi_refgs.synthesis.options import DatasetOptions
 from mi_refgs.types import Color3f, Scene, Vector3f
 
 SAMPLES_PER_LAUNCH = 1 << 24  # most paths per launch; the path tracer keeps about 100 bytes for each
+NEAR = 1e-4  # least distance of the near plane of a given sensor, radii of the object
 FILL = 0.95  # of the shorter side that the object's bounding sphere fills, unless distances are given
 BACKDROP = 2.0  # radii of the object: a flat shape that is larger is a floor or a wall
 FLAT = 0.05  # least over largest spread of the points of a flat shape: the top of a table is one
@@ -136,11 +138,11 @@ class Cameras:
 
 
 class Tracer:
-    """One sensor that moves from view to view, so that each kernel is compiled once. If `cameras` have the
-    objects of an open scene, images show everything, also emitters, without alpha, and maps are of those
-    shapes only."""
+    """One sensor, with the lens of `like` if it is given, that moves from view to view, so that each kernel
+    is compiled once. If `cameras` have the objects of an open scene, images show everything, also emitters,
+    without alpha, and maps are of those shapes only."""
 
-    def __init__(self, scene: Scene, cameras: Cameras) -> None:
+    def __init__(self, scene: Scene, cameras: Cameras, like: Camera | None = None) -> None:
         import mitsuba as mi
 
         options, (low, high) = cameras.options, cameras.distance
@@ -161,6 +163,11 @@ class Tracer:
         film |= {"width": self.width, "height": self.height, "pixel_format": "rgb" if opaque else "rgba"}
         lens: dict[str, Any] = {"type": "perspective", "fov": options.fov, "fov_axis": "smaller"}
         lens |= {"near_clip": 0.1 * (low - cameras.radius), "far_clip": 10 * (high + cameras.reach)}
+        if like is not None:
+            lens |= {"fov": math.degrees(2 * math.atan(0.5 * like.width / like.focal)), "fov_axis": "x"}
+            lens |= {"near_clip": max(float(like.near[0]), NEAR * cameras.radius), "far_clip": MAX_NUMBER}
+            for axis, centre, size in (("x", like.cx, like.width), ("y", like.cy, like.height)):
+                lens[f"principal_point_offset_{axis}"] = 0.5 - float(centre[0]) / size
         self.sensor = mi.load_dict(lens | {"sampler": {"type": "multijitter"}, "film": film})
         self.params = mi.traverse(self.sensor)
 
