@@ -68,7 +68,7 @@ export run --degree 1
 export damaged
 import no.ply -o out
 import text.exr -o out
-import nan/surfels.ply -o out --resume
+import nan/surfels.ply -o out --preset quick
 view run --port 70000
 view run --host 192.0.2.1
 compare -o out --methods tiny.toml

@@ -42,13 +42,11 @@ class Import:
     purpose: Annotated[str | None, optional("{photographs,relighting}", name="for")] = None
     """choose the method by a purpose (default with --relightable: relighting)"""
     preset: Preset = None
-    resume: Flag = False
-    """continue a fit that was interrupted"""
     common: Rendering = Rendering()
 
     def run(self) -> Result:
         """Import the file."""
-        given = {"--for": self.purpose, "--preset": self.preset, "--resume": self.resume}
+        given = {"--for": self.purpose, "--preset": self.preset}
         for option in (name for name, value in given.items() if value and not self.relightable):
             raise InputError("only a relightable import is fitted", option, remedy="add --relightable")
         from mi_refgs.formats.cameras import read_cameras
@@ -84,7 +82,6 @@ class Import:
             cameras=cameras,
             method=None if self.purpose is None else methods.for_purpose(self.purpose),
             preset=self.preset,
-            resume=self.resume,
         )
         trained, dataset = found.trained, str(found.provenance.data)
         data = {

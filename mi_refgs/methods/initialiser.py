@@ -41,6 +41,7 @@ class Initialiser:
     start: Callable[[Wanted], Start | None]  # None: not with these data
 
 
+INITIALISERS: Registry[Initialiser]
 INITIALISERS = Registry("initialiser", package="mi_refgs.fitting.initialisers", of=Initialiser)
 register = INITIALISERS.register
 """Add an initialiser, which methods can name from then on."""

@@ -18,7 +18,7 @@ from mi_refgs.formats.cameras import TRANSFORMS, transforms
 from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
-from mi_refgs.io.ownership import RUN, own_folder, owner_of
+from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.io.progress import with_bar
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.reconstruction.fit import fit
@@ -43,20 +43,18 @@ def import_relightable(
     cameras: Sequence[Camera] | None = None,
     method: str | Path | None = None,
     preset: str | None = None,
-    resume: bool = False,
     progress: bool | runner.Progress = True,
 ) -> Reconstruction:
     """Fit materials, normals and an environment map to views of a PLY file of 3DGS or 2DGS.
 
     Views from all around, rendered by the formulas of the file, become a data set, the folder `data` of the
     run folder `output`. linear, box: as in `import_splats`. cameras: of the views; every eighth is a test
-    view. method: as in `fit`, by default that for relighting. preset, resume, progress: as in `fit`; the
-    preset also chooses the size of the views. Raises InputError for a file that `import_splats` refuses or
+    view. method: as in `fit`, by default that for relighting. preset, progress: as in `fit`; the preset
+    also chooses the size of the views. Raises InputError for a file that `import_splats` refuses or
     that shows no free object, for a folder with another run or foreign files, and as `fit` does."""
     path, run = Path(path), Run(output)
-    if resume:
-        run.require_resumable()
-    elif method is None:
+    run.require_none()
+    if method is None:
         method = methods.for_purpose(PURPOSE)
     wanted = runner.load_method(None if method is None else str(method), preset)
     made = import_splats(path, linear=linear, box=box)
@@ -65,23 +63,19 @@ def import_relightable(
         chosen = enumerate(held_out(cameras or (), split))
         given += [Shot(f"{split}/r_{i:03d}", split, camera) for i, camera in chosen]
     views, owner = run.path / DATA, f"import of {path.resolve()}"
-    if not resume:
-        run.require_none()
-        pixels = PRESETS.get(wanted.preset, PRESETS[DEFAULT_PRESET]).pixels
-        shots = given or shots_around(made.trained.surfels, VIEWS, math.isqrt(pixels), ELEVATION)
-        _require_object(made, shots, path)
-        with run.alone():
-            own_folder(run.path, RUN)
-            own_folder(views, owner)
-            try:
-                for shot in with_bar(shots, "views", unit="view", disable=progress is False):
-                    write_png(views / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))
-            except KeyboardInterrupt as error:
-                raise type(error)("interrupted while views were rendered; repeat the command") from None
-            write_json(views / TRANSFORMS, transforms(shots))
-    elif owner_of(views) != owner or not (views / TRANSFORMS).is_file():
-        raise InputError(f"{views} has no views of this file", path, "--resume", "choose another -o")
-    return fit(views, method, preset=preset, output=output, resume=resume, progress=progress)
+    pixels = PRESETS.get(wanted.preset, PRESETS[DEFAULT_PRESET]).pixels
+    shots = given or shots_around(made.trained.surfels, VIEWS, math.isqrt(pixels), ELEVATION)
+    _require_object(made, shots, path)
+    with run.alone():
+        own_folder(run.path, RUN)
+        own_folder(views, owner)
+        try:
+            for shot in with_bar(shots, "views", unit="view", disable=progress is False):
+                write_png(views / f"{shot.name}.png", straight_srgb(made.render(shot.camera)))
+        except KeyboardInterrupt as error:
+            raise type(error)("interrupted while views were rendered; repeat the command") from None
+        write_json(views / TRANSFORMS, transforms(shots))
+    return fit(views, method, preset=preset, output=output, progress=progress)
 
 
 def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> None:

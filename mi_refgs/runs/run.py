@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.poses import rigid
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.io.files import (
@@ -58,7 +57,7 @@ class Run:
     def require_none(self) -> None:
         """Raise InputError if the folder contains a run or other files."""
         if (self.path / CONFIG).exists():
-            remedy = "add --resume to go on with it, or choose another -o"
+            remedy = "continue it with `refgs train --resume`, or choose another -o"
             raise InputError("contains a run already", self.path, remedy=remedy)
         require_own(self.path, RUN)
 
@@ -121,16 +120,8 @@ class Run:
         return None if found is None else Region.of(found, self.path / DATASET)
 
     def cameras(self) -> dict[str, Any]:
-        """The decision about camera corrections, with corrected poses by view; {} for none. Raises
-        InputError."""
-        record, found = self.path / CAMERAS, self._record(CAMERAS)
-        try:
-            for name, pose in found.get("to_world", {}).items():
-                rigid(np.array(pose, dtype=np.float64).reshape(4, 4), f"{record}: to_world: {name}")
-        except (AttributeError, TypeError, ValueError) as error:
-            what, remedy = f"cannot be read ({error})", "restore or remove the file"
-            raise InputError(what, record, "to_world", remedy) from error
-        return found
+        """The decision about camera corrections, with corrected poses by view; {} for none."""
+        return self._record(CAMERAS)
 
     def checkpoints(self) -> list[Path]:
         """Complete checkpoints, oldest first."""

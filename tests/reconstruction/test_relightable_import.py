@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -156,34 +154,23 @@ def test_command_writes_the_same_views_and_fits_the_method_for_relighting(
     argv = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET]
     assert main(argv) == 0
     assert tree(run / "data") == tree(imported / "data")
-    assert main([*argv, "--resume"]) == 0  # finished: nothing is left to do
     assert asked == ["relighting"]
 
 
-@pytest.mark.usefixtures("heard_interrupts", "one_thread")
-def test_interrupted_import_resumes(
+def test_an_interrupted_import_is_an_interrupted_fit(
     ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the command of the import, as if never interrupted; its message names that of the fit."""
-    step, run = Trainer.step, tmp_path / "run"
+    """Its message names the command that goes on."""
 
-    def interrupted(self: Trainer) -> None:
-        step(self)
-        if self.iteration == 4:
-            os.kill(os.getpid(), signal.SIGINT)
+    def interrupted(trainer: Trainer) -> None:
+        raise KeyboardInterrupt
 
+    monkeypatch.setattr(Trainer, "step", interrupted)
     options: dict[str, Any] = {"method": method, "preset": PRESET, "progress": Progress()}
-    mi_refgs.import_relightable(ball, tmp_path / "straight", **options)
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "step", interrupted)
-        with pytest.raises(KeyboardInterrupt, match="interrupted at iteration 4; resume with: ") as caught:
-            mi_refgs.import_relightable(ball, run, **options)
-    _, _, named = str(caught.value).partition("resume with: refgs ")
-    assert named == f"train {run / 'data'} -o {run} --resume"
-    refused(lambda: mi_refgs.import_relightable(ball, run, **options), "contains a run already; add --resume")
-    again = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET, "--resume"]
-    assert main([*again, "--threads", "1"]) == 0
-    assert (run / "surfels.ply").read_bytes() == (tmp_path / "straight" / "surfels.ply").read_bytes()
+    run = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt, match=f"train {run / 'data'} -o {run} --resume"):
+        mi_refgs.import_relightable(ball, run, **options)
+    refused(lambda: mi_refgs.import_relightable(ball, run, **options), "contains a run already; ")
 
 
 def test_scene_all_around_is_refused(ball: Path, tmp_path: Path) -> None:
@@ -213,5 +200,5 @@ def test_bad_preset_is_refused_before_views_are_rendered(ball: Path, tmp_path: P
     argv = ["import", ball, "-o", tmp_path / "run", "--relightable"]
     refused([*argv, "--preset", "fast"], "--preset: fast: unknown")
     refused([*argv, "--for", "fun"], "--for: fun: no method is for that")
-    refused([*argv[:-1], "--resume"], "--resume: ", "add --relightable")
+    refused([*argv[:-1], "--preset", "quick"], "--preset: ", "add --relightable")
     assert not (tmp_path / "run").exists()
