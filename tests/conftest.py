@@ -8,6 +8,9 @@ import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from tests.simple_kernels import set_options
+
+# isort: split
 import mi_refgs  # noqa: F401  (first: it chooses the libLLVM that Dr.Jit loads)
 
 # isort: split
@@ -21,6 +24,8 @@ from mi_refgs.cli import main
 from mi_refgs.io.exr import MITSUBA_EXR_THREADS
 from tests.scenes.known import write_known_data, write_known_run
 from tests.scenes.tiny import train_command, write_data, write_method
+
+set_options()
 
 # The same examples in every run. Kernels are compiled in the first, so there is no deadline; failures are not
 # simplified, since examples are mostly seeds.
