@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from mi_refgs.cli.command import Flag, OtherData, Output, Rendering, Result, RunFolder, joined
+from mi_refgs.cli.command import OtherData, Output, Rendering, Result, RunFolder, joined
 from mi_refgs.editing.options import Change, Selection
 from mi_refgs.errors import InputError
 from mi_refgs.io.progress import say
@@ -15,15 +15,13 @@ class Edit:
     """The run stays as it is.
 
     example:
-      refgs edit runs/glossy -o runs/matte --set roughness=0.6 --where "metallic > 0.5" --preview
+      refgs edit runs/glossy -o runs/matte --set roughness=0.6 --where "metallic > 0.5"
     """
 
     run_folder: RunFolder
     output: Output
     """new run folder"""
     data: OtherData = None
-    preview: Flag = False
-    """also write preview.png: views before and after"""
     selection: Selection = Selection()
     change: Change = Change()
     common: Rendering = Rendering()
@@ -31,9 +29,7 @@ class Edit:
     def run(self) -> Result:
         """Edit the run."""
         from mi_refgs.editing.change import assignments
-        from mi_refgs.editing.edit import before_and_after
         from mi_refgs.editing.selection import parse_condition
-        from mi_refgs.io.images import write_png
         from mi_refgs.io.ownership import require_own
         from mi_refgs.reconstruction.reconstruction import load
 
@@ -54,11 +50,6 @@ class Edit:
         for note in entry["notes"]:
             say(f"note: {note}")
         after.save(self.output)
-        if self.preview:
-            views = before.views() if before.provenance.has_data else None
-            colours = () if views is None else (views.background, views.is_linear_radiance)
-            sheet = before_and_after(before.trained, after.trained, before.cameras(), *colours)
-            write_png(self.output / "preview.png", sheet)
         selected = f"{entry['selected']} of {entry['of']} surfels selected"
         text = f"{self.output}: {selected}; the new run has {entry['surfels']}"
         return Result({"output": str(self.output), **entry}, text)

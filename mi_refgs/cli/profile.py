@@ -3,51 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from mi_refgs.cli.command import MethodName, OtherData, Preset, Rendering, Result, Settings, joined
+from mi_refgs.cli.command import OtherData, Rendering, Result, RunFolder
 from mi_refgs.errors import InputError
-from mi_refgs.io.progress import say
 
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """A run is measured at its newest checkpoint, a data set at the start of a new fit; nothing is written.
+    """A run is measured at its newest checkpoint; nothing is written.
 
     example:
       refgs profile runs/glossy
     """
 
-    path: Annotated[Positional[Path], arg(metavar="RUN|DATA")]
-    """run folder or data set"""
+    run_folder: RunFolder
     steps: Annotated[int, arg(metavar="N")] = 15
     """steps to measure"""
     data: OtherData = None
-    method: MethodName = None
-    preset: Preset = None
-    set: Settings = ()
     common: Rendering = Rendering()
 
     def run(self) -> Result:
         """Measure."""
         from mi_refgs.evaluation.profile import phases_of, stepper
-        from mi_refgs.fitting.runner import load_method
         from mi_refgs.fitting.train import Trainer
         from mi_refgs.runs.run import Run
-        from mi_refgs.runs.views import sized, views_of_run
+        from mi_refgs.runs.views import views_of_run
 
         if self.steps < 1:
             raise InputError(f"{self.steps} is out of range", "--steps", remedy="give a number from 1")
-        folder = Run(self.path)
-        if folder.exists():
-            method = folder.method()
-            trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)
-        else:
-            wanted = load_method(self.method, self.preset, joined(self.set))
-            trainer = Trainer(*sized(wanted, self.path, say))
+        folder = Run(self.run_folder)
+        method = folder.method()
+        trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)
         stage = trainer.method.stage_at(max(trainer.iteration, 1))[0]
         rows = phases_of(stepper(trainer, stage), self.steps)
         lines = [f"{'phase':<20}{'ms':>10}{'launches':>10}{'share':>8}"]

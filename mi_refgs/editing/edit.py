@@ -1,4 +1,4 @@
-"""An edit of a scene, from the selection to the notes for the user, and images before and after."""
+"""An edit of a scene, from the selection to the notes for the user."""
 
 from __future__ import annotations
 
@@ -7,22 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Unpack
 
-import numpy as np
-
-from mi_refgs.data.view import evenly_spread
 from mi_refgs.editing.change import Assignment, apply, assignments
 from mi_refgs.editing.options import Change, EditOptions, Selection
 from mi_refgs.editing.selection import COLOUR, select
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.images import contact_sheet
-from mi_refgs.render.display import displayed, image_array
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.splat import Camera
-
-PREVIEWS = 4
-"""Views of `before_and_after`, spread evenly over the cameras."""
-WHITE = np.ones(3, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,20 +84,3 @@ def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list
         trace = "; --materials traces rays instead" if has_materials else ""
         notes.append(f"interreflection (indirect_sh) stays as it was fitted{trace}")
     return notes
-
-
-def before_and_after(
-    before: TrainedScene,
-    after: TrainedScene,
-    cameras: Sequence[Camera],
-    background: np.ndarray = WHITE,  # (3,) display-encoded
-    linear: bool = False,
-) -> np.ndarray:
-    """Return a contact sheet (H, W, 3) of both scenes, one row per camera, display-encoded (`displayed`)."""
-    renderers = {"before": before.renderer(aovs=False), "after": after.renderer(aovs=False)}
-    rows = []
-    for camera in (cameras[i] for i in evenly_spread(len(cameras), PREVIEWS)):
-        shots = {title: displayed(view(camera), background, linear) for title, view in renderers.items()}
-        size = camera.height, camera.width
-        rows.append({title: np.clip(image_array(x, *size), 0, 1) for title, x in shots.items()})
-    return contact_sheet(rows)

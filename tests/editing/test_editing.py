@@ -255,13 +255,13 @@ def test_an_edited_run_is_a_run(finished: Path, tmp_path: Path, capsys: pytest.C
     """An edit of an edit; every command reads it; the run that it came from stays as it was."""
     before = files(finished)
     new, newer = tmp_path / "new", tmp_path / "newer"
-    options = ["--set", "roughness=0.5", "--where", "x > 0", "--preview"]
+    options = ["--set", "roughness=0.5", "--where", "x > 0"]
     assert main(["edit", str(finished), "-o", str(new), *options]) == 0
     out = capsys.readouterr().out
     assert main(["edit", str(new), "-o", str(newer), "--set", "metallic=0.25", "--json"]) == 0
     second = json.loads(capsys.readouterr().out)
     assert files(finished) == before
-    assert not (new / "checkpoints").exists() and (new / "preview.png").stat().st_size > 1000
+    assert not (new / "checkpoints").exists()
     record = json.loads((newer / "edit.json").read_text())["edits"]
     assert [edit["selected"] == edit["of"] for edit in record] == [False, True]
     assert record[0]["where"] == "x > 0" and record[0]["set"] == ["roughness=0.5"]
