@@ -24,4 +24,4 @@ if nvidia-smi > /dev/null 2>&1; then
 else
   options=(--small)
 fi
-exec "$python" -m benchmarks.gpu "${options[@]}" "$out" "$@"
+exec timeout 530 "$python" -m benchmarks.gpu "${options[@]}" "$out" "$@"

@@ -10,7 +10,7 @@ from tests.helpers import run_process
 
 
 def test_small_instance(tmp_path: Path) -> None:
-    done = run_process("-m", "benchmarks.gpu", tmp_path, "--small", "splat", "volprim", "gsplat")
+    done = run_process("-m", "benchmarks.gpu", tmp_path, "--small", "gsplat", "splat", "volprim")
     assert done.returncode == 0, done.stderr[-3000:]
     steps = read_result(tmp_path / "gpu.json")["steps"]
     (ours,), (theirs,) = steps["splat"], steps["volprim"]
