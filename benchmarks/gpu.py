@@ -192,13 +192,13 @@ LIMITS = {values: 60, splat: 80, step: 120, gsplat: 60, fit: 150, frame: 30, vol
 def run(name: str, seconds: float, arguments: list[str], log: Any) -> Iterator[Row]:
     """The rows of a step in a process of its own, and at last what went wrong."""
     command = [sys.executable, "-m", "benchmarks.gpu", *arguments, "--only", name]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=ROOT)
-    assert process.stdout is not None
-    timer = threading.Timer(seconds, process.kill)
-    timer.start()
-    yield from (json.loads(line) for line in process.stdout if line.startswith('{"'))
-    timer.cancel()
-    if code := process.wait():
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=ROOT) as process:
+        assert process.stdout is not None
+        timer = threading.Timer(seconds, process.kill)
+        timer.start()
+        yield from (json.loads(line) for line in process.stdout if line.startswith('{"'))
+        timer.cancel()
+    if code := process.returncode:
         log.seek(0)
         yield {"error": f"exit code {code} (-9: the limit of {seconds} s)", "log": log.read()[-600:]}
 
