@@ -11,9 +11,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs.kernels.device import upload
 from mi_refgs.reference import light as reference
 from mi_refgs.shade.light import envmap, lobe_matrices, prefilter
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.prefilter_kernels import Kernels
 from tests.helpers import level_maps, refused, slow, unit, vector
 from tests.scenes.shading_points import exact_light
 
@@ -153,6 +155,18 @@ def test_maps_finer_than_the_levels_are_averaged(
     lights = (EnvironmentLight.from_radiance(x).prefilter() for x in (fine, coarse))
     for a, b in list(zip(*map(level_maps, lights), strict=True))[1:]:
         np.testing.assert_allclose(a, b, atol=3e-3)
+
+
+@pytest.mark.parametrize("height", [8, 12, 64])
+def test_prefilter_of_a_gpu_is_that_of_the_host(height: int, rng: np.random.Generator) -> None:
+    op = prefilter.operator(height)
+    kernels = Kernels.of(height, op.shapes, op.matrix, op.texels)
+    radiance = rng.uniform(size=(height, 2 * height, 3)).astype(np.float32)
+    δ = rng.normal(size=(op.texels, 4)).astype(np.float32)
+    levels = kernels.apply(upload(radiance)).numpy().reshape(δ.shape)
+    np.testing.assert_allclose(levels, op.apply(radiance), atol=4e-6)
+    δradiance = kernels.apply_transposed(upload(δ)).numpy().reshape(radiance.shape)
+    np.testing.assert_allclose(δradiance, op.apply_transposed(δ), atol=1e-5)
 
 
 @pytest.mark.parametrize("height", [8, 12, 64])

@@ -2,8 +2,9 @@
 
     radiance ─ FFT ─► coefficients ─ matrix ─► coefficients of every level ─ inverse FFT ─► levels
 
-`analyse` and `synthesise` are each other's transpose. All of it runs on the host: a light is small. The
-levels are one flat buffer, TEXEL floats per texel: RGBA, A unused; the map itself comes first.
+`analyse` and `synthesise` are each other's transpose. All of it runs on the host, since a light is small, but
+for a GPU, which would wait for it: `prefilter_kernels`. The levels are one flat buffer, TEXEL floats per
+texel: RGBA, A unused; the map itself comes first.
 """
 
 from __future__ import annotations
@@ -20,9 +21,8 @@ from scipy.sparse import csc_matrix
 
 from mi_refgs.kernels.device import upload
 from mi_refgs.shade.light.lobe_matrices import build_levels
+from mi_refgs.shade.light.prefilter_kernels import TEXEL, Kernels
 from mi_refgs.types import Float, TensorXf, UInt32
-
-TEXEL = 4  # floats per texel
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Operator:
     matrix: csc_matrix  # float32, from coefficients of the map to those of all levels, one after the other
     info: UInt32  # 4 a level: first texel, h, w, 0; level 0 is the map itself
     shapes: tuple[tuple[int, int], ...]  # (first texel, h) of each level, the same on the host
+    kernels: Kernels | None  # in place of `apply` and `apply_transposed`
 
     @property
     def texels(self) -> int:
@@ -103,7 +104,9 @@ def _operator(variant: str, height: int) -> Operator:
     firsts = np.cumsum([0, *(2 * h * h for h in (height, *heights[:-1]))]).tolist()
     shapes = tuple(zip(firsts, (height, *heights), strict=True))
     info = upload(np.array([(first, h, 2 * h, 0) for first, h in shapes]), mi.UInt32)
-    return Operator(height, matrix, info, shapes)
+    texels = shapes[-1][0] + 2 * heights[-1] ** 2
+    kernels = Kernels.of(height, shapes, matrix, texels) if variant.startswith("cuda") else None
+    return Operator(height, matrix, info, shapes, kernels)
 
 
 def operator(height: int) -> Operator:
@@ -122,11 +125,17 @@ class _Prefilter(dr.CustomOp):
         self.set_grad_out(self._apply(self.grad_in("radiance")))
 
     def backward(self) -> None:
-        δ = self.grad_out().numpy().reshape(-1, TEXEL)
-        self.set_grad_in("radiance", upload(self.operator.apply_transposed(δ)))
+        δ, kernels = self.grad_out(), self.operator.kernels
+        if kernels is None:
+            δradiance = upload(self.operator.apply_transposed(δ.numpy().reshape(-1, TEXEL)))
+        else:
+            δradiance = kernels.apply_transposed(δ)
+        self.set_grad_in("radiance", δradiance)
 
     def _apply(self, radiance: Float) -> Float:
         height = self.operator.height
+        if self.operator.kernels is not None:
+            return self.operator.kernels.apply(radiance)
         return upload(self.operator.apply(radiance.numpy().reshape(height, 2 * height, 3)))
 
     def name(self) -> str:
