@@ -9,6 +9,7 @@ from __future__ import annotations
 import faulthandler
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -148,18 +149,16 @@ def step(small: bool) -> Iterator[Row]:
 def fit(small: bool) -> Iterator[Row]:
     """Time to a PSNR: mirror_ring, traced here."""
     variant = ("--mitsuba-variant", str(mi.variant()))
+    shutil.rmtree(WORK, ignore_errors=True)
     data, begin = WORK / "data", time.perf_counter()
-    numbers = (
-        "--views 4 --test-views 1 --size 24 --samples 2"
-        if small
-        else "--views 100 --test-views 20 --size 200"
-    )
+    views, test_views, size, samples = (4, 1, 24, 2) if small else (100, 20, 200, 128)
+    numbers = ["--views", views, "--test-views", test_views, "--size", size, "--samples", samples]
     scene = ROOT / "scenes/mirror_ring.xml"
-    refgs("dataset", scene, "-o", data, "--overwrite", *numbers.split(), *variant)
+    refgs("dataset", scene, "-o", data, *numbers, *variant)
     yield {"dataset_seconds": time.perf_counter() - begin}
     for preset in ("8:200",) if small else ("quick", "standard"):
         run = WORK / preset.replace(":", "_")
-        trained = refgs("train", data, "-o", run, "--resume", "--preset", preset, *variant)
+        trained = refgs("train", data, "-o", run, "--preset", preset, *variant)
         scores = refgs("eval", run, *variant)
         keys = ("psnr", "normal_mae_deg", "surfels", "train_seconds")
         yield {"preset": preset, "total_seconds": trained["total_seconds"]} | {k: scores[k] for k in keys}
@@ -167,11 +166,8 @@ def fit(small: bool) -> Iterator[Row]:
 
 def frame(small: bool) -> Iterator[Row]:
     """Times of images of the last finished run, without derivatives."""
-    run = [
-        path
-        for path in (WORK / name for name in ("8_200", "quick", "standard"))
-        if (path / "metrics.json").is_file()
-    ][-1]
+    runs = [WORK / name for name in ("8_200", "quick", "standard")]
+    run = [run for run in runs if (run / "metrics.json").is_file()][-1]
     yield from frames.measure(run, (32,) if small else (200, 400, 800, (1920, 1080)))
 
 
@@ -179,7 +175,7 @@ def tests(small: bool) -> Iterator[Row]:
     """Laws and hard cases with this variant."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=line"]
     command += ["tests/hard_cases", "tests/laws/test_splat_laws.py", "tests/laws/test_render_laws.py"]
-    command += ["-k", "roughness"] if small else ["-n", "8"]
+    command += ["-k", "roughness"] if small else ["-n", "8", "-p", "no:benchmark"]
     environment = os.environ | {"MI_REFGS_TEST_VARIANT": str(mi.variant())}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
     yield {"code": done.returncode, "tail": done.stdout.splitlines()[-30:]}
