@@ -78,6 +78,7 @@ from mi_refgs.surfels.primitives import Primitive as Primitive
 from mi_refgs.surfels.primitives import register as register_primitive
 from mi_refgs.surfels.table import Surfels as Surfels
 from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
+from mi_refgs.synthesis.mesh_surfels import surfels_from_mesh as surfels_from_mesh
 from mi_refgs.synthesis.options import DatasetOptions as DatasetOptions
 
 load_plugins()  # those of installed packages

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +15,8 @@ from mi_refgs.surfels.primitives import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 
 DISTANCE_FLOOR = 1e-4  # least distance of neighbours, in extents of the points: keeps the log scale finite
+DRAWS, ROUNDS = 8, 4  # of `even_points`: draws per point, and moves to the centres of cells
+APART = 2.0  # distances of neighbours that the opposite sides of a sheet are half apart
 NEIGHBOURS = 3  # their mean squared distance gives the scale [3DGS]
 MORTON_BITS = 10  # log₂ of the cells along an axis: they are smaller than the distance of surfels
 MORTON_OUTLIERS = 0.01  # fraction of points at either end of an axis that are put into the outermost cells
@@ -65,6 +68,28 @@ def from_points(
     if colours is not None and "radiance_sh" in raw:
         raw["radiance_sh"][:, :3] = (_check("colours", colours, (count,)) - 0.5) / SH_DC
     return Surfels.from_numpy({name: raw[name] for name in ATTRIBUTES if name in raw})
+
+
+def even_points(
+    vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (count, 3) evenly spread on triangles, and the unit normals there: uniform draws, then the
+    centres of their cells [Lloyd 1982], which are parts of one side of a thin sheet. InputError without area.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if count < 1 or not mesh.area > 0:
+        what = f"{count} points on an area of {mesh.area:g}"
+        raise InputError(what, "surfels", "mesh", "give triangles and a number from 1")
+    drawn, face = trimesh.sample.sample_surface(mesh, DRAWS * count, seed=int(rng.integers(2**31)))
+    normals = np.asarray(mesh.face_normals[face])
+    place = np.concatenate([drawn / np.sqrt(mesh.area / count), APART * normals], axis=1)
+    chosen = np.arange(count)
+    for _ in range(ROUNDS):
+        _, cell = cKDTree(place[chosen]).query(place)
+        total = np.stack([np.bincount(cell, column, count) for column in place.T], axis=1)
+        size = np.bincount(cell, minlength=count)[:, None]
+        chosen = cKDTree(place).query(np.where(size > 0, total / np.maximum(size, 1), place[chosen]))[1]
+    return np.asarray(drawn[chosen]), normals[chosen]
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:

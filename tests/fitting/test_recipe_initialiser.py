@@ -15,6 +15,7 @@ from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.fitting.initial import initial_surfels
 from mi_refgs.methods.initialiser import INITIALISERS, Start, Wanted
+from mi_refgs.surfels.init import even_points
 from tests.helpers import refused
 from tests.scenes.tiny import METHOD, write_data
 
@@ -22,12 +23,10 @@ MESH = trimesh.creation.icosphere(3, radius=0.5)
 
 
 def on_mesh(wanted: Wanted) -> Start | None:
-    """Points uniform on a mesh of the object, with its normals; not for the background."""
+    """Points evenly spread on a mesh of the object, with its normals; not for the background."""
     if not wanted.inside:
         return None
-    seed = int(wanted.rng.integers(2**31))
-    points, face = trimesh.sample.sample_surface(MESH, wanted.count, seed=seed)
-    normals = MESH.face_normals[face]
+    points, normals = even_points(MESH.vertices, MESH.faces, wanted.count, wanted.rng)
     data = wanted.data
     return Start(points, hull.median_colours(points, data.views, data.background, normals), normals)
 

@@ -295,7 +295,7 @@ def test_replacement_light_is_rotated_like_the_scenes_own(made: Path, tmp_path: 
     """The scene's own map changes nothing; and a scene without a map is z up."""
     own = load_scene(made.parent / "ball.xml")
     same = under_light(own, SCENES / "lights" / "studio.exr")
-    first, second = (pathtrace.environment_image(scene, 64) for scene in (own, same))
+    first, second = (environment_image(scene, 64) for scene in (own, same))
     np.testing.assert_array_equal(first, second)
     parts = '<emitter type="constant"/><emitter type="point"/><shape type="sphere"/>'
     (tmp_path / "plain.xml").write_text(f'<scene version="3.0.0">{parts}</scene>')
