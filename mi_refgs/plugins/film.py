@@ -112,7 +112,7 @@ class FilmImage:
         parts, (height, _), views = [], self._size, len(self._sensors)
         for sensor, band in self._passes(most):
             parts.append(of(sensor, band))
-            if band.size[1] < height:
+            if views > 1 or band.size[1] < height:
                 dr.eval(parts[-1])
         values = dr.concat(parts) if len(parts) > 1 else parts[0]
         parts.clear()

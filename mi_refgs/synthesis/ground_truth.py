@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import trimesh
 
@@ -33,7 +35,6 @@ class Materials(NamedTuple):
     @staticmethod
     def of(albedo: Any = None, roughness: Any = None, metallic: Any = None, known: Bool = True) -> Materials:
         """Materials of these values, where `known`; None is undefined."""
-        import mitsuba as mi
 
         def pair(kind: Any, value: Any) -> tuple[Any, Bool]:
             return (kind(0), mi.Bool(False)) if value is None else (kind(value), mi.Bool(known))
@@ -41,15 +42,11 @@ class Materials(NamedTuple):
         return Materials(pair(mi.Color3f, albedo), pair(mi.Float, roughness), pair(mi.Float, metallic))
 
     def where(self, mask: Bool, other: Materials) -> Materials:
-        import drjit as dr
-
         pairs = zip(self, other, strict=True)
         return Materials(*((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs))
 
     def cleaned(self) -> Materials:
         """Unknown where a value is not finite; clipped to 0 … 1 elsewhere."""
-        import drjit as dr
-        import mitsuba as mi
 
         def clean(value: Any, known: Bool) -> tuple[Any, Bool]:
             finite = known
@@ -62,8 +59,6 @@ class Materials(NamedTuple):
 
 def materials_at(scene: Scene, si: Any) -> Materials:
     """Materials of the scene's shapes at surface interactions `si`; of instances of groups unknown."""
-    import mitsuba as mi
-
     found, here = Materials.of(), si.bsdf()
     bsdfs = {id(bsdf): bsdf for shape in scene.shapes() if (bsdf := shape.bsdf()) is not None}
     for bsdf in bsdfs.values():
@@ -76,8 +71,6 @@ class _Parameters:
     """The parameters of one BSDF by name, evaluated at surface interactions."""
 
     def __init__(self, bsdf: Any, si: Any, active: Bool) -> None:
-        import mitsuba as mi
-
         self.bsdf, self.si, self.active = bsdf, si, active
         self.children, self.values = children_of(bsdf), mi.traverse(bsdf)
 
@@ -86,16 +79,12 @@ class _Parameters:
 
     def number(self, name: str, default: float = 0.0) -> Float:
         """A parameter as mi.Float; `default` without one."""
-        import mitsuba as mi
-
         if isinstance(texture := self.children.get(name), mi.Texture):
             return mi.Float(texture.eval_1(self.si, self.active))
         return mi.Float(self.values[name] if name in self.children else default)
 
     def colour(self, name: str, default: float = 1.0) -> Color3f:
         """A parameter as mi.Color3f; `default` without one."""
-        import mitsuba as mi
-
         texture = self.children.get(name)
         return mi.Color3f(default if texture is None else texture.eval(self.si, self.active))
 
@@ -118,8 +107,6 @@ def _principled(p: _Parameters) -> Materials:
 
 
 def _conductor(p: _Parameters) -> Materials:
-    import drjit as dr
-
     eta, k = p.colour("eta"), p.colour("k")
     # Reflectance at normal incidence; η = 0 (`material = none`) gives 1.
     f0 = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
@@ -128,9 +115,6 @@ def _conductor(p: _Parameters) -> Materials:
 
 
 def _plastic(p: _Parameters) -> Materials:
-    import drjit as dr
-    import mitsuba as mi
-
     albedo = p.colour("diffuse_reflectance")
     if "nonlinear = 1" in str(p.bsdf):  # no parameter says so
         inside = mi.fresnel_diffuse_reflectance(1 / p.number("eta", 1.5))
@@ -139,8 +123,6 @@ def _plastic(p: _Parameters) -> Materials:
 
 
 def _two_sided(p: _Parameters) -> Materials:
-    import drjit as dr
-
     front = p.si.wi.z > 0
     behind = type(p.si)(p.si)
     behind.wi.z = dr.abs(p.si.wi.z)
@@ -181,8 +163,6 @@ def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
 
 def triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of one shape, as `surface_mesh` has them."""
-    import mitsuba as mi
-
     if shape.is_mesh():
         return mesh_arrays(shape)
     name = shape.class_name()

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import GOLDEN_ANGLE, MAX_NUMBER
@@ -98,9 +100,6 @@ def camera_poses(
 
 def incident_image(scene: Scene, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
     """Path-traced radiance that arrives at a point (3,), on the grid of `environment_image`."""
-    import drjit as dr
-    import mitsuba as mi
-
     integrator = mi.load_dict({"type": "path", "max_depth": options.max_depth})
     sampler = mi.load_dict({"type": "independent"})
     passes = max(1, options.spp // OVERSAMPLING**2)
@@ -143,8 +142,6 @@ class Tracer:
     without alpha, and maps are of those shapes only."""
 
     def __init__(self, scene: Scene, cameras: Cameras, like: Camera | None = None) -> None:
-        import mitsuba as mi
-
         options, (low, high) = cameras.options, cameras.distance
         self.scene, self.cameras, self.objects = scene, cameras, cameras.objects
         self.width, self.height = options.resolution
@@ -173,9 +170,6 @@ class Tracer:
 
     def image(self, pose: np.ndarray, seed: int) -> np.ndarray:
         """Premultiplied linear RGBA (H, W, 4) of one view; RGB (H, W, 3) of an open scene."""
-        import drjit as dr
-        import mitsuba as mi
-
         self._look(pose)
         seeds = [seed, *np.random.SeedSequence(seed).generate_state(self.passes)[1:]]
         image = np.zeros((self.height, self.width, 3 if self.objects else 4))
@@ -187,9 +181,6 @@ class Tracer:
 
     def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
         """The maps of MAPS at pixel centres, where `covered` (H, W), which excludes hidden emitters."""
-        import drjit as dr
-        import mitsuba as mi
-
         self._look(pose)
         width, height = self.width, self.height
 
@@ -214,7 +205,5 @@ class Tracer:
         return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
 
     def _look(self, pose: np.ndarray) -> None:
-        import mitsuba as mi
-
         self.params["to_world"] = mi.ScalarTransform4f(pose)
         self.params.update()

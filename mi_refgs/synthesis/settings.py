@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import REGION_FILE
@@ -31,8 +32,6 @@ FILES = (
 
 def load_scene(scene: Path) -> Any:
     """Load a Mitsuba scene with all shapes and their ids: Mitsuba would merge meshes of one material."""
-    import mitsuba as mi
-
     try:
         with mitsuba_exr():
             loaded = mi.load_file(str(scene), optimize=False)
@@ -48,8 +47,6 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
     """The scene with a lat-long map (EXR, HDR) in place of its environment; its other emitters are kept.
     `objects`: shapes that are lit alone, without the other shapes and emitters. The map is rotated as the
     scene's own `envmap` is; without one, its y becomes z, which is up."""
-    import mitsuba as mi
-
     turned: Any = mi.ScalarTransform4f().rotate(*Z_UP)
     environment = scene.environment()
     if environment is not None:
@@ -67,8 +64,6 @@ def without(scene: Scene, objects: Sequence[Any]) -> Any:
 
 def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
     """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
-    import mitsuba as mi
-
     shapes = [shape for shape in scene.shapes() if not any(shape is one for one in objects)]
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
     lamps = [lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)]
@@ -76,8 +71,6 @@ def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
 
 
 def _scene_of(parts: Sequence[Any]) -> Any:
-    import mitsuba as mi
-
     return mi.load_dict({"type": "scene"} | {f"part_{i}": part for i, part in enumerate(parts)})
 
 
