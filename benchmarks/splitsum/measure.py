@@ -104,7 +104,6 @@ class Run:
     settings: Settings
     rows: list[dict[str, Any]] = field(default_factory=list)
     times: Times = field(default_factory=dict)
-    prefilter_ms: list[dict[str, Any]] = field(default_factory=list)
     scores: list[dict[str, Any]] = field(default_factory=list)
 
     def time(self, setup: Exact, calls: Calls) -> None:
@@ -138,7 +137,7 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     for setup in tqdm(stages, desc="references, path tracer", disable=quiet):
         for roughness, metallic in materials:
             _traced(run, setup, roughness, metallic)
-    filtered = _prefilter(run, lights)
+    filtered = _prefilter(settings, lights)
     for setup in tqdm(stages, desc="split sum, times", disable=quiet):
         run.time(setup, _split_sums(run, setup, filtered, materials) | _traced_calls(setup))
     shared = {(setup.name, setup.light.name): setup for setup in stages}
@@ -148,9 +147,7 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     return {
         "settings": vars(settings),
         "frequencies": {light.name: light.frequency() for light in lights},
-        "pixels": {setup.name: setup.points.count for setup in stages},
         "rows": [row | {"ms_per_mpx": time_of(run.times, row)} for row in run.rows],
-        "prefilter_ms": run.prefilter_ms,
         "scores": run.scores,
         "speed_ups": speed_ups(run.rows, run.times),
         "budgets": budgets,
@@ -182,20 +179,13 @@ def _traced_calls(setup: Exact) -> Calls:
 # ---------------- split sums ----------------
 
 
-def _prefilter(run: Run, lights: list[Light]) -> dict[tuple[str, int], Any]:
-    """Return every light at every height, by (light, height); books the time that the first one takes."""
+def _prefilter(settings: Settings, lights: list[Light]) -> dict[tuple[str, int], Any]:
+    """Return every light at every height, by (light, height)."""
     filtered = {}
     # One height after the other: only a few operators are kept at a time.
-    for height in run.settings.heights:
-        environments = [light.environment(height) for light in lights]
-        for light, environment in zip(lights, environments, strict=True):
-            filtered[light.name, height] = environment.prefilter()
-
-        def again(environment: Any = environments[0]) -> Any:
-            return environment.prefilter().levels
-
-        ms = timing.milliseconds({0: again}, run.settings.timing_seconds)[0]
-        run.prefilter_ms.append({"height": height, "ms": ms})
+    for height in settings.heights:
+        for light in lights:
+            filtered[light.name, height] = light.environment(height).prefilter()
     dr.eval([light.levels for light in filtered.values()])
     return filtered
 

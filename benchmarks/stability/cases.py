@@ -34,9 +34,7 @@ class Case:
     reflectance: str = "split_sum"
     diffuse: str = "sh"
     mesh: Callable[[], Mesh] | None = None  # made when it is needed
-    surface: Any = (
-        None  # vertices and faces of the mesh, and offset of rays: what the float64 reference traces
-    )
+    surface: Any = None  # vertices, faces and offset of rays, which the float64 reference traces
     further: float = 0.0  # rays may start so much further off the surface: nothing is compared there
     pixels: int | None = None  # the float64 reference sees a random subset of this size; None: all
     offset: tuple[int, int] = (0, 0)  # of a crop window in its film

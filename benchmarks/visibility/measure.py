@@ -29,7 +29,6 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     """Measure every scene; returns the JSON report."""
     scenes = [make_scene(name, settings.detail) for name in (*settings.scenes, *settings.meshes)]
     rows: list[Row] = []
-    facts: dict[str, Any] = {}
     for concave in tqdm(scenes, desc="scenes", disable=quiet):
         setup = Setup(concave, settings)
         found: list[Row] = []
@@ -38,14 +37,9 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
             found += _errors(setup, roughness)
         times = _times(setup)
         rows += [row | {"frame_ms": times.get(row["method"])} for row in found]
-        facts[setup.name] = {
-            "pixels": setup.points.count,
-            "triangles": len(concave.mesh.faces),
-            "surfels": setup.surfels.count,
-        }
     return {
         "settings": vars(settings) | {"meshes": [Path(name).name for name in settings.meshes]},
-        "scenes": facts,
+        "scenes": [concave.name for concave in scenes],
         "rows": rows,
         "tradeoffs": tradeoffs(rows),
     }

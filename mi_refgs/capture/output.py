@@ -113,7 +113,7 @@ def write_images(
             jpeg = photograph.path.suffix.lower() in (".jpg", ".jpeg")
             kind = {"format": "JPEG", "quality": QUALITY, "subsampling": 0} if jpeg else {"format": "PNG"}
             pixels = Image.fromarray(camera.resample(np.asarray(photograph.load())))
-            replace_file(image, lambda path: pixels.save(path, exif=photograph.exif(), **kind))
+            replace_file(image, lambda path: pixels.save(path, **kind))
         if masks:
             mask = camera.resample(mask_pixels(masks[photograph.name], photograph))[..., 0]
             target = folder / MASKS / f"{photograph.name}.png"

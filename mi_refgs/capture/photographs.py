@@ -92,16 +92,6 @@ class Photograph:
         upright = ImageOps.exif_transpose(upright)
         return upright.transpose(Image.Transpose.ROTATE_90) if self.lying else upright
 
-    def exif(self) -> bytes:
-        """The EXIF data for an image in display orientation; empty if the file's are broken."""
-        with open_image(self.path) as image:
-            try:
-                data = image.getexif()
-                data[ORIENTATION] = 1
-                return bytes(data.tobytes())
-            except Exception:  # Pillow raises many types for broken EXIF data
-                return b""
-
 
 def find_photographs(folder: Path) -> list[Photograph]:
     """The photographs of a folder by name, rotated as most of them are: so all have one size and one lens.

@@ -19,7 +19,6 @@ PROBE_TIMEOUT = 60.0  # time limit of the trial kernel in seconds; it usually ta
 
 EXTRAS = {
     "lpips": "lpips",
-    "flip": "flip-evaluator",
     "capture": "pycolmap",
     "view": "viser",
     "export": "xatlas",

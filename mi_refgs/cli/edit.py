@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from mi_refgs.cli.command import OtherData, Output, Rendering, Result, RunFolder, joined
+from mi_refgs.cli.command import Output, Rendering, Result, RunFolder, joined
 from mi_refgs.editing.options import Change, Selection
 from mi_refgs.errors import InputError
 from mi_refgs.io.progress import say
@@ -21,7 +21,6 @@ class Edit:
     run_folder: RunFolder
     output: Output
     """new run folder"""
-    data: OtherData = None
     selection: Selection = Selection()
     change: Change = Change()
     common: Rendering = Rendering()
@@ -41,7 +40,6 @@ class Edit:
         if self.selection.where is not None:
             parse_condition(self.selection.where)
         before = load(self.run_folder, write=False)
-        before = replace(before, provenance=before.provenance.with_data(self.data))
         try:
             after = before.edit(**options)
         except InputError as error:

@@ -20,7 +20,6 @@ from mi_refgs.cli.command import (
     joined,
     optional,
 )
-from mi_refgs.cli.view import HOST, PORT, Port
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +45,6 @@ class Train:
     set: Settings = ()
     resume: Flag = False
     """continue the run from its newest checkpoint"""
-    watch: Flag = False
-    """display images and curves of the fit in the browser"""
-    port: Port = PORT
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -56,10 +52,6 @@ class Train:
         from mi_refgs.reconstruction.fit import ProgressBar, fit
 
         progress = ProgressBar()
-        if self.watch:
-            from mi_refgs.viewer.training import TrainingViewer
-
-            progress = TrainingViewer(HOST, self.port)
         begin = time.monotonic()
         given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
         given |= {"settings": joined(self.set), "purpose": self.purpose}

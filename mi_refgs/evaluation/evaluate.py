@@ -39,7 +39,7 @@ SHEET, METRICS = "contact_sheet.png", "metrics.json"
 LONGEST_STEM = 60  # characters of a view in a file's name; file systems allow 255 bytes
 SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
 ORANGE = np.array([0.75, 0.3, 0.0])  # of concave pixels
-MEANS = """psnr psnr_gain psnr_registered ssim flip lpips psnr_region ssim_region region_share normal_mae_deg
+MEANS = """psnr psnr_gain psnr_registered ssim lpips psnr_region ssim_region region_share normal_mae_deg
     normal_mae_deg_full""".split()  # scores of views whose means are reported
 
 
@@ -156,8 +156,7 @@ def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:
     for name in MEANS:
         values = [scores[name] for scores in per_view if scores.get(name) is not None]
         result[name] = float(np.mean(values)) if values else None
-    for name in ("flip", "lpips"):
-        result[f"{name}_reason"] = per_view[0][f"{name}_reason"] or None
+    result["lpips_reason"] = per_view[0]["lpips_reason"] or None
     for name, key, reason in (
         ("region", "psnr_region", "the data set has no region of interest"),
         ("normal", "normal_mae_deg", "the data set has no ground-truth normals"),
@@ -172,9 +171,8 @@ def _scores(rendered: RenderedView, view: View, data: Dataset, first: dict[str, 
     image, truth = rendered.image, view.displayed
     scores: dict[str, Any] = {"name": view.name}
     scores |= {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth)}
-    for name, measure in (("flip", metrics.flip), ("lpips", metrics.lpips)):
-        reason = first.get(f"{name}_reason")  # a metric that is not installed stays so
-        scores[name], scores[f"{name}_reason"] = (None, reason) if reason else measure(image, truth)
+    reason = first.get("lpips_reason")  # a metric that is not installed stays so
+    scores["lpips"], scores["lpips_reason"] = (None, reason) if reason else metrics.lpips(image, truth)
     if data.region is not None and (where := region_pixels(view, data.region)).any():
         scores["psnr_region"] = metrics.psnr(image, truth, where)
         scores["ssim_region"] = metrics.ssim(image, truth, where)

@@ -67,16 +67,6 @@ def _lpips_network() -> Any:
     return package.LPIPS(net="alex", verbose=False).eval()  # as the authors recommend for comparing images
 
 
-def flip(image: np.ndarray, truth: np.ndarray) -> tuple[float | None, str]:
-    """Return (mean LDR FLIP at 67 pixels per degree, ""), or (None, reason) without the extra `flip`."""
-    try:
-        import flip_evaluator
-    except ImportError:
-        return None, "not installed: pip install 'mi_refgs[flip]'"
-    image, truth = (np.ascontiguousarray(array, dtype=np.float32) for array in _pair(image, truth))
-    return float(flip_evaluator.evaluate(truth, image, "LDR", applyMagma=False)[1]), ""
-
-
 def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if np.shape(image) != np.shape(truth):
         sizes = f"{np.shape(image)} and {np.shape(truth)}"
@@ -113,8 +103,6 @@ def environment(light: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     weighted by solid angle, on the fitted one's grid. Keys: `env_scale` (three numbers), `env_mae` (linear),
     `env_psnr` (dB, sRGB-encoded in [0, 1]) and `env_correlation` (Pearson, of the same)."""
     light, truth = np.asarray(light, np.float64), np.asarray(truth, np.float64)
-    if not np.all(np.isfinite(truth)):
-        raise InputError("need finite values; write the map again", "metrics", "ground-truth environment")
     rows = lobe_matrices.resampling(len(truth), len(light)).toarray()
     columns = lobe_matrices.resampling(truth.shape[1], light.shape[1], periodic=True).toarray()
     truth = np.einsum("ih,jw,hwc->ijc", rows, columns, truth, optimize=True)

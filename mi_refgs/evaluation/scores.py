@@ -29,7 +29,6 @@ SCORES = (
     Score("ssim", "SSIM", "{:.4f}", compared=True, higher=True),
     Score("psnr_region", "PSNR, region of interest", "{:.2f}", " dB"),
     Score("ssim_region", "SSIM, region of interest", "{:.4f}"),
-    Score("flip", "FLIP", "{:.4f}", "", "flip", compared=True, higher=False),
     Score("lpips", "LPIPS", "{:.4f}", "", "lpips", compared=True, higher=False),
     Score("normal_mae_deg", "normal error, foreground", "{:.2f}", "°", "normal", True, False, concave=True),
     Score("normal_mae_deg_full", "normal error, whole image", "{:.2f}", "°", "normal", True, False),

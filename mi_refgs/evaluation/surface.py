@@ -30,9 +30,7 @@ QUERIES = 20_000  # points per surface whose distances are averaged
 TARGETS = 200_000  # points on a surface among which the nearest are searched
 CANDIDATES = 8  # nearest of these points, to whose triangles the distance is computed
 GRAZING = 0.1  # cosine to the viewing ray below which a view does not see a point
-NEAR_TRUTH = (
-    1.2  # radius, in radii of the true surface, within which an open scene's mesh is compared with it
-)
+NEAR_TRUTH = 1.2  # radii of the true surface within which an open scene's mesh is compared with it
 SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
 NO_SURFACE = f"the data set has no true surface: {SURFACE}, which `refgs dataset` writes"
 

@@ -132,12 +132,12 @@ class Trainer:
         """The camera of a training view, with the correction that was fitted."""
         return per_view.camera_of(self.setup, self.fit.params, index)
 
-    def view(self, camera: Camera, aovs: bool = True, object_only: bool = False) -> Frame:
+    def view(self, camera: Camera, aovs: bool = True) -> Frame:
         """Render the present state as its export does, without derivatives."""
         with dr.suspend_grad():
             shading = self.shading().antialiased()
             self.fit.update_missing_caches(shading)
-            light, around = shading.light_of(self.fit.light), None if object_only else self.fit.surroundings
+            light, around = shading.light_of(self.fit.light), self.fit.surroundings
             scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around, self.fit.near)
             degree = self.setup.sh_degree(self.iteration)
             return render(scene, camera, Request(scene.all_aovs if aovs else (), not aovs, sh_degree=degree))

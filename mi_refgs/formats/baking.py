@@ -155,7 +155,7 @@ def texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, UI
 def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Frame]) -> Mesh:
     """Move a mesh of expected depths along its normals until it covers as many pixels as the surfels do."""
     covered = sum(float(dr.sum(renderer(view).object_alpha)[0]) for view in views)
-    normals = _normals(mesh)
+    normals = mesh.normals().astype(np.float32)
 
     def moved(voxels: float) -> Mesh:
         return replace(mesh, vertices=(mesh.vertices + voxels * mesh.voxel * normals).astype(np.float32))
@@ -173,13 +173,6 @@ def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Fra
         middle = (low + high) / 2
         low, high = (middle, high) if excess(middle) < 0 else (low, middle)
     return moved((low + high) / 2)
-
-
-def _normals(mesh: Mesh) -> np.ndarray:
-    """Return outward unit normals (V, 3) float32 of the triangles around each vertex."""
-    # In voxels: trimesh takes triangles of less than 1e-14 square units for points.
-    scaled = (mesh.vertices - mesh.vertices[0]) / mesh.voxel
-    return np.array(trimesh.Trimesh(scaled, mesh.faces, process=False).vertex_normals, np.float32)
 
 
 def _columns(model: Reflectance, values: Mapping[str, Array]) -> list[Float]:
@@ -204,7 +197,7 @@ def _points(
     columns = nearby.values(scene.surfels, scene.shading.required_attributes)
     values = {name: own[0] if len(own) == 1 else mi.Color3f(*own) for name, own in columns.items()}
     materials = [interpolated(column) for column in _columns(scene.shading.model, values)]
-    normal = mi.Vector3f(*(interpolated(upload(column)) for column in _normals(mesh).T))
+    normal = mi.Vector3f(*(interpolated(upload(column)) for column in mesh.normals().astype(np.float32).T))
     points = mi.Point3f(*(interpolated(upload(column)) for column in mesh.vertices.T))
     return points, [*materials, *safe_normalize(normal)]
 

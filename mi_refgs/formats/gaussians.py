@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.formats.format import Shot, remember_last
+from mi_refgs.formats.format import Shot
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -45,7 +45,6 @@ STEPS = 3  # conjugate-gradient steps after the first
 DAMPING = 0.1  # λ, over the 1/4π that Y² is on average
 
 
-@remember_last
 def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_only: bool) -> Surfels:
     """The scene as 3D Gaussians with display-encoded radiance_sh; `object_only`: without background ones."""
     if not 0 <= degree <= MAX_SH_DEGREE:

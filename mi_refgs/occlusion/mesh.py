@@ -41,6 +41,12 @@ class Mesh:
         used, faces = np.unique(self.faces[kept], return_inverse=True)
         return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.uint32), self.voxel)
 
+    def normals(self) -> np.ndarray:
+        """Outward unit normals (V, 3) of the triangles around each vertex."""
+        # In voxels: trimesh takes triangles of less than 1e-14 square units for points.
+        scaled = (self.vertices - self.vertices[0]) / self.voxel
+        return np.asarray(trimesh.Trimesh(scaled, self.faces, process=False).vertex_normals)
+
     def of_vertices(self, kept: np.ndarray) -> Mesh:
         """The triangles all of whose vertices are kept (V,) bool."""
         return self.part(kept[self.faces].all(axis=1))

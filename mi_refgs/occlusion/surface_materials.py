@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from mi_refgs.errors import InputError
@@ -180,9 +179,7 @@ def _corners(
 
 def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Outward unit normals (V, 3): weighted ones (V, K, 3) of the surfels where the mesh's agree."""
-    # In voxels: trimesh takes triangles of less than 1e-14 square units for points.
-    scaled = (mesh.vertices - mesh.vertices[0]) / mesh.voxel
-    own = np.asarray(trimesh.Trimesh(scaled, mesh.faces, process=False).vertex_normals)
+    own = mesh.normals()
     outward = np.where((neighbours * own[:, None]).sum(-1) < 0, -1.0, 1.0)
     mean = (neighbours * (weight * outward)[..., None]).sum(1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)

@@ -7,12 +7,10 @@ metrics.json  contact_sheet.png  eval/                                 by `evalu
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
 import sys
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -179,16 +177,6 @@ class Run:
     def _make_folders(self) -> None:
         for name in ("checkpoints", "previews"):
             make_folder(self.path / name)
-
-
-def read_log(path: Path, names: Sequence[str]) -> list[dict[str, float]]:
-    """These numbers of the lines of a log that are complete and have all of them."""
-    lines = []
-    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
-        with contextlib.suppress(ValueError, KeyError, TypeError):  # being written, or of a killed process
-            line = json.loads(text)
-            lines.append({name: float(line[name]) for name in names})
-    return lines
 
 
 def _logged(line: str) -> float:

@@ -54,7 +54,6 @@ class RenderLoop:
         self.look = DisplayOptions(backdrop=scene.backdrops[0])
         self.report: Callable[[str], None] = lambda message: None  # called with a sentence about a failure
         self.delivered = 0  # images
-        self.smooth = True  # images at rest are supersampled
         self._tasks: dict[Any, Callable[[], None]] = {}
         self._wake = threading.Condition()
 
@@ -104,8 +103,7 @@ class RenderLoop:
             self._succeeds(task)
 
         def wait_of(client: Client) -> float:
-            progress = client.progress if self.smooth or client.progress < LARGE else DONE
-            return resolution.due(progress, self.clock() - client.changed)
+            return resolution.due(client.progress, self.clock() - client.changed)
 
         waiting = [client for client in tuple(self.clients.values()) if client.pose is not None]
         if not waiting:

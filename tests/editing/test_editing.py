@@ -309,18 +309,9 @@ def test_an_edited_run_is_not_resumed(finished: Path, data: Path, tmp_path: Path
     assert files(new) == before
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--set", "roughness=0.5", "--where", "x > 1e9"], "choose a wider one"),
-        (["--cut", "--data", "none"], "--data: no such folder"),
-    ],
-)
-def test_a_bad_command_writes_nothing(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    refused(["edit", finished, "-o", tmp_path / "new", *options], message)
+def test_a_bad_command_writes_nothing(finished: Path, tmp_path: Path) -> None:
+    nowhere = ["--set", "roughness=0.5", "--where", "x > 1e9"]
+    refused(["edit", finished, "-o", tmp_path / "new", *nowhere], "choose a wider one")
     assert not any(tmp_path.iterdir())
 
 

@@ -31,7 +31,7 @@ from tests.scenes.open_pair import CASES, Pair
 from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
 KEYS = (
-    "psnr ssim flip flip_reason lpips lpips_reason normal_mae_deg normal_mae_deg_full normal_reason "
+    "psnr ssim lpips lpips_reason normal_mae_deg normal_mae_deg_full normal_reason "
     "albedo_psnr albedo_scale albedo_reason roughness_mae roughness_reason metallic_mae metallic_reason "
     "surface_distance surface_accuracy surface_completeness surface_reason concave_share concave_reason "
     "psnr_concave normal_mae_deg_concave albedo_psnr_concave surface_distance_concave "
@@ -101,7 +101,7 @@ def test_metrics_equal_those_of_the_trainer(
     assert result["iterations"] == 6 and result["method"] == "tiny" and result["preset"] == "quick"
     assert 0 < result["ms_per_frame"] and result["train_seconds"] > 0
     assert 0 <= result["normal_mae_deg_full"] < result["normal_mae_deg"] <= 180
-    for key in ("flip", "lpips", "normal", "env", "albedo", "roughness", "metallic", "surface", "concave"):
+    for key in ("lpips", "normal", "env", "albedo", "roughness", "metallic", "surface", "concave"):
         names = [name for name in result if name.startswith(key) and not name.endswith(("reason", "concave"))]
         missing = any(result[name] is None for name in names)
         assert missing == bool(result[f"{key}_reason"]), key

@@ -22,8 +22,6 @@ from mi_refgs.editing.change import apply, assignments
 from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.state import FitState
-from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import to_8_bits
 from mi_refgs.methods.read import load
@@ -31,7 +29,7 @@ from mi_refgs.render import passes
 from mi_refgs.render.display import image_array
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.relightable import relightable
-from mi_refgs.runs.run import Run, read_log
+from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat import Camera
@@ -41,11 +39,9 @@ from mi_refgs.viewer.panels import light_of, write_view
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE
-from mi_refgs.viewer.training import Training, TrainingPage
 from mi_refgs.viewer.viewer_scene import DisplayOptions, ViewerScene, displayed_planes
 from tests.helpers import ROOT, refused
 from tests.scenes.known import with_background
-from tests.scenes.tiny import SETTINGS
 
 
 @pytest.fixture
@@ -400,19 +396,6 @@ def test_a_photographed_object_is_displayed_with_or_without_background(photograp
         assert np.array_equal(ours, theirs) and not np.array_equal(ours, all_)
 
 
-def test_a_fit_is_displayed_with_or_without_background(
-    data: Path, method: Path, photographed: TrainedScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trainer = Trainer(load(str(method), "quick", SETTINGS), read_dataset(data, "train"))
-    drawable = Training(trainer)
-    assert "background" not in drawable.backdrops
-    before = shown(drawable)
-    monkeypatch.setattr(FitState, "surroundings", photographed.surroundings)
-    assert Training(trainer).backdrops == ("background", "white", "grey", "black")
-    assert np.array_equal(shown(drawable), before)
-    assert np.abs(shown(drawable, backdrop="background") - before).max() > 50
-
-
 def saved(scene: TrainedScene, folder: Path, **options: Any) -> Path:
     """Save a view (20, 32) of a scene from the front; the path of its PNG."""
     return write_view(ReconstructionView(scene), front(1.6), (32, 20), DisplayOptions(**options), folder)
@@ -466,44 +449,3 @@ def test_a_run_without_a_fit_is_refused(data: Path, tmp_path: Path) -> None:
 def test_a_missing_viser_is_refused(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     refused(["view", finished], 'view: viser is not installed; pip install "mi_refgs[view]"')
-
-
-def test_a_fit_draws_only_for_open_pages_and_a_share_of_its_time(
-    data: Path, method: Path, tmp_path: Path
-) -> None:
-    views, clock = read_dataset(data, "train"), Clock()
-    trainer = Trainer(load(str(method), "quick", SETTINGS), views)
-    page = TrainingPage(trainer, Run(tmp_path), ("127.0.0.1", 0), clock)
-    drawn: list[Camera] = []
-    draw, loop = page.scene.draw, page.loop
-
-    def slow(camera: Camera, look: DisplayOptions, settled: bool) -> Any:
-        drawn.append(camera)
-        clock.now += 0.5
-        return draw(camera, look, settled)
-
-    def steps(count: int) -> None:
-        for _ in range(count):
-            clock.now += 0.1
-            page.step()
-
-    try:
-        page.scene.draw = slow  # type: ignore[method-assign]
-        steps(20)
-        assert drawn == []
-        seen: list[DeliveredImage] = []
-        loop.clients[1] = Client(seen.append)
-        loop.change(1, pose=Pose.of_view(views.views[0]), window=(640, 400))
-        steps(100)
-        taken = 10 + 0.5 * len(drawn)
-        assert 0.2 * taken < 0.5 * len(drawn) < 0.25 * taken + 0.6
-        assert seen[0].image.std() > 1
-    finally:
-        page.close()
-
-
-def test_the_curves_have_the_complete_lines_of_the_log(tmp_path: Path) -> None:
-    log, names = tmp_path / "metrics.jsonl", ("iteration", "loss")
-    assert read_log(log, names) == []
-    log.write_text('{"iteration": 1, "loss": 0.5}\n{"iteration": 2}\n{"iteration": 3, ')
-    assert [row["iteration"] for row in read_log(log, names)] == [1]
