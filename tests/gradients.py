@@ -57,12 +57,12 @@ def path_traced(_: Path) -> mi.Scene:
 
 
 SCENES: dict[str, tuple[Callable[[Path], mi.Scene], str]] = {
+    "refgs_bsdf": (path_traced, "ball.bsdf."),
     "surfels": (lambda to: scenes.open_scene(mesh=scenes.plane_mesh(to), aovs="n:normal,d:depth"), ""),
     "Gaussian shader": (gaussian_shader, "integrator."),
     "emitters": (emitters, "s"),
     "constant": (lambda _: scenes.lit_scene({"type": "constant"}), "sky."),
     "ignored": (ignored, ""),
-    "refgs_bsdf": (path_traced, "ball.b."),
 }
 """What makes each scene, and the beginning of the keys that it adds to the table."""
 
@@ -72,12 +72,16 @@ def parameters(folder: Path) -> Iterator[tuple[str, mi.Scene, bool]]:
     seen: set[str] = set()
     for name, (make, prefix) in SCENES.items():
         of = make(folder)
-        params = mi.traverse(of)
-        for key in params.keys():
-            value = getattr(params[key], "matrix", params[key])
-            if dr.is_diff_v(value) and dr.is_float_v(value) and key.startswith(prefix) and key not in seen:
-                seen.add(key)
-                yield key, of, name != "ignored"
+        new = [key for key in differentiable(of) if key.startswith(prefix) and key not in seen]
+        assert new, name
+        yield from ((key, of, name != "ignored") for key in new)
+        seen |= {*new}
+
+
+def differentiable(of: mi.Scene) -> list[str]:
+    """The parameters whose types can have gradients."""
+    values = {key: getattr(value, "matrix", value) for key, value in mi.traverse(of).items()}
+    return [key for key, value in values.items() if dr.is_diff_v(value) and dr.is_float_v(value)]
 
 
 def refusals(of: mi.Scene, key: str) -> set[str]:

@@ -23,6 +23,7 @@ from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import attribute
+from tests.gradients import differentiable
 from tests.scenes.integrator import hollow_mesh, integrator, lit_scene, raw_channels, sensor, sky
 
 TOLERANCE = 1e-5  # relative to the largest entry of the sum, per parameter: sums by scatter are in any order
@@ -63,7 +64,12 @@ def open_scene(**changes: Any) -> Any:
 
 
 def lit(emitter: dict[str, Any]) -> Any:
-    return lit_scene(emitter, raw=every_channel("split_sum", "sh", False), aovs="s:specular")
+    return lit_scene(
+        emitter,
+        {"sun": {"type": "directional", "direction": [-1, -1, -0.5]}},
+        raw=every_channel("split_sum", "sh", False),
+        aovs="s:specular",
+    )
 
 
 def map_of(rows: int, columns: int, folder: Path) -> dict[str, Any]:
@@ -110,9 +116,18 @@ SCENES: dict[str, Callable[[Path], Any]] = {
 SAMPLE = {"traced bounces", "BSDF, prb"}  # tested without `-m slow`; `test_option_pairs` tests others
 
 
-def is_trained(key: str) -> bool:
-    mine = key.startswith("integrator.") and not key.endswith("to_world")  # a motion, not numbers that add
-    return mine or key.endswith((".data", "sky.scale", "sky.radiance.value"))
+def trained(scene: Any) -> list[str]:
+    """Parameters that have derivatives; with Mitsuba's integrators, those of the BSDF and the light."""
+    keys = [key for key in differentiable(scene) if not key.startswith("ball.to_world")]
+    own = scene.integrator().class_name() == "SamplingIntegrator"
+    return keys if own else [key for key in keys if key.endswith((".data", "sky.radiance.value"))]
+
+
+def numbers(value: Any) -> Any:
+    """The numbers of a parameter (mi.Float), under AD."""
+    if not hasattr(value, "matrix"):
+        return dr.ravel(value)
+    return dr.concat([value.matrix[i, j] for i in range(4) for j in range(4)])
 
 
 class Losses:
@@ -120,9 +135,9 @@ class Losses:
 
     def __init__(self, scene: Any, without: tuple[str, ...] = ()) -> None:
         self.scene, self.params = scene, mi.traverse(scene)
-        kept = [key for key in self.params.keys() if is_trained(key) and key not in without]
-        self.base = {key: np.array(dr.ravel(self.params[key])) for key in kept}
-        self.shape = {key: tuple(self.params[key].shape) for key in kept}
+        kept = [key for key in trained(scene) if key not in without]
+        self.base = {key: np.array(numbers(self.params[key])) for key in kept}
+        self.shape = {key: tuple(getattr(self.params[key], "shape", (16,))) for key in kept}
         self.keys = kept
         rng = np.random.default_rng(0)
         self.picked = {key: mi.UInt32(rng.integers(0, x.size, 2 * x.size)) for key, x in self.base.items()}
@@ -146,16 +161,15 @@ class Losses:
         """New leaves of the AD graph in place of the parameters `keys`, and new constants of the others."""
         made = {}
         for key, values in self.base.items():
-            flat = mi.Float(values)
-            leaf = mi.TensorXf(flat, self.shape[key])
-            if type(self.params[key]) is mi.Color3f:
-                leaf = mi.Color3f(*(mi.Float(float(x)) for x in values))
-            elif type(self.params[key]) is mi.Float:
-                leaf = flat
+            kind = type(self.params[key])
+            made_of = mi.Matrix4f if kind is mi.Transform4f else kind
+            several = dr.depth_v(made_of) > 1  # a colour or a matrix
+            parts = [mi.Float(float(x)) for x in values] if several else [mi.Float(values)]
+            leaf = made_of(*parts) if kind is not mi.TensorXf else mi.TensorXf(*parts, self.shape[key])
             if key in self.keys:
                 dr.enable_grad(leaf)
                 made[key] = leaf
-            self.params[key] = leaf
+            self.params[key] = kind(leaf)
         self.params.update()
         return made
 
@@ -179,7 +193,8 @@ class Losses:
         """Sum of squares of what is read of each parameter."""
         total = mi.Float(0)
         for key in self.keys:
-            value = read(key, self.params[key])
+            value = self.params[key]
+            value = read(key, value if isinstance(value, mi.TensorXf) else numbers(value))
             total += dr.sum(dr.square(dr.ravel(value)))
         return total
 

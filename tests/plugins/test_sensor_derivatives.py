@@ -1,4 +1,4 @@
-"""Derivatives of mi.render with respect to a sensor's `to_world` and `x_fov`."""
+"""Derivatives of mi.render with respect to a sensor's `to_world`, `x_fov` and principal point."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from tests.scenes.integrator import (
     sensor,
 )
 
-POSE, ANGLE = "sensor.to_world", "sensor.x_fov"
+POSE, ANGLE, CENTRE = "sensor.to_world", "sensor.x_fov", "sensor.principal_point_offset_"
 FOV = 45.0  # degrees
-START = np.array([0.06, -0.1, 0.08, 0.04, 0.06, -0.02, 0.03], np.float32)
-"""Where derivatives are taken: a motion, and the relative change of the field of view."""
+START = np.array([0.06, -0.1, 0.08, 0.04, 0.06, -0.02, 0.03, 0, 0], np.float32)
+"""Where derivatives are taken: a motion, the relative change of the field of view, the principal point."""
 
 
 @dataclass
 class Moved:
-    """A scene whose sensor has another pose and field of view, by (7,) numbers under AD."""
+    """A scene whose sensor has another pose and lens, by (9,) numbers under AD."""
 
     of: mi.Scene
 
@@ -49,7 +49,9 @@ class Moved:
 
     def image(self, values: mi.Float, **arguments: Any) -> mi.TensorXf:
         self.params[POSE] = transform(values) @ self.start
-        self.params[ANGLE] = self.angle * (1 + dr.gather(mi.Float, values, dr.opaque(mi.UInt32, 6)))
+        angle, x, y = (dr.gather(mi.Float, values, dr.opaque(mi.UInt32, i)) for i in (6, 7, 8))
+        self.params[ANGLE] = self.angle * (1 + angle)
+        self.params[f"{CENTRE}x"], self.params[f"{CENTRE}y"] = x, y
         self.params.update()
         return mi.render(self.of, self.params, **arguments)
 
@@ -94,7 +96,8 @@ class Pair:
     def camera(self, values: np.ndarray) -> PinholeCamera:
         focal = -0.5 * WIDTH / np.tan(np.radians(FOV / (1 + float(START[6])) * (1 + values[6])) / 2)
         pose = moved_pose(self.start, values[:6])
-        return replace(self.case.camera, fx=focal, fy=focal, to_world=pose)
+        x, y = self.case.camera.cx - WIDTH * values[7], self.case.camera.cy - HEIGHT * values[8]
+        return replace(self.case.camera, fx=focal, fy=focal, cx=x, cy=y, to_world=pose)
 
     def planes(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Channels (H, W, C) as the plugin has them, and where a declared discontinuity is near."""
@@ -164,7 +167,7 @@ def test_derivatives_are_those_of_differences(kind: str, tmp_path: Path) -> None
     def rendered(values: mi.TensorXf) -> mi.TensorXf:
         return moved.image(values.array, spp=4 if kind != "antialias" else 1)
 
-    check_image_derivatives(rendered, np.zeros(7, np.float32), kind)
+    check_image_derivatives(rendered, np.zeros(9, np.float32), kind)
 
 
 def test_only_rigid_changes_have_derivatives() -> None:
