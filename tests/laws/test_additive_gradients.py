@@ -113,14 +113,15 @@ SCENES: dict[str, Callable[[Path], Any]] = {
     "BSDF, prb": lambda _: textured_scene("prb"),
 }
 
+RESAMPLED = "sky.data", "resampled envmap"
 SAMPLE = {"traced bounces", "BSDF, prb"}  # tested without `-m slow`; `test_option_pairs` tests others
 
 
 def trained(scene: Any) -> list[str]:
-    """Parameters that have derivatives; with Mitsuba's integrators, those of the BSDF and the light."""
-    keys = [key for key in differentiable(scene) if not key.startswith("ball.to_world")]
-    own = scene.integrator().class_name() == "SamplingIntegrator"
-    return keys if own else [key for key in keys if key.endswith((".data", "sky.radiance.value"))]
+    """Parameters that fits have; those of all sensors and transformations have a test of their own."""
+    ends = ".data", "sky.scale", "sky.radiance.value"
+    keys = (key for key in differentiable(scene) if not key.endswith("to_world"))
+    return [key for key in keys if key.startswith("integrator.") or key.endswith(ends)]
 
 
 def numbers(value: Any) -> Any:
@@ -133,9 +134,9 @@ def numbers(value: Any) -> Any:
 class Losses:
     """A scene and its parameters, and losses of all of them by name, whose weights are drawn once."""
 
-    def __init__(self, scene: Any, without: tuple[str, ...] = ()) -> None:
+    def __init__(self, scene: Any, kept: list[str] | None = None) -> None:
         self.scene, self.params = scene, mi.traverse(scene)
-        kept = [key for key in trained(scene) if key not in without]
+        kept = trained(scene) if kept is None else kept
         self.base = {key: np.array(numbers(self.params[key])) for key in kept}
         self.shape = {key: tuple(getattr(self.params[key], "shape", (16,))) for key in kept}
         self.keys = kept
@@ -230,7 +231,7 @@ def losses(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     mi.set_variant("llvm_ad_rgb")
     scene = SCENES[request.param](tmp_path_factory.mktemp("scene"))
     # Mitsuba's texels of a map that is resampled have no derivative, and say so.
-    return Losses(scene, ("sky.data",) if request.param == "resampled envmap" else ())
+    return Losses(scene, [key for key in trained(scene) if (key, request.param) != RESAMPLED])
 
 
 def check_additive(
@@ -262,6 +263,12 @@ def test_gradients_of_every_pair_of_losses_add(set_threads: Callable[[int], None
         losses.keys = [key]
         alone = {name: losses.gradient(name) for name in losses.terms}
         check_additive(losses, alone, [*permutations(losses.terms, 2)])
+
+
+def test_gradients_of_cameras_and_rotations_add(tmp_path: Path) -> None:
+    scene = lit(map_of(16, 32, tmp_path))
+    losses = Losses(scene, [key for key in differentiable(scene) if key.startswith("s")])
+    check_additive(losses, losses.gradients, [names := (*losses.terms,), names[::-1]])
 
 
 def test_every_parameter_has_a_gradient(losses: Losses) -> None:
