@@ -61,7 +61,7 @@ class PackedRows:
         copies = 4 * dr.width(self.data) * dr.thread_count()
         mode = dr.ReduceMode.Expand if copies <= COPIES_BYTES else dr.ReduceMode.Local
         if dr.backend_v(self.data) == dr.JitBackend.CUDA:
-            mode = dr.ReduceMode.Direct  # sums within a warp first take eight times as long: docs/gpu.md
+            mode = dr.ReduceMode.Direct  # `Local` takes twice as long, `Expand` eight times: docs/gpu.md
         for place, group in self._groups(row, values):
             dr.scatter_add(self.data, group, place, active, mode=mode)
 
