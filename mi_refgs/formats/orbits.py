@@ -16,7 +16,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
 
-AROUND = {"test": 4, "train": 60}  # cameras around an object without a data set
+CAMERAS = {"test": 4, "train": 60}  # cameras around an object without a data set
 SIZE, FIELD_OF_VIEW = 512, 40.0  # pixels and degrees of their square images
 ELEVATION = (-10.0, 70.0)  # degrees
 INSIDE = 0.98  # fraction of the surfels, by opacity, in the sphere that fills these images; others are strays
@@ -25,7 +25,7 @@ SIGMAS = 2.0  # standard deviations around its centre up to which a surfel is in
 
 def shots_around(
     surfels: Surfels,
-    counts: Mapping[str, int] = AROUND,  # by split
+    counts: Mapping[str, int] = CAMERAS,  # by split
     size: int = SIZE,  # pixels per side
     elevation: tuple[float, float] = ELEVATION,  # degrees
 ) -> list[Shot]:

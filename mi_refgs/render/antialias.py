@@ -17,7 +17,7 @@ from mi_refgs.types import Float
 
 NODE = 0.5 / math.sqrt(3)  # pixels from the centre, per axis: Gauss-Legendre, exact for cubic radiance
 NODES = [(x, y) for y in (-1, 1) for x in (-1, 1)]  # quadrant of each point
-AROUND = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # steps to the neighbours
+STEPS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # steps to the neighbours
 
 
 def averaged(
@@ -48,8 +48,8 @@ def averaged(
 
 def _interpolated(plane: Float, camera: Camera, pixels: CompactedPixels | None) -> list[Float]:
     """Values (P,) at each of NODES of a plane (P,) given at pixel centres."""
-    beside = neighbours(plane, camera.width, camera.height, AROUND, pixels)
-    at = dict(zip(AROUND, beside, strict=True))
+    beside = neighbours(plane, camera.width, camera.height, STEPS, pixels)
+    at = dict(zip(STEPS, beside, strict=True))
     side, corner = NODE * (1 - NODE), NODE**2
     centre = (1 - NODE) ** 2 * plane
     return [centre + side * (at[x, 0] + at[0, y]) + corner * at[x, y] for x, y in NODES]

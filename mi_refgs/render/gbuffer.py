@@ -17,7 +17,7 @@ from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.types import Array, Float
 
 OBJECT = "object"  # slot of the object's opacity; where it is blended, slots are divided by it
-AROUND = "surroundings"  # slot of the radiance of the surroundings
+SURROUNDINGS = "surroundings"  # slot of the radiance of the surroundings
 Slots = Mapping[str, Any]  # values by name, such as mi.Color3f; each costs time in every pair
 
 

@@ -21,7 +21,7 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.kernels.timing import boundary
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.antialias import averaged
-from mi_refgs.render.gbuffer import AROUND, OBJECT, GBuffer, features, inverse_alpha, joined_slots
+from mi_refgs.render.gbuffer import OBJECT, SURROUNDINGS, GBuffer, features, inverse_alpha, joined_slots
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.near_field import LocalLight, NearField
@@ -244,7 +244,7 @@ def _shade_at_pixels(view: _View) -> Frame:
     # G-buffer: the model's attributes and the requested ones.
     slots = {"normal": view.points.normal} | view.points.attributes
     slots |= scene.surfels.values(view.asked - slots.keys())
-    others = {AROUND: view.others["radiance"]} if view.others else {}
+    others = {SURROUNDINGS: view.others["radiance"]} if view.others else {}
     buffer = view.blend(slots | view.presence, others)
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
     normal, alpha = buffer.slots["normal"], buffer.slots.get(OBJECT, buffer.alpha)
@@ -276,5 +276,5 @@ def _shade_at_pixels(view: _View) -> Frame:
     else:
         shaded = shaded_at(points)
     terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
-    radiance = terms.total() + buffer.slots[AROUND] if view.others else terms.total()
+    radiance = terms.total() + buffer.slots[SURROUNDINGS] if view.others else terms.total()
     return view.frame(buffer, normal=normal, radiance=radiance, terms=terms, maps=maps, object_alpha=alpha)
