@@ -74,7 +74,7 @@ class Registry(Mapping[str, T], Generic[T]):
             raise InputError(what, self.kind, remedy="choose another name")
         self._check(item)
         caller, added = sys._getframe(1).f_globals, {name: item}
-        if caller["__name__"].partition(".")[0] != "mi_refgs" and "__file__" in caller:
+        if caller.get("__name__", "").partition(".")[0] != "mi_refgs" and "__file__" in caller:
             _files[self.kind, name] = os.path.abspath(caller["__file__"])
         self._registered = added | self._registered if self._newest_first else self._registered | added
         return item

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -136,19 +135,13 @@ def test_turntable_of_an_open_scene_is_around_its_region(balls: Reconstruction) 
     np.testing.assert_allclose(centre, 0, atol=0.05)
 
 
-def test_mitsuba_scene_renders_the_same_and_differentiates(balls: Reconstruction) -> None:
-    """Each sensor equals its camera; roughness and light have gradients."""
+def test_mitsuba_scene_renders_the_same(balls: Reconstruction) -> None:
+    """Each sensor equals its camera; `tests.gradients` has its derivatives."""
     scene = balls.scene([0, 1], aovs=["normal"])
     for i in range(2):
         image = mi.render(scene, sensor=i, spp=1).numpy()
         difference = np.abs(image[..., :4] - balls.render(i))
         assert image.shape == (SIZE, SIZE, 7) and np.median(difference) < 1e-5 and difference.mean() < 1e-3
-    params = mi.traverse(scene)
-    for key in ("refgs.roughness", "refgs.light"):
-        dr.enable_grad(params[key])
-    dr.backward(dr.mean(mi.render(scene, params, spp=1), axis=None))
-    for key in ("refgs.roughness", "refgs.light"):
-        assert np.abs(dr.grad(params[key]).numpy()).max() > 0, key
 
 
 def test_mitsuba_scene_keeps_the_crop_of_a_sensor(balls: Reconstruction) -> None:
