@@ -30,9 +30,8 @@ HEIGHT = {"allowed": (is_height, f"a multiple of 4 from {MIN_HEIGHT}")}
 class Map(LightKind):
     """An environment map."""
 
-    height: int | None = field(
-        default=None, metadata=HEIGHT
-    )  # rows; width is twice that; absent: by the images
+    # rows; width is twice that; absent: by the images
+    height: int | None = field(default=None, metadata=HEIGHT)
 
     @property
     def rows(self) -> int:
