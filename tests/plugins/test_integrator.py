@@ -89,9 +89,7 @@ def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
     sun = {"type": "directional", "direction": [-1, -1, -0.5], "irradiance": warm}
 
     def lit(**emitters: dict) -> mi.Scene:
-        inner = integrator(diffuse="irradiance")
-        del inner["light"]
-        return mi.load_dict({"type": "scene", "i": inner, "s": sensor(), **emitters})
+        return lit_scene(None, emitters, diffuse="irradiance")
 
     alone = image(lit(sun=sun))
     assert alone.max() > 0.1

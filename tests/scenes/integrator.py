@@ -102,13 +102,6 @@ def check_derivatives(of: mi.Scene, key: str, spp: int = 1) -> None:
     assert max(errors) < TANGENT_TOLERANCE, f"{key}: {errors} from central differences"
 
 
-def check_image_derivatives(rendered: Callable[[Any], mi.TensorXf], base: np.ndarray, name: str) -> None:
-    """Both modes of a tensor like `base` against central differences of images."""
-    step = varied(base.shape)
-    errors = derivative_errors(lambda t: rendered(mi.TensorXf(base) + t * mi.TensorXf(step)), name)
-    assert max(errors) < TANGENT_TOLERANCE, f"{name}: {errors} from central differences"
-
-
 def varied(shape: tuple[int, ...]) -> np.ndarray:
     """Numbers of either sign, none of them small."""
     rng = np.random.default_rng(3)
