@@ -34,8 +34,8 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     if type(integrator).__name__ != "RefGSIntegrator":
         what, remedy = "it has no `refgs` integrator", "give such a scene, its parameters, or raw arrays"
         raise InputError(what, "from_params", type(params).__name__, remedy)
-    if mesh is not None or shading is not None:
-        raise InputError("a scene has its own", "from_params", "mesh, shading", "give arrays, or drop them")
+    if shading is not None:
+        raise InputError("a scene has its own", "from_params", "shading", "give arrays, or drop it")
     with dr.suspend_grad():
         seen = light_of(integrator.shading, integrator.light, integrator.light_to_world, params)
     light = integrator.light
@@ -48,7 +48,7 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     return TrainedScene(
         integrator.surfels.detach(),
         None if light is None else EnvironmentLight(dr.detach(light.raw)),
-        None if integrator.occluder is None else integrator.occluder.mesh(),
+        mesh or (None if integrator.occluder is None else integrator.occluder.mesh()),
         integrator.shading,
         iteration=0,
         seconds=0.0,

@@ -71,8 +71,9 @@ class Reconstruction:
 
         params: an `mi.Scene` with the `refgs` integrator or its `mi.traverse`, whose light, mesh, shading and
         surroundings are taken too. Or a mapping of arrays or tensors: raw attributes (N, D) by name, and
-        "light", the raw map (h, 2h, 3); names may begin with "refgs.". Of a mapping only, mesh: occludes;
-        shading: by default the first model whose attributes are there.
+        "light", the raw map (h, 2h, 3); names may begin with "refgs.". mesh: of the surface, for relighting
+        and exports, as `extract_mesh` makes it. shading: of a mapping only, by default the first model whose
+        attributes are there, occluded by the mesh.
         data: folder of its data set; without one, cameras are around the object, z up. name: of its method.
         Raises InputError for another object, unknown names, wrong shapes, NaN, and without a light that the
         shading needs."""

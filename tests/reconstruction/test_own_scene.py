@@ -72,4 +72,4 @@ def test_other_states_are_refused(balls: Reconstruction) -> None:
     refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
     refused(lambda: make(arrays), "shading: light: reflectance = split_sum needs one")
     refused(lambda: make(arrays | {"opacity": np.full_like(arrays["opacity"], np.nan)}), "NaN")
-    refused(lambda: make(balls.scene(), mesh=balls.trained.mesh), "a scene has its own")
+    refused(lambda: make(balls.scene(), shading=balls.trained.shading), "a scene has its own")
