@@ -12,8 +12,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 
 mode=${1:-}
 case "$mode" in
-    "" | demo) extras="" ;;
-    test) extras="[dev]" ;;
+    "" | demo) extras="" options="--no-compile" ;;  # Python compiles what it imports, when it does
+    test) extras="[dev]" options="" ;;
     *) echo "usage: bash setup.sh [demo|test]" >&2; exit 2 ;;
 esac
 
@@ -73,7 +73,7 @@ if [ "$was" != "$made_for: $holds [dev]" ] && [ "$was" != "$made_for: $holds $ex
         "$made_for: "*) ;;
         *) "$python" -m venv --clear .venv ;;
     esac
-    .venv/bin/python -m pip install -qq --disable-pip-version-check -e ".$extras"
+    .venv/bin/python -m pip install -qq --disable-pip-version-check $options -e ".$extras"
     .venv/bin/python -c 'import mi_refgs'
     echo "$made_for: $holds $extras" > "$stamp"
 fi
