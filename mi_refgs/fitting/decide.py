@@ -19,7 +19,7 @@ from mi_refgs.fitting.initial import converted, with_columns
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import Event
-from mi_refgs.methods.method import APART, AROUND, LIGHT, PLACEMENT, Method
+from mi_refgs.methods.method import APART, AROUND, LIGHT, Method
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.light.maps import Map
@@ -126,7 +126,7 @@ def fork(trainer: Trainer, method: Method) -> Trainer:
     wanted = converted(old, widths, method, rng)
     wanted |= {name: old[name] for name in old if name in APART or name.startswith(AROUND)}
     if method.light is None:
-        wanted = {name: values for name, values in wanted.items() if name not in (LIGHT, PLACEMENT)}
+        wanted = {name: values for name, values in wanted.items() if not name.startswith(LIGHT)}
     dropped = (PARAMS, OPTIMISER) if method.has_mesh else (PARAMS, OPTIMISER, MESH)
     new = {name: value for name, value in state.items() if not name.startswith(dropped)}
     for name, values in wanted.items():

@@ -10,8 +10,9 @@ import numpy as np
 from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.initialiser import INITIALISERS, Start, Wanted
-from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, PLACEMENT, Method
+from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.light.maps import Learnt
@@ -37,8 +38,8 @@ def initial_parameters(
         return params
     if open_scene and isinstance(method.light, Learnt):
         return params | {LIGHT: seen_around(data, method.light.rows).raw}
-    params |= {LIGHT: method.light.start()}
-    return params if (placement := method.light.placement()) is None else params | {PLACEMENT: placement}
+    placement = {f"{LIGHT}_{name}": upload_tensor(np.zeros((1, 3))) for name in method.light.placement}
+    return params | {LIGHT: method.light.start()} | placement
 
 
 def started(names: Sequence[str], wanted: Wanted) -> Start:

@@ -35,7 +35,7 @@ from mi_refgs.methods.method import POSE, Method
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import MODEL
-from mi_refgs.runs.views import downscaled, lit, read_views, sized, with_region
+from mi_refgs.runs.views import read_views, sized, with_region
 from mi_refgs.shade.light.placed import PlacedLight
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
@@ -133,12 +133,12 @@ def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> 
     # Settings of anything but images may be those of the other method.
     of_images = [text for text in methods.assignments(choice.settings) if text.startswith("data.")]
     named = choice.named()
-    reads, views = downscaled(load_method(named, choice.preset, of_images), data, say)
+    reads, views = sized(load_method(named, choice.preset, of_images), data, say)
     name = _for_images(named, reads, views)
     if name != named:
         say(f"{views.path}: images without alpha: fitted with their background, by --method {name}")
     method = load_method(name, choice.preset, choice.settings)
-    return lit(method.downscaled(views.downscale), views, say), views
+    return method.downscaled(views.downscale), views
 
 
 def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:
@@ -209,7 +209,7 @@ def begin(
     if resumed:
         run.rewind(trainer.iteration)
     else:
-        run.create(method, views.folder, views.region)
+        run.create(trainer.method, views.folder, views.region)
         if len(views.views) < HOLDOUT and (names := waiting(trainer)):
             few = f"{len(views.views)} views: too few to hold some out"
             tell(f"{views.path}: {few}, so {' and '.join(names)} are not decided")
@@ -272,7 +272,9 @@ def finish(trainer: Trainer, run: Run) -> str | None:
         poses = [camera_of(setup, params, i).pose().tolist() for i in range(len(names))]
         run.write_json(CAMERAS, {"to_world": dict(zip(names, poses, strict=True))})
     if isinstance(light := trainer.fit.light, PlacedLight):
-        run.write_json("light.json", light.record())
+        scale = [1] * 3 if light.scale is None else np.exp(light.scale.numpy()[0]).tolist()
+        turn = np.array(light.world_from_map()).reshape(3, 3).tolist()
+        run.write_json("light.json", {"world_from_map": turn, "scale": scale})
     if trainer.fit.region is not None:
         run.write_dataset(trainer.data.folder, trainer.fit.region)
     warning, camera = None, trainer.camera(0)

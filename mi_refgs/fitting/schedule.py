@@ -19,17 +19,34 @@ from mi_refgs.fitting.events import place
 from mi_refgs.fitting.optim import LearningRate
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.event import EVENTS, Event
-from mi_refgs.methods.method import AROUND, BACKGROUND, GAIN, LIGHT, PER_VIEW, PLACEMENT, POSE, Method, Rates
+from mi_refgs.methods.method import (
+    AROUND,
+    BACKGROUND,
+    GAIN,
+    LIGHT,
+    LIGHT_ROTATION,
+    LIGHT_SCALE,
+    PER_VIEW,
+    POSE,
+    Method,
+    Rates,
+)
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.light.kind import FittedLight
 from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.light.placed import PlacedLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.types import Float, TensorXf
 
 DEFAULT_RATES = Rates()
-LEARNT_BESIDE = {GAIN: (1e-3, 1e-4), POSE: (2e-3, 6e-5), PLACEMENT: (1e-2, 1e-4)}
+LEARNT_BESIDE = {
+    GAIN: (1e-3, 1e-4),
+    POSE: (2e-3, 6e-5),
+    LIGHT_ROTATION: (1e-2, 1e-4),
+    LIGHT_SCALE: (1e-2, 1e-4),
+}
 """Learning rates of log gains, of corrections, radians or half widths, and of the rotation, radians, and log
 scale of a known light, at the start and at the end."""
 POSITION_STEPS, POSITION_FINAL = 0.6, 1.6e-6
@@ -147,8 +164,7 @@ class FitSetup:
             wanted[BACKGROUND] = (2 * around.height, 3)
         if light is not None:
             wanted[LIGHT] = light.columns()
-            if light.placement() is not None:
-                wanted[PLACEMENT] = (6,)
+            wanted |= {f"{LIGHT}_{name}": (3,) for name in light.placement}
         found = {
             name: values.shape if name in PER_VIEW else values.shape[1:]
             for name, values in part(state, PARAMS).items()
@@ -194,15 +210,17 @@ class SharedPrefilter:
 
     def light(self, environment: FittedLight | None, shading: Shading) -> Light | None:
         """The light of a step, under AD; a light that is not filtered stays attached to its environment."""
-        if environment is None:
-            return None
-        if self._light is None or shading.model.light != "filtered":
-            light = shading.light_of(environment.map)
-            if not isinstance(light, PrefilteredLight):
-                return None if light is None else environment.placed(light)
-            self._light, self._leaf = light, dr.detach(light.levels)
-            dr.set_grad_enabled(self._leaf, dr.grad_enabled(light.levels))
-        return environment.placed(replace(self._light, levels=self._leaf))
+        if isinstance(environment, PlacedLight):
+            light = self.light(environment.map, shading)
+            return None if light is None else environment.placed(light)
+        if self._light is not None and shading.model.light == "filtered":
+            return replace(self._light, levels=self._leaf)
+        light = shading.light_of(environment)
+        if not isinstance(light, PrefilteredLight):
+            return light
+        self._light, self._leaf = light, dr.detach(light.levels)
+        dr.set_grad_enabled(self._leaf, dr.grad_enabled(light.levels))
+        return replace(light, levels=self._leaf)
 
     def close(self) -> None:
         """Add the accumulated gradient to that of the environment; a fixed light stays filtered."""

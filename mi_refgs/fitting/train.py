@@ -30,6 +30,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
+from mi_refgs.shade.light.maps import Map
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
@@ -63,6 +64,11 @@ class Trainer:
         self.health = Health()
         self.loss: Float = None  # of the last step, width 1
         self.error: Float = None  # mean squared error of the last step, width 1
+        if method.light is not None:
+            light = method.light.sized(max(view.width * view.height for view in data.views))
+            if light != method.light and isinstance(light, Map):
+                tell(f"{data.path}: the environment map has {light.rows} rows; `light.height` sets others")
+            method = replace(method, light=light)
         self.setup = FitSetup(method, data)
         shared = targets is not None and targets.data is data and targets.options == method.data
         self.targets = targets if shared and targets is not None else Targets(data, method.data)

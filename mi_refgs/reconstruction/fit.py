@@ -52,8 +52,8 @@ def fit(
 
     light: a lat-long map (EXR, HDR, PNG, JPEG) with which the light starts, or which it is if `light_fixed`.
     Its first row is straight up, +z, unless it is the data set's environment.exr. The settings
-    `light.world`, `light.rotate` and `light.exposure` are as in `Reconstruction.relight`; `light.learn` names
-    some of "rotation" or "azimuth", "scale" or "colour", of a fixed map.
+    `light.world`, `light.rotate` and `light.exposure` are as in `Reconstruction.relight`; `light.learn`
+    is some of "rotation" and "scale", of a fixed map.
 
     output: the run folder. Without one a temporary folder is used, which is removed with the last
     `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`;

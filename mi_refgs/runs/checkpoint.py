@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.kernels.device import upload_tensor
-from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT, PLACEMENT
+from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT, LIGHT_ROTATION, LIGHT_SCALE
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.kind import FittedLight, LightKind
 from mi_refgs.shade.light.near_field import NearField
+from mi_refgs.shade.light.placed import PlacedLight
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 
@@ -33,8 +34,9 @@ def light_of(kind: LightKind | None, params: Mapping[str, Any]) -> FittedLight |
     """The light that the object reflects, if there is one; raises InputError for a wrong shape."""
     if kind is None or LIGHT not in params:
         return None
-    raw, placement = params[LIGHT], params.get(PLACEMENT)
-    return kind.of(raw) if placement is None else kind.placed(raw, placement)
+    if kind.placement:
+        return PlacedLight(params[LIGHT], params.get(LIGHT_ROTATION), params.get(LIGHT_SCALE))
+    return kind.of(params[LIGHT])
 
 
 def surroundings_of(params: Mapping[str, Any]) -> Surroundings | None:

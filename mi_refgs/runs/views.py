@@ -17,18 +17,9 @@ from mi_refgs.errors import InputError
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.run import DATASET, Run
-from mi_refgs.shade.light.maps import Map
 
 
 def sized(
-    method: Method, path: Path | Dataset, tell: Callable[[str], None] = lambda _: None
-) -> tuple[Method, Dataset]:
-    """The method with its image size (`downscaled`) and size of the light (`lit`) decided, and the views."""
-    method, views = downscaled(method, path, tell)
-    return lit(method, views, tell), views
-
-
-def downscaled(
     method: Method, path: Path | Dataset, tell: Callable[[str], None] = lambda _: None
 ) -> tuple[Method, Dataset]:
     """The method with its image size decided, and training views without ground truth: `data.downscale`, or
@@ -44,17 +35,6 @@ def downscaled(
             f"data.downscale=1 reads them whole"
         )
     return method.downscaled(views.downscale), views
-
-
-def lit(method: Method, views: Dataset, tell: Callable[[str], None] = lambda _: None) -> Method:
-    """Decide the size of the light by that of the images; `tell` is called with it. Raises InputError for a
-    file of a light that cannot be read."""
-    if method.light is None:
-        return method
-    light = method.light.sized(max(view.width * view.height for view in views.views))
-    if isinstance(light, Map) and light != method.light:
-        tell(f"{views.path}: the environment map has {light.rows} rows; --set light.height=N changes that")
-    return replace(method, light=light)
 
 
 def read_views(

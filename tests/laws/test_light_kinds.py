@@ -19,10 +19,10 @@ from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.fitting.decide import differences
 from mi_refgs.fitting.objective import LossInputs, objective
-from mi_refgs.fitting.runner import Choice, chosen
+from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import write_exr
-from mi_refgs.methods.method import LIGHT, PLACEMENT
+from mi_refgs.methods.method import LIGHT, LIGHT_ROTATION, LIGHT_SCALE
 from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.runs.checkpoint import PARAMS
 from mi_refgs.runs.run import Run
@@ -30,8 +30,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.maps import LARGEST_HEIGHT, Learnt
 from mi_refgs.shade.light.placed import PlacedLight
-from tests.helpers import refused, unit
-from tests.helpers import vector as vector3
+from tests.helpers import refused, unit, vector
 from tests.scenes.tiny import METHOD, SETTINGS, train_command, write_data, write_open_data
 
 FILE = 'kind = "file"\nfile = "sky.exr"\nworld = true\n'
@@ -47,7 +46,7 @@ KINDS = {  # the table [light], and what else the method has
     "constant": 'kind = "constant"\nradiance = 0.7\n',
     "initial": FILE + "height = 8\n",
     "fixed": "every = 2\nradiance = 0.8\n",  # by options of the command line
-    "placed": FILE + 'fixed = true\nrotate = 20\nlearn = ["rotation", "colour"]\n',
+    "placed": FILE + 'fixed = true\nrotate = 20\nlearn = ["rotation", "scale"]\n',
     "photographed": "height = 8\n" + PHOTOGRAPHS,  # whose light is near, too
 }
 SKY = np.linspace(0.1, 2, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32)  # the map of the tiny data set
@@ -94,14 +93,14 @@ def test_a_run_saves_what_was_fitted(fitted: tuple[str, Path]) -> None:
         np.testing.assert_allclose(saved, SKY, rtol=1e-5)
     elif kind == "initial":
         assert 1e-4 < np.abs(saved - SKY).max() < 0.5
-    placement = state.get(PARAMS + PLACEMENT)
-    assert (placement is not None) == (kind == "placed")
-    if placement is not None:
-        assert np.all(np.abs(placement) > 1e-4) and np.all(np.abs(placement) < 0.2)
+    if kind == "placed":
+        rotation, scale = (state[PARAMS + name][0] for name in (LIGHT_ROTATION, LIGHT_SCALE))
+        assert np.all(np.abs([rotation, scale]) > 1e-4) and np.all(np.abs([rotation, scale]) < 0.2)
         found = json.loads((folder / "run" / "light.json").read_text())
-        turn = Rotation.from_rotvec(placement[0, :3]).as_matrix()
-        np.testing.assert_allclose(found["world_from_map"], turn, atol=1e-5)
-        np.testing.assert_allclose(found["scale"], np.exp(placement[0, 3:]), atol=1e-5)
+        np.testing.assert_allclose(
+            found["world_from_map"], Rotation.from_rotvec(rotation).as_matrix(), atol=1e-5
+        )
+        np.testing.assert_allclose(found["scale"], np.exp(scale), atol=1e-5)
 
 
 def test_resumed_fits_repeat(fitted: tuple[str, Path], tmp_path: Path) -> None:
@@ -135,11 +134,11 @@ def test_height_follows_the_size_of_images(tmp_path: Path) -> None:
     assert rows == [16, 76, 104, LARGEST_HEIGHT, LARGEST_HEIGHT]
     assert Learnt(height=8).sized(96**2).height == 8
     (tmp_path / "own.toml").write_text(METHOD.replace("height = 8\n", ""))
-    data, own, said = write_data(tmp_path / "data"), str(tmp_path / "own.toml"), []
-    method, _ = chosen(data, Choice(own, "quick"), said.append)
-    assert method.light == Learnt(height=16) and "16 rows" in said[0]
-    Run(tmp_path / "run").create(method, str(data))
-    assert differences(Run(tmp_path / "run"), methods.load(own, "quick")) == {}
+    data, own, said = write_data(tmp_path / "data"), str(tmp_path / "own.toml"), list[str]()
+    run, method = Run(tmp_path / "run"), methods.load(own, "quick", SETTINGS)
+    begin(method, read_dataset(data, "train"), run, said.append)
+    assert run.method().light == Learnt(height=16) and "16 rows" in said[0]
+    assert differences(run, method).keys() <= {"data.downscale"}
 
 
 def test_what_no_light_can_be(tmp_path: Path) -> None:
@@ -151,29 +150,24 @@ def test_what_no_light_can_be(tmp_path: Path) -> None:
     refused([*command, "--light-fixed"], "light_fixed: no map is given")
 
 
-PLACEMENT_AT = np.array([[0.3, -0.2, 0.5, 0.1, 0.2, -0.3]], np.float32)
+AT = np.array([[0.3, -0.2, 0.5], [0.1, 0.2, -0.3]], np.float32)  # rotation vector, log scale
 
 
 def test_placed_light_is_the_map_turned_and_scaled() -> None:
     """In lookups, and in the map that a run saves."""
-    raw = mi_refgs.EnvironmentLight.from_radiance(
-        np.tile(np.linspace(0.1, 1, 16)[:, None, None], (1, 32, 3))
-    ).raw
-    for learn, vector, scale in (
-        (("rotation", "colour"), PLACEMENT_AT[0, :3], PLACEMENT_AT[0, 3:]),
-        (("azimuth", "scale"), [0, 0, 0.5], [0.1, 0.1, 0.1]),
-    ):
-        light = PlacedLight(raw, mi.TensorXf(PLACEMENT_AT), learn)
-        d = unit(np.random.default_rng(1).normal(size=(200, 3)))
-        expected = np.exp(scale) * light.map.unfiltered().radiance(vector3(d)).numpy().T
-        turned = Rotation.from_rotvec(vector).apply(d)
-        for found in (light.unfiltered(), light.environment().unfiltered()):
-            np.testing.assert_allclose(found.radiance(vector3(turned)).numpy().T, expected, atol=0.01)
+    smooth = np.tile(np.linspace(0.1, 1, 16)[:, None, None], (1, 32, 3))
+    raw = mi_refgs.EnvironmentLight.from_radiance(smooth).raw
+    light = PlacedLight(raw, *(mi.TensorXf(row[None]) for row in AT))
+    d = unit(np.random.default_rng(1).normal(size=(200, 3)))
+    expected = np.exp(AT[1]) * light.map.unfiltered().radiance(vector(d)).numpy().T
+    turned = vector(Rotation.from_rotvec(AT[0]).apply(d))
+    for found in (light.unfiltered(), light.environment().unfiltered()):
+        np.testing.assert_allclose(found.radiance(turned).numpy().T, expected, atol=0.01)
 
 
 def test_derivatives_of_rotation_and_scale_with_other_losses(tmp_path: Path) -> None:
     """Of the objective without L1, which has kinks, against central differences; at 0 too."""
-    sky = 0.6 + 0.3 * lobe_matrices.map_directions(16)
+    sky = 0.6 + 0.3 * lobe_matrices.map_directions(32)
     write_exr(tmp_path / "sky.exr", sky.astype(np.float32))
     (tmp_path / "own.toml").write_text(METHOD.replace("height = 8\n", KINDS["placed"]))
     more = [
@@ -188,23 +182,20 @@ def test_derivatives_of_rotation_and_scale_with_other_losses(tmp_path: Path) -> 
     trainer.train()
     target, fit = trainer.targets.at(6, 0), trainer.fit
 
-    def objective_at(numbers: np.ndarray) -> tuple[Any, Any]:
-        fit.params[PLACEMENT] = mi.TensorXf(numbers.astype(np.float32))
-        dr.enable_grad(fit.params[PLACEMENT])
+    def objective_at(numbers: np.ndarray) -> Any:
+        for name, row in zip((LIGHT_ROTATION, LIGHT_SCALE), numbers, strict=True):
+            fit.params[name] = mi.TensorXf(row[None].astype(np.float32))
+            dr.enable_grad(fit.params[name])
         shading = trainer.shading()
         light = shading.light_of(fit.light)
-        frame = render(
-            SurfelScene(fit.surfels, shading, light, fit.occluder), target.camera, Request(("normal",))
-        )
-        return fit.params[PLACEMENT], objective(
-            LossInputs.of(frame, target, trainer.data, light), method.loss, 6
-        )[0]
+        scene = SurfelScene(fit.surfels, shading, light, fit.occluder)
+        frame = render(scene, target.camera, Request(("normal",)))
+        return objective(LossInputs.of(frame, target, trainer.data, light), method.loss, 6)[0]
 
-    for at in (PLACEMENT_AT, np.zeros((1, 6))):
-        leaf, loss = objective_at(at)
-        dr.backward(loss)
-        found, steps = dr.grad(leaf).numpy()[0], 0.05 * np.eye(6)[:, None]
-        sides = [[float(objective_at(at + sign * step)[1][0]) for sign in (1, -1)] for step in steps]
-        expected = np.array([(above - below) / 0.1 for above, below in sides])
-        for part in (slice(0, 3), slice(3, 6)):
-            np.testing.assert_allclose(found[part], expected[part], atol=0.03 * np.abs(expected[part]).max())
+    for at in (AT, np.zeros((2, 3))):
+        dr.backward(objective_at(at))
+        found = [dr.grad(fit.params[name]).numpy()[0] for name in (LIGHT_ROTATION, LIGHT_SCALE)]
+        for i, row in enumerate(found):
+            steps = [0.03 * np.outer(np.eye(2)[i], axis) for axis in np.eye(3)]
+            expected = [(objective_at(at + x)[0] - objective_at(at - x)[0]) / 0.06 for x in steps]
+            np.testing.assert_allclose(row, expected, atol=0.03 * np.abs(expected).max())

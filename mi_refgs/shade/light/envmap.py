@@ -178,21 +178,7 @@ class FittedLight:
 
     def environment(self) -> EnvironmentLight:
         """The map that a run saves, which every application shows, edits and exports."""
-        return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, self.saved_height, 1))
-
-    @property
-    def saved_height(self) -> int:
-        """Rows of `environment`."""
-        return DEFAULT_HEIGHT
-
-    @property
-    def map(self) -> FittedLight:
-        """The light without the rotation and scale that `placed` gives it."""
-        return self
-
-    def placed(self, light: Light) -> Light:
-        """A lookup of `map`, as `prefilter` returns it, with the learnt rotation and scale, under AD."""
-        return light
+        return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, DEFAULT_HEIGHT, 1))
 
     def unusable(self) -> int:
         """Number of raw values that are not < RAW_LIMIT; waits for the device."""

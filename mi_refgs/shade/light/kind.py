@@ -21,6 +21,11 @@ class LightKind:
     name: ClassVar[str] = ""
 
     @property
+    def placement(self) -> tuple[str, ...]:
+        """Of "rotation" and "scale" (`placed.PlacedLight`), what a fit learns beside the raw values."""
+        return ()
+
+    @property
     def learns(self) -> bool:
         """Whether a fit changes the raw values."""
         return True
@@ -36,14 +41,6 @@ class LightKind:
     def columns(self) -> tuple[int, ...]:
         """Shape of the raw values without their rows."""
         return tuple(self.start().shape[1:])
-
-    def placement(self) -> TensorXf | None:
-        """Rotation and scale (`placed.PlacedLight`) that a fit begins with, if it learns them."""
-        return None
-
-    def placed(self, raw: TensorXf, placement: TensorXf) -> FittedLight:
-        """`of`, with a rotation and scale."""
-        raise NotImplementedError
 
     def of(self, raw: TensorXf) -> FittedLight:
         """The light of raw values, under AD; unless it is overridden, an environment map."""

@@ -10,12 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight, is_height
 from mi_refgs.shade.light.kind import LightKind
 from mi_refgs.shade.light.latlong import OVERSAMPLING, Z_UP, environment_image
 from mi_refgs.shade.light.light_file import read_radiance
-from mi_refgs.shade.light.placed import PlacedLight
 from mi_refgs.types import TensorXf
 
 LARGEST_HEIGHT = 128  # most rows of a learnt map by default: the finest filtered level has no more
@@ -30,7 +28,7 @@ HEIGHT = {"allowed": (is_height, f"a multiple of 4 from {MIN_HEIGHT}")}
 class Map(LightKind):
     """An environment map."""
 
-    # rows; width is twice that; absent: by the images
+    # Rows; width is twice that; absent: by the images, or of a fixed map by its file.
     height: int | None = field(default=None, metadata=HEIGHT)
 
     @property
@@ -66,9 +64,8 @@ class Known(Map):
     """The lat-long map of a file (EXR, HDR, PNG, JPEG): the light, or where a learnt light starts."""
 
     file: str = ""  # its path
-    fixed: bool = False  # whether its texels stay as they are; `height` is by default the file's
-    # Of a fixed map: "rotation", or "azimuth", about +z only; one "scale", or "colour", one per channel.
-    learn: tuple[Literal["rotation", "azimuth", "scale", "colour"], ...] = ()
+    fixed: bool = False  # whether its texels stay as they are
+    learn: tuple[Literal["rotation", "scale"], ...] = ()  # of a fixed map; the scale is one per channel
     world: bool = False  # whether the map is in world directions, as envmap.exr; else its first row is +z
     rotate: float = 0.0  # degrees about +z, counter-clockwise seen from above; initial, if it is learnt
     exposure: float = 0.0  # stops; initial, if a scale is learnt
@@ -76,7 +73,6 @@ class Known(Map):
     name: ClassVar[str] = "file"
 
     def __post_init__(self) -> None:
-        require_range(self.rotate, self.exposure)
         if not self.file:
             raise InputError("none is named", field="file", remedy="give an EXR or HDR file")
         if self.learn and not self.fixed:
@@ -97,11 +93,9 @@ class Known(Map):
         image = read_radiance(self.file, OVERSAMPLING * self.rows)
         return world_light(image, self.world, self.rotate, self.exposure, self.rows).raw
 
-    def placement(self) -> TensorXf | None:
-        return upload_tensor(np.zeros((1, 6))) if self.learn else None
-
-    def placed(self, raw: TensorXf, placement: TensorXf) -> PlacedLight:
-        return PlacedLight(raw, placement, self.learn)
+    @property
+    def placement(self) -> tuple[str, ...]:
+        return self.learn
 
 
 def require_range(rotate: float, exposure: float) -> None:
