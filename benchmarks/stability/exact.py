@@ -28,7 +28,7 @@ def fast_camera(case: Case) -> Camera:
 @functools.lru_cache(maxsize=8)
 def filters(height: int) -> list[Array]:
     """Dense matrices (2 h_out², 2 height²) of the product's prefilter, float64."""
-    return [dense_filter(level.weights) for level in lobe_matrices.build_levels(height)]
+    return [dense_filter(weights) for weights in lobe_matrices.build_levels(height)]
 
 
 def light_of(raw: Array) -> Light:

@@ -38,10 +38,6 @@ class LightKind:
         """Raw values that a fit begins with; raises InputError if a setting cannot be used."""
         raise NotImplementedError
 
-    def columns(self) -> tuple[int, ...]:
-        """Shape of the raw values without their rows."""
-        return tuple(self.start().shape[1:])
-
     def of(self, raw: TensorXf) -> FittedLight:
         """The light of raw values, under AD; unless it is overridden, an environment map."""
         return EnvironmentLight(raw)

@@ -26,7 +26,7 @@ def lat_long(
     theta = (index // columns) * (dr.pi / (rows - 1))
     direction = mi.Vector3f(dr.sin(theta) * dr.sin(phi), dr.cos(theta), -dr.sin(theta) * dr.cos(phi))
     # A constant emitter returns one value for all directions.
-    found = np.array(radiance(direction) + dr.zeros(mi.Float, rows * columns))
+    found = np.array(radiance(direction) + dr.zeros(mi.Float, rows * columns), np.float64)
     image = resample(found.T.reshape(rows, columns, 3), height)
     image[[0, -1]] = image[[0, -1]].mean(axis=1, keepdims=True)  # a pole is one point
     return image.astype(np.float32)

@@ -11,7 +11,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.exr import EXR_MAGIC, read_exr_image
 from mi_refgs.io.hdr import read_hdr
 from mi_refgs.io.images import linear_from_srgb, read_bytes
-from mi_refgs.shade.light.lobe_matrices import resampling
+from mi_refgs.shade.light.lobe_matrices import resample
 
 MAX_ROWS = 4096  # most rows that are kept of a map: 400 MB of float32
 
@@ -25,15 +25,7 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
     if min(height, width) < 2:
         size = f"{width} × {height} pixels"
         raise InputError(f"{size} are no lat-long image", path, "environment", "give 2 × 2 at least")
-    h, w = min(height, rows), min(width, 2 * rows)
-    if h < height:
-        down = resampling(height, h).astype(np.float32)
-        image = (down @ image.reshape(height, -1)).reshape(h, width, 3)
-    if w < width:
-        across = resampling(width, w, periodic=True).astype(np.float32)
-        columns = across @ image.swapaxes(0, 1).reshape(width, -1)
-        image = columns.reshape(w, h, 3).swapaxes(0, 1)
-    return np.ascontiguousarray(image)
+    return np.ascontiguousarray(resample(image, min(height, rows), min(width, 2 * rows)))
 
 
 def _read(path: Path) -> np.ndarray:

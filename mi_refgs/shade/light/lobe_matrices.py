@@ -10,8 +10,6 @@ Rows are at θ = πi/(h-1) from +y (first and last row are the poles), columns a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.sparse import csr_matrix
 
@@ -21,15 +19,6 @@ LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)  # rows at most: 1.4 % (L1)
 DROP_BELOW = 1e-5  # of a level's largest entry; smaller ones are dropped: 0.05 % of a lobe (L1)
 HORIZON_CUTS = 0.5  # roughness from which a lobe ends at the horizon rather than before it
 MIN_SUBSAMPLES = 2  # quadrature points per texel side where the lobe is wider than a texel
-
-
-@dataclass(frozen=True)
-class Level:
-    """One filtered level: `weights` (h_out, h_in, M) from Fourier coefficients of input to output rows."""
-
-    roughness: float
-    height: int
-    weights: np.ndarray
 
 
 def row_angles(h: int) -> np.ndarray:
@@ -87,12 +76,15 @@ def resampling(count: int, wanted: int, periodic: bool = False) -> csr_matrix:
     return matrix
 
 
-def resample(radiance: np.ndarray, height: int) -> np.ndarray:
-    """Radiance (h, w, 3) at (height, 2·height, 3), keeping its integral when it coarsens."""
-    h, w = radiance.shape[:2]
-    rows, columns = resampling(h, height), resampling(w, 2 * height, periodic=True)
-    coarse = np.tensordot(rows.toarray(), radiance.astype(np.float64), 1)
-    return np.einsum("ab,ibc->iac", columns.toarray(), coarse)
+def resample(radiance: np.ndarray, height: int, width: int | None = None) -> np.ndarray:
+    """Radiance (h, w, 3) at (height, width, 3), by default 2·height wide, with its number type; it keeps its
+    integral when it coarsens."""
+    h, w, _ = radiance.shape
+    width = width or 2 * height
+    rows, columns = resampling(h, height), resampling(w, width, periodic=True)
+    coarse = rows.astype(radiance.dtype) @ radiance.reshape(h, -1)
+    turned = coarse.reshape(height, w, 3).swapaxes(0, 1).reshape(w, -1)
+    return (columns.astype(radiance.dtype) @ turned).reshape(width, height, 3).swapaxes(0, 1)
 
 
 def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
@@ -130,8 +122,9 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     return out * scale
 
 
-def build_levels(h: int) -> list[Level]:
-    """The filtered levels of a map (h, 2h); one of more rows than the finest is averaged down to it first."""
+def build_levels(h: int) -> list[np.ndarray]:
+    """Weights (h_out, h, M) of each filtered level, from Fourier coefficients of the rows of a map (h, 2h) to
+    its own; a map of more rows than the finest is averaged down to it first."""
     h_in = min(h, LEVEL_MAX_HEIGHT[0])
     built = []
     for roughness, cap in zip(LEVEL_ROUGHNESS, LEVEL_MAX_HEIGHT, strict=True):
@@ -151,5 +144,5 @@ def build_levels(h: int) -> list[Level]:
             weights = weights * np.sinc(np.arange(rows + 1) / (rows + 1))
         kept = np.abs(weights) > DROP_BELOW * np.abs(weights).max()
         kept[:, :, 0] = True  # the mean is never thinned: constants stay constant
-        built.append(Level(roughness, weights.shape[0], np.where(kept, weights, 0)))
+        built.append(np.where(kept, weights, 0))
     return built

@@ -43,9 +43,6 @@ class Map(LightKind):
         wanted = 4 * math.ceil(ROWS_PER_PIXEL * math.sqrt(pixels) / 4)
         return replace(self, height=min(max(wanted, MIN_HEIGHT), LARGEST_HEIGHT))
 
-    def columns(self) -> tuple[int, ...]:
-        return 2 * self.rows, 3
-
 
 @dataclass(frozen=True)
 class Learnt(Map):

@@ -87,15 +87,15 @@ def _product(matrix: csc_matrix, coefficients: np.ndarray) -> np.ndarray:
 def _matrix(height: int) -> tuple[csc_matrix, list[int]]:
     """The matrix of an operator, and the rows of its levels."""
     built, values, rows, columns, first = build_levels(height), [], [], [], 0
-    for level in built:
-        i, k, m = np.nonzero(level.weights)
-        values.append(level.weights[i, k, m].astype(np.float32))
-        rows.append(first + m * level.height + i)
+    for weights in built:
+        i, k, m = np.nonzero(weights)
+        values.append(weights[i, k, m].astype(np.float32))
+        rows.append(first + m * len(weights) + i)
         columns.append(m * height + k)
-        first += level.height * (level.height + 1)
+        first += len(weights) * (len(weights) + 1)
     places = np.concatenate(rows), np.concatenate(columns)
     matrix = csc_matrix((np.concatenate(values), places), shape=(first, height * (height + 1)))
-    return matrix, [level.height for level in built]
+    return matrix, [len(weights) for weights in built]
 
 
 @functools.lru_cache(maxsize=4)
