@@ -250,7 +250,7 @@ def _evaluated(
     data: Path, method: str, folder: Path, settings: Mapping[str, Any]
 ) -> tuple[Reconstruction, dict[str, Any]]:
     """Fit a method and evaluate the run where that is missing; returns the run and its metrics."""
-    how = {"preset": settings["preset"], "settings": settings["set"], "resume": True}
+    how = {"preset": settings["preset"], "settings": settings["set"], "resume": Run(folder).exists()}
     run = fit(data, method, output=folder, progress=True, **how)
     metrics = evaluation.read_metrics(Run(folder))
     if metrics is None or metrics.get("iterations") != run.trained.iteration:
