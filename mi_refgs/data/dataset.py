@@ -179,14 +179,12 @@ class Dataset:
         """Path-trace views of a Mitsuba scene in memory: what `make_dataset` writes, and a fit takes.
 
         scene: an `mi.Scene` or its file. sensors: Mitsuba sensors or `Camera`s, a number of views around the
-        object, or None for the sensors of the scene. Images are linear radiance (H, W, 3) over white with
-        alpha, without visible emitters; normals, depth and materials are at pixel centres.
-        options: split ("train", or "test" for other cameras and seeds), maps (True: with normals, depth and
-        materials), spp, seed, max_depth, and for views around the object size, fov, distance,
-        elevation, azimuth, as in `DatasetOptions`. Raises InputError as `make_dataset` does, and for a sensor
-        that is no pinhole.
+        object, or None for those of the scene. Images are linear radiance (H, W, 3) over white with alpha.
+        options: split ("train", or "test" for other cameras and seeds), maps (True: normals, depth and
+        materials at pixel centres), and those of `DatasetOptions`, of which a sensor has its own lens and
+        size. Raises InputError as `make_dataset` does, and for a sensor that is no pinhole.
         """
-        # By name, as a registry finds what is registered: `synthesis` imports this module.
+        # By name, as registries import what is registered: `synthesis` imports this module.
         made: Dataset = import_module("mi_refgs.synthesis.in_memory").traced(scene, sensors, **options)
         return made
 

@@ -45,6 +45,8 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         values = np.broadcast_to(np.array(radiance), (3, direction.size // 3))
         light = EnvironmentLight.from_radiance(values.T.reshape(direction.shape))
     around, behind = integrator.background.surfels, integrator.background.map
+    if behind is not None or around is not None:
+        around = Surroundings((around or nothing_around(integrator.surfels)).detach(), behind)
     return TrainedScene(
         integrator.surfels.detach(),
         None if light is None else EnvironmentLight(dr.detach(light.raw)),
@@ -52,21 +54,17 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         integrator.shading,
         iteration=0,
         seconds=0.0,
-        surroundings=None
-        if around is None and behind is None
-        else Surroundings((around or nothing_around(integrator.surfels)).detach(), behind),
+        surroundings=around,
         near=integrator.near,
     )
 
 
 def _of_arrays(params: Mapping[str, Any], mesh: Mesh | None, shading: ShadingOptions | None) -> TrainedScene:
     """The scene of raw values by attribute, and of a light."""
-    values = {}
-    for key, value in params.items():
-        name = key.removeprefix("refgs.")
-        if name != "light":
-            attribute(name)  # is registered
-        values[name] = np.array(value, np.float32)
+    values = {name.removeprefix("refgs."): value for name, value in params.items()}
+    for name in values.keys() - {"light"}:
+        attribute(name)  # is registered
+    values = {name: np.array(value, np.float32) for name, value in values.items()}
     light = EnvironmentLight(mi.TensorXf(values.pop("light"))) if "light" in values else None
     surfels = Surfels.from_numpy(values)
     surfels.validate()

@@ -70,8 +70,7 @@ def _view_of(camera: Camera) -> View:
     """A camera as a view, without its image; InputError unless Mitsuba has such a sensor."""
     fx, fy, cx, cy = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     pose = camera.pose()
-    if fx > 0:  # both axes point the other way
-        pose[:3, :2] *= -1
+    pose[:3, :2] *= -np.sign(fx)  # in Mitsuba's frame focal lengths are negative
     if not np.isclose(fx, fy, rtol=1e-3) or np.linalg.det(pose[:3, :3]) < 0:
         what = f"focal lengths {fx:g} and {fy:g} pixels, or a mirrored pose"
         raise InputError(what, "from_mitsuba", "sensors", "give cameras of square pixels, not mirrored")

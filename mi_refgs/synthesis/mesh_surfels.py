@@ -19,12 +19,11 @@ ABOVE = 1e-3  # extents of the mesh above a point from which its BSDF is looked 
 def surfels_from_mesh(mesh: Any, count: int, *, seed: int = 0, **options: Any) -> Surfels:
     """Surfels evenly spread on a surface, of a size that leaves no holes.
 
-    mesh: an `mi.Scene`, its shapes or one shape, whose shading normals, and albedo, roughness and metallic of
-    the BSDF, with its textures, are taken; or anything with `vertices` (V, 3) and `faces` (F, 3), world, such
-    as a `Mesh` or a trimesh, with the normals of its triangles. count: surfels. options: of `from_points`,
-    such as attributes, opacity (0.99 by default), degree, or initial values, which replace those of the BSDF.
-    Where a BSDF defines no value, it is the attribute's own. Raises InputError for a shape that cannot be
-    tessellated, a surface without area, and as `from_points` does.
+    mesh: an `mi.Scene`, its shapes or one of them, whose shading normals, and albedo, roughness and metallic
+    where their BSDFs and textures define them, are taken; or anything with `vertices` (V, 3) and `faces` (F,
+    3), world, such as a `Mesh` or a trimesh. options: of `from_points`, such as attributes, opacity (default:
+    0.99), or values in place of the BSDF's. Raises InputError for a shape that cannot be tessellated, a
+    surface without area, and as `from_points` does.
     """
     rng = np.random.default_rng(seed)
     materials: dict[str, np.ndarray] = {}

@@ -132,13 +132,11 @@ def densify_and_prune(
 ) -> TableEdit:
     """Split the surfels with the largest error; remove transparent and oversized ones, and faint ones.
 
-    error: (N,), what each surfel is responsible for: Σ w e² over the pixels of recent steps, as
-    `ParameterTable` adds up, or another score such as the length of the position's gradient; none is split
-    where it is 0. most: surfels that result at most. grow: fraction that is split at most. prune_opacity:
-    surfels of less are removed. largest: scene units, one or (N,), larger ones are removed. faint: rows that
-    may be removed for others as far as splits lack room, the first ones first. keep_one: the most opaque
-    surfel stays in any case. Returns new surfels and the row that each descends from, which
-    `ParameterTable.apply` takes. Raises InputError if no surfel would be left.
+    error: (N,), Σ w e² over the pixels of recent steps, or another score, such as the length of the
+    position's gradient; none is split where it is 0. most: surfels that result at most. grow: fraction that
+    is split at most. prune_opacity: surfels of less are removed, as are those larger than `largest`, scene
+    units, one or (N,). faint: rows that make room for splits, the first ones first. keep_one: the most opaque
+    surfel stays in any case. `ParameterTable.apply` takes the result. InputError if no surfel is left.
     """
     error = np.array(error)
     raw = surfels.to_numpy()

@@ -48,8 +48,8 @@ class ExtractMesh(Event[Trainer]):
 def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int = 128) -> Mesh:
     """The surface of surfels as triangles, which occlude: fused from their depth in all cameras.
 
-    cameras: from all around, since what none sees is no surface. resolution: voxels along the longest side of
-    the box around the surfels, 2 … 1023. Detached. Raises InputError without a finite position.
+    cameras: from all around. resolution: voxels along the longest side of the box around the surfels, 2 …
+    1023. Raises InputError without a finite position.
     """
     bounds = bounds_from_points(surfels.to_numpy()["position"])
     views = tee(render_depth(surfels, camera) for camera in cameras)
