@@ -11,12 +11,12 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.plugins.light import light_of
+from mi_refgs.plugins.light import light_of, used_emitters
 from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, EnvironmentLight
+from mi_refgs.shade.light.latlong import lat_long
 from mi_refgs.shade.light.light import RotatedLight
-from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
@@ -36,14 +36,17 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         raise InputError(what, "from_params", type(params).__name__, remedy)
     if shading is not None:
         raise InputError("a scene has its own", "from_params", "shading", "give arrays, or drop it")
+    if integrator.light is None and integrator.shading.model.light != "none":
+        lights = used_emitters(integrator.shading, params) if isinstance(params, mi.Scene) else []
+        if not lights or not all(emitter.is_environment() for emitter in lights):
+            what, remedy = "its light is not an environment alone", "nest an `envmap` in the integrator"
+            raise InputError(what, "from_params", "light", remedy)
     with dr.suspend_grad():
         seen = light_of(integrator.shading, integrator.light, integrator.light_to_world, params)
     light = integrator.light
     if isinstance(seen, RotatedLight) or (light is None and seen is not None):
-        direction = map_directions(DEFAULT_HEIGHT if light is None else light.height)
-        radiance = seen.radiance(mi.Vector3f(direction.reshape(-1, 3).T.astype(np.float32)))
-        values = np.broadcast_to(np.array(radiance), (3, direction.size // 3))
-        light = EnvironmentLight.from_radiance(values.T.reshape(direction.shape))
+        height = DEFAULT_HEIGHT if light is None else light.height
+        light = EnvironmentLight.from_radiance(lat_long(seen.radiance, height))
     around, behind = integrator.background.surfels, integrator.background.map
     if behind is not None or around is not None:
         around = Surroundings((around or nothing_around(integrator.surfels)).detach(), behind)

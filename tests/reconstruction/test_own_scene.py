@@ -72,4 +72,9 @@ def test_other_states_are_refused(balls: Reconstruction) -> None:
     refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
     refused(lambda: make(arrays), "shading: light: reflectance = split_sum needs one")
     refused(lambda: make(arrays | {"opacity": np.full_like(arrays["opacity"], np.nan)}), "NaN")
+    sun = {"type": "directional", "direction": [0, 0, -1]}
+    surfels = {"type": "refgs", **balls.trained.surfels.raw, "reflectance": "split_sum"}
+    lit = mi.load_dict({"type": "scene", "refgs": surfels, "sun": sun})
+    refused(lambda: make(lit), "its light is not an environment alone")
+    refused(lambda: make(mi.traverse(lit.integrator())), "its light is not an environment alone")
     refused(lambda: make(balls.scene(), shading=balls.trained.shading), "a scene has its own")
