@@ -31,10 +31,9 @@ def gaussian_shader(_: Path) -> mi.Scene:
     return scenes.scene(raw=raw_channels() | more, reflectance="gaussian_shader")
 
 
-def emitters(folder: Path) -> mi.Scene:
-    mi.Bitmap(scenes.sky()).write(str(folder / "sky.exr"))
+def emitters(_: Path) -> mi.Scene:
     turned = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 40)
-    sky = {"type": "envmap", "filename": str(folder / "sky.exr"), "to_world": turned}
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(scenes.sky()), "to_world": turned}
     sun = {"type": "directional", "direction": [-1, -1, -0.5]}
     return scenes.lit_scene(sky, {"sun": sun}, diffuse="irradiance")
 
