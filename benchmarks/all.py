@@ -66,7 +66,6 @@ PARTS = (
     Part("splitsum", 9, "benchmarks.splitsum", "--small"),
     Part("visibility", 4, "benchmarks.visibility --mesh {data}/meshes/bob_tri.obj", "--small"),
     Part("stability", 15, "benchmarks.stability", "--quick --only light"),
-    Part("memory", 6, "benchmarks.memory"),
     *_fits(),
     Part("frames", 2, "benchmarks.frames {run}"),
 )

@@ -13,7 +13,6 @@ from benchmarks.fits.plan import GROUPS, SOURCES
 from mi_refgs.compare.table import Statistic
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.scores import PIXEL_CLASSES
-from mi_refgs.kernels import memory as model
 
 Result = dict[str, Any]
 Values = dict[str, Any]
@@ -419,41 +418,10 @@ def _percent(value: float, sign: str = "") -> str:
     return "0" if abs(value) < 1e-9 else f"{100 * value:{sign}.2g} %"
 
 
-# ---------- Memory ----------
-
-
-def memory(result: Result) -> Values:
-    """Measured and predicted gigabytes by kind, and the constants of the prediction."""
-    known = [row for row in result["rows"] if row["measured"] is not None]
-    kinds = list(dict.fromkeys(row["kind"] for row in result["rows"]))
-    ratios = [row["predicted"] / row["measured"] for row in known]
-    most = max(known, key=lambda row: float(row["measured"]))
-    cases: dict[tuple[str, ...], dict[str, str]] = {}
-    for row in known:
-        case = (f"{row['size']}²", f"{row['samples']}", f"{row['surfels']:,}")
-        cell = f"{row['measured'] / 1e9:.2f} ({row['predicted'] / 1e9:.2f})"
-        cases.setdefault(case, {})[row["kind"]] = cell
-    return {
-        "table": table(
-            ["pixels", "samples per pixel", "surfels", *(f"{kind}, GB" for kind in kinds)],
-            [[*case, *(of.get(kind) for kind in kinds)] for case, of in cases.items()],
-        ),
-        "least": f"{min(ratios):.1f}",
-        "largest": f"{max(ratios):.1f}",
-        "most": f"{most['measured'] / 1e9:.1f}",
-        "pass_samples": f"{model.PASS_SAMPLES / 1e6:.1f}",
-        "derivative_samples": f"{model.DERIVATIVE_SAMPLES / 1e6:.1f}",
-        "base": f"{model.BASE / 1e9:.1f}",
-        "per_pixel": f"{model.PER_PIXEL / 1e3:.1f}",
-        "per_surfel": f"{model.PER_SURFEL / 1e3:.1f}",
-    }
-
-
 PAGES: dict[str, Callable[[Result], Values]] = {
     "splatting": splatting,
     "splitsum": splitsum,
     "visibility": visibility,
     "stability": stability,
-    "memory": memory,
 }
 """Benchmarks that write their data file themselves."""

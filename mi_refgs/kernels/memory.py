@@ -1,4 +1,4 @@
-"""Memory that a computation needs and that is available; upper bounds, measured by `benchmarks.memory`."""
+"""Memory that a computation needs and that is available; upper bounds."""
 
 from __future__ import annotations
 

@@ -1,1 +1,0 @@
-"""Peak memory of images and their gradients, compared with the prediction of `mi_refgs.kernels.memory`."""
