@@ -49,8 +49,7 @@ class Part:
     small: str | None = None  # arguments of a small instance
 
 
-TRACING = {"front": 5, "decisions": 20, "photographs": 14}
-"""Minutes of path tracing in a group."""
+TRACING = {"front": 5, "decisions": 20, "photographs": 14}  # minutes of path tracing in a group
 
 
 def _fits() -> Iterator[Part]:

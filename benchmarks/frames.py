@@ -17,10 +17,8 @@ import numpy as np
 from benchmarks.common.report import plain_parser
 from mi_refgs import load
 
-SIZES = (200, 400, 800)
-"""Pixels along the longer side."""
-ROUNDS, WARM_UP = 9, 2
-"""Timed images of each size, and those before, which compile kernels."""
+SIZES = (200, 400, 800)  # pixels along the longer side
+ROUNDS, WARM_UP = 9, 2  # timed images of each size, and those before, which compile kernels
 
 
 def measure(run: Path, sizes: Sequence[int | tuple[int, int]] = SIZES) -> list[dict[str, float]]:

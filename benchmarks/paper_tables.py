@@ -22,8 +22,7 @@ from mi_refgs.io.files import read_json
 
 OTHER_WORDS = {"blender", "synthetic", "ref", "scene", "data", "dataset"}
 """Words that may be part of a folder's name beside the scene, its data set and numbers."""
-UNNAMED = ("Shiny Blender", "Glossy Synthetic")
-"""Data sets of averages for which the paper names none."""
+UNNAMED = ("Shiny Blender", "Glossy Synthetic")  # data sets of averages for which the paper names none
 TITLES = {
     "psnr": ("PSNR (dB)", ".2f"),
     "ssim": ("SSIM", ".3f"),

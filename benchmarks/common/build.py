@@ -24,8 +24,7 @@ from mi_refgs.kernels import device
 RESULTS = ROOT / "benchmarks" / "results"  # data files of the pages
 CODE = ("mi_refgs", "benchmarks", "scenes", "variants", ":!benchmarks/results", ":!*.md")
 """What results depend on, for git."""
-SAME = ("commit", "cpu", "cores", "mitsuba", "drjit", "llvm")
-"""What the rows of a table have in common."""
+SAME = ("commit", "cpu", "cores", "mitsuba", "drjit", "llvm")  # what the rows of a table have in common
 DIGITS = 7  # significant digits of the numbers in a data file
 
 

@@ -11,10 +11,8 @@ import numpy as np
 from benchmarks.common.montecarlo import Estimate
 from benchmarks.common.report import Row
 
-DARK = 0.01
-"""Share of the mean radiance below which a relative error counts as one of this radiance."""
-CLEAR = 2.0
-"""A relMSE below this many times what the reference's own noise adds to it is not told from zero."""
+DARK = 0.01  # share of the mean radiance below which a relative error counts as one of this radiance
+CLEAR = 2.0  # a relMSE below this many times what the reference's own noise adds to it is not told from zero
 
 
 def weight(reference: np.ndarray, scale: float | None = None) -> np.ndarray:

@@ -23,14 +23,11 @@ from mi_refgs.reference.lobe import split_sum_entry
 
 LATTICES = (34, 55, 89, 144, 233, 377, 610, 987, 1597, 2584, 4181)
 """Fibonacci numbers: the good sizes of a rank-1 lattice with the predecessor as its generator."""
-RAY_OFFSET = 1e-4
-"""Distance by which a visibility ray starts off the surface; objects have a size of about 2."""
+RAY_OFFSET = 1e-4  # distance by which a visibility ray starts off the surface; objects have a size of about 2
 NORM_NODES = 20_000
 """Midpoints of the one-dimensional integral that normalises the prefilter's lobe: exact to 1e-8."""
-GOLDEN = 0x9E3779B9
-"""Spreads the seeds of random streams."""
-TABLE_NODES = 700
-"""Midpoints of the float64 quadrature of (A, B): exact to 1e-6."""
+GOLDEN = 0x9E3779B9  # spreads the seeds of random streams
+TABLE_NODES = 700  # midpoints of the float64 quadrature of (A, B): exact to 1e-6
 TABLE_COSINES = np.linspace(0.05, 1.0, 40) ** 2
 """n·v at which the quadrature is done; a cubic spline in √(n·v) lies between."""
 

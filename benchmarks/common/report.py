@@ -20,8 +20,7 @@ from mi_refgs.errors import InputError
 
 Row = dict[str, Any]
 
-NUMERIC = re.compile(r"$|[<>≥~±+−-]?\s?\d|[–●]")
-"""How a cell of a number, an empty one or a mark begins."""
+NUMERIC = re.compile(r"$|[<>≥~±+−-]?\s?\d|[–●]")  # how a cell of a number, an empty one or a mark begins
 
 
 def where(rows: Iterable[Row], **values: Any) -> list[Row]:

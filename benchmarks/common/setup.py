@@ -16,8 +16,7 @@ from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 
 ALBEDO = (0.9, 0.6, 0.3)
-OPACITY = 0.99
-"""Opacity of surfels that cover a solid surface."""
+OPACITY = 0.99  # opacity of surfels that cover a solid surface
 
 
 def path_tracer(depth: int) -> Any:

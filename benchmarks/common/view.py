@@ -27,10 +27,8 @@ SUN_ELEVATION, SUN_AZIMUTH = 12.0, -90.0
 """Degrees above the horizon, and from -z towards +x: so low that a floor glints at a grazing angle."""
 SUBSAMPLES = 8
 """Samples per side of a texel when Mitsuba's sky is baked; the sun's disc is about a texel wide."""
-CHECKS = 12
-"""Checks from pole to pole: 15 degrees each."""
-BUILT_IN = ("constant", "gradient", "studio", "checker", "sunsky")
-"""In rising order of frequency."""
+CHECKS = 12  # checks from pole to pole: 15 degrees each
+BUILT_IN = ("constant", "gradient", "studio", "checker", "sunsky")  # in rising order of frequency
 
 
 @dataclass(frozen=True)
@@ -132,8 +130,7 @@ def make_light(name: str, height: int) -> Light:
     return Light(Path(name).stem, radiance.astype(np.float32))
 
 
-SENSOR = "pixel_centres"
-"""Name under which the sensor is registered."""
+SENSOR = "pixel_centres"  # name under which the sensor is registered
 
 VIEW_BINS = ((0.0, 0.1), (0.1, 0.2), (0.2, 0.5), (0.5, 1.0))
 """Ranges of n·v: 84° from the normal and beyond, 78° to 84°, 60° to 78°, and the rest."""

@@ -23,8 +23,7 @@ from benchmarks.common.report import plain_parser
 from benchmarks.mutation import Mutant, applied, copy_repository, read_mutants
 
 WORKERS = 2
-TIME_LIMIT = 300
-"""Seconds for a test, compiling its kernels included. A mutant that makes it hang is caught."""
+TIME_LIMIT = 300  # seconds for a test, compiling its kernels included; a mutant that hangs is caught
 PYTEST = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist")
 
 

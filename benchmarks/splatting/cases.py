@@ -15,8 +15,7 @@ from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.init import quaternions
 from mi_refgs.surfels.table import Surfels
 
-Grid = tuple[tuple[int, int], ...]
-"""(Surfels, edge of the image in pixels)."""
+Grid = tuple[tuple[int, int], ...]  # (surfels, edge of the image in pixels)
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,7 @@ SMALL = Settings(
 OPACITY = 0.8
 DISTANCE = 4.0
 FIELD_OF_VIEW = 40.0  # degrees
-DIRECTION = (0.6, 0.8, 0.0)
-"""From the sphere's centre to the camera."""
+DIRECTION = (0.6, 0.8, 0.0)  # from the sphere's centre to the camera
 CHANNELS = {"normal": 3, "albedo": 3, "metallic": 1, "roughness": 1, "radiance": 3, "indirect light": 3}
 """Features of the full G-buffer; with depth and alpha they are its 16 channels."""
 FEATURES = sum(CHANNELS.values())

@@ -32,11 +32,9 @@ from mi_refgs.evaluation.profile import phases_of, stepper
 from mi_refgs.splat import list_by_tile, project
 
 FLOPS = {"forward": 60, "both": 260}
-CHAINS = 16
-"""Independent sums per lane: more than latency times ports of any CPU's multiply-add unit."""
+CHAINS = 16  # independent sums per lane: more than latency times ports of any CPU's multiply-add unit
 STEPS = 4096
-VECTORS = 256
-"""SIMD vectors of 16 lanes: enough blocks for every thread."""
+VECTORS = 256  # SIMD vectors of 16 lanes: enough blocks for every thread
 TRIES = 12
 
 
@@ -101,8 +99,7 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
 
 PHASES = ("project", "tile lists", "sort", "splat forward", "splat backward", "surfels backward")
 PHASE_REPEATS = 5
-COST = ("contributing", "pairs", "surfels")
-"""What time is linear in."""
+COST = ("contributing", "pairs", "surfels")  # what time is linear in
 Row = dict[str, Any]
 
 
@@ -138,8 +135,7 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
     }
 
 
-STEP_SECONDS = 1.0
-"""For which the splat of a step is timed by itself, at most."""
+STEP_SECONDS = 1.0  # for which the splat of a step is timed by itself, at most
 
 
 def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:

@@ -99,10 +99,8 @@ def _maps(blended: Composited) -> list[Any]:
     return [*blended.features, blended.depth, blended.alpha]
 
 
-FLATNESS = 1e-2
-"""Thickness over the smaller standard deviation."""
-SH_0 = 0.28209479177387814
-"""The constant spherical harmonic: colour = SH_0 · coefficient + ½."""
+FLATNESS = 1e-2  # thickness over the smaller standard deviation
+SH_0 = 0.28209479177387814  # the constant spherical harmonic: colour = SH_0 · coefficient + ½
 
 
 class Volprim:

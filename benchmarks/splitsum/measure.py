@@ -91,10 +91,8 @@ def speed_ups(rows: list[Row], times: Times) -> list[dict[str, Any]]:
     return found
 
 
-TIMED = (0.5, 0.3)
-"""Metallic and roughness on which times are taken; a kernel is the same for every other."""
-Calls = dict[tuple[str, int], Callable[[], Any]]
-"""What makes the timed image, by method and setting."""
+TIMED = (0.5, 0.3)  # metallic and roughness on which times are taken; a kernel is the same for every other
+Calls = dict[tuple[str, int], Callable[[], Any]]  # what makes the timed image, by method and setting
 
 
 @dataclass

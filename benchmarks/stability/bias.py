@@ -19,8 +19,7 @@ from mi_refgs.reference.camera import camera_frame
 from mi_refgs.reference.splat import sorted_rows
 
 WIDTH, HEIGHT = 48, 40
-SAMPLES = 4
-"""Along each axis of a pixel, for the mean that the low-pass stands for."""
+SAMPLES = 4  # along each axis of a pixel, for the mean that the low-pass stands for
 NEARLY_ONE = 1 - 1e-9
 OPACITIES = (0.9, 0.3, 0.1, 0.05)
 

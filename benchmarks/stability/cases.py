@@ -90,8 +90,7 @@ def plain(name: str, **changes: Any) -> Case:
 
 
 LN = np.log
-EYE = np.array([3.0, 1.0, 2.0])
-"""Position of the plain camera."""
+EYE = np.array([3.0, 1.0, 2.0])  # position of the plain camera
 
 
 def catalogue() -> list[Case]:

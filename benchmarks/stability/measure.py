@@ -30,10 +30,8 @@ from mi_refgs.surfels.table import Surfels
 
 IMAGE_LIMIT = 1e-4
 """Largest error of a map's pixel, relative to the map's largest value: a fortieth of an 8-bit step."""
-GRADIENT_LIMIT = 1e-2
-"""Largest ‖g - g₆₄‖ / ‖g₆₄‖ of a class of parameters."""
-ORDER_LIMIT = 1e-5
-"""Largest relative difference of the depths of two surfels that show in the wrong order."""
+GRADIENT_LIMIT = 1e-2  # largest ‖g - g₆₄‖ / ‖g₆₄‖ of a class of parameters
+ORDER_LIMIT = 1e-5  # largest relative difference of the depths of two surfels that show in the wrong order
 ULP = 2.0**-23
 ILL = 8.0
 """An error of up to so many times what one unit in the last place of the inputs does to the exact answer is

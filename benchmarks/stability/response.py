@@ -15,8 +15,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
 
-SIZE = (11, 9)
-"""Height and width of the images."""
+SIZE = (11, 9)  # height and width of the images
 NOISE = 1e-4
 """Below this a gradient of the loss is compared absolutely: differences of float64 tell no more, and a
 pixel of the plain image has 1e-2."""

@@ -14,8 +14,7 @@ from benchmarks.common.view import Look
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.shade.options import ShadingOptions
 
-METALLIC = 1.0
-"""A metal has no diffuse term: the whole image is the specular one."""
+METALLIC = 1.0  # A metal has no diffuse term: the whole image is the specular one
 VOXEL = 5e-5
 """Resolution the occluder is told, for objects of size 2. Mesh and points are exact: a ray leaves the surface
 by no more than rounding requires."""
@@ -88,8 +87,7 @@ class Rule:
         )
 
 
-PAPER = Rule(1)
-"""One mirror ray for the whole lobe, and no traced light."""
+PAPER = Rule(1)  # one mirror ray for the whole lobe, and no traced light
 
 
 def rules(settings: Settings) -> Iterator[Rule]:
@@ -106,8 +104,7 @@ def rules(settings: Settings) -> Iterator[Rule]:
 BOWLS = {"bowl": (60.0, -0.15), "deep_bowl": (90.0, -0.42)}
 """Degrees from a bowl's lowest point to its rim, of radius 1 at height 0; height of the torus in it."""
 WALL = 0.08
-RING = (0.45, 0.17)
-"""Radii of the torus."""
+RING = (0.45, 0.17)  # radii of the torus
 PLATE = (0.1, 1.4, 1.6)
 PLATE_DISTANCE, PLATE_ANGLE = 0.8, 30.0
 """From the middle to each plate, and the degrees by which each opens towards the camera: a mirror ray of the

@@ -19,8 +19,7 @@ from mi_refgs.shade.points import reflect
 from mi_refgs.shade.sh import clamp_positive, eval_sh, sh_basis
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 
-DEGREE = MAX_SH_DEGREE
-"""SH degree of the product's indirect channel."""
+DEGREE = MAX_SH_DEGREE  # SH degree of the product's indirect channel
 RIDGE = 1e-3
 """Penalty on the coefficients, in multiples of the weight of a whole hemisphere: it decides where hardly any
 direction is blocked. From 1e-4 to 1e-2, relMSE changes by less than a tenth but for plates, roughness 0.1."""

@@ -15,14 +15,12 @@ from benchmarks.visibility.cases import PAPER, Settings, make_scene, rules
 from benchmarks.visibility.harmonics import mirror_radiance
 from benchmarks.visibility.setup import TIMED_ROUGHNESS, Setup
 
-DEPTH = 12
-"""Mitsuba's `max_depth`: light after up to eleven reflections."""
+DEPTH = 12  # Mitsuba's `max_depth`: light after up to eleven reflections
 MIRROR = PAPER.name
 """One mirror ray for the whole lobe and no indirect light: what the price is a multiple of."""
 HARMONICS = "mirror ray, spherical harmonics"
 """The paper's rule: one mirror ray, indirect light by the best spherical harmonics."""
-BUDGET = 3.0
-"""Times of the mirror ray alone that a setting may take."""
+BUDGET = 3.0  # times of the mirror ray alone that a setting may take
 
 
 def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:

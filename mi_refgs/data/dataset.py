@@ -98,8 +98,7 @@ class Reader(Protocol):
 
 READERS: Registry[Reader] = Registry("reader of data sets", newest_first=True)
 """All readers, in the order in which `recognises` is called."""
-register_reader = READERS.register
-"""Add a reader, whose `recognises` is called before those of all others."""
+register_reader = READERS.register  # add a reader, whose `recognises` is called before those of all others
 
 
 def reader_of(folder: Path) -> Reader:

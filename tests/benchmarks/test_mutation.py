@@ -9,8 +9,7 @@ from benchmarks.mutation import mutated, read_mutants
 from tests.helpers import ROOT
 
 MUTANTS = read_mutants()
-WITHOUT_MUTANTS = {"reference"}
-"""The float64 reference that the others are tested against."""
+WITHOUT_MUTANTS = {"reference"}  # the float64 reference that the others are tested against
 
 
 def test_mutant_changes_its_source() -> None:

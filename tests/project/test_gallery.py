@@ -28,8 +28,7 @@ SETTINGS: dict[str, Any] = {
     ),
     "lights": (ROOT / "scenes" / "lights" / "studio.exr",),
 }
-TURN, TEST_VIEWS = 4, 4
-"""Frames of a turntable, and test views, of the small gallery."""
+TURN, TEST_VIEWS = 4, 4  # frames of a turntable, and test views, of the small gallery
 COMMITTED = ROOT / "docs" / "gallery"
 LIMIT = 5_000_000  # bytes of the gallery in the repository
 

@@ -21,8 +21,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 SHORTER = {"scaled(method, 0.2)": "scaled(method, 0.02)", "> 21": "> 10", "< 20": "< 90", "%config": "# "}
 """Changes of the first tutorial for a fit of 40 iterations outside of Jupyter."""
 MOST_BYTES = 300_000
-MOST_SECONDS = 60
-"""Seconds of CPU time on an idle machine; a busy one counts up to twice as many."""
+MOST_SECONDS = 60  # seconds of CPU time on an idle machine; a busy one counts up to twice as many
 
 
 def cells(path: Path) -> list[Any]:

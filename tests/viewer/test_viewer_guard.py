@@ -19,8 +19,7 @@ from mi_refgs.viewer.guard import MESSAGE_BYTES
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 
-WAIT = 20.0
-"""Seconds that a busy machine may take to answer."""
+WAIT = 20.0  # seconds that a busy machine may take to answer
 UPGRADE = (
     "Upgrade: websocket",
     "Connection: Upgrade",

@@ -37,10 +37,8 @@ from tests.scenes.tiny import write_open_data
 
 WINDOW = {"width": 760, "height": 420}
 """Small: browser and viewer draw on the same processor. The image is as wide as it is high."""
-SMALL = "200²"
-"""Pixels at rest."""
-PATIENCE = 90.0
-"""Seconds that a page may take to show something, on a busy machine."""
+SMALL = "200²"  # pixels at rest
+PATIENCE = 90.0  # seconds that a page may take to show something, on a busy machine
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
