@@ -65,8 +65,7 @@ def children_of(parent: Any) -> dict[str, Any]:
 
 
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
-    """A flat copy aligned to SIMD vectors, LOOK_AHEAD zeros after its end: Dr.Jit has one kernel more for
-    others."""
+    """A flat copy aligned to SIMD vectors, LOOK_AHEAD zeros after its end: others need more kernels."""
     size, count = np.dtype(dtype).itemsize, np.size(values)
     whole: np.ndarray = np.zeros((count + LOOK_AHEAD) * size + ALIGNMENT, np.uint8)
     start = -whole.ctypes.data % ALIGNMENT

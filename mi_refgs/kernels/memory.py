@@ -50,8 +50,7 @@ def of_fit(pixels: int, surfels: int, images: float) -> float:
 
 
 def require(needed: float, what: str, remedy: str) -> None:
-    """Raise InputError, with `what` and `remedy`, if a process that needs so many bytes in all would not
-    fit."""
+    """Raise InputError, with `what` and `remedy`, if a process that needs so many bytes would not fit."""
     there = available() + resident()
     if needed > there:
         numbers = f"needs {needed / 1e9:.2g} GB of memory, {there / 1e9:.2g} GB are available"

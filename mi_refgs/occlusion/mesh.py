@@ -67,8 +67,7 @@ def extract_mesh(tsdf: TSDF) -> Mesh:
 
 
 def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = False) -> Mesh:
-    """Keep the large closed components, without inner walls, degenerate triangles and unused vertices; with
-    `open_` all that are large."""
+    """The large components (without `open_` closed ones that wind outward), without degenerate triangles."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.update_faces(mesh.area_faces > 0)
     if not len(mesh.faces):

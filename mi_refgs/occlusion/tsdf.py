@@ -44,8 +44,7 @@ class TSDF:
 
 
 def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Box (lo, hi) with a margin around (N, 3) world points, without NaN and floaters; InputError if none is
-    left."""
+    """Box (lo, hi) with a margin around (N, 3) world points but NaN and floaters; InputError without any."""
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -109,8 +108,8 @@ class _Grid:
         self.corner = (flat // nyz) | ((yz // nz) << 10) | ((yz % nz) << 20)
         self.lo = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in origin))
         self.voxel = dr.opaque(mi.Float, voxel)
-        self.total, self.weight, self.seen, self.behind = (dr.zeros(mi.Float, count) for _ in range(4))
-        dr.eval(self.corner, self.total, self.weight, self.seen, self.behind)
+        self.total, self.weight, self.behind = (dr.zeros(mi.Float, count) for _ in range(3))
+        dr.eval(self.corner, self.total, self.weight, self.behind)
 
     def integrate(self, depth: Float, alpha: Float, camera: Camera) -> None:
         """Add one view."""
@@ -136,18 +135,15 @@ class _Grid:
         banded = hit & (distance > -trunc)
         # Full weight down to one voxel behind the surface, then falling to 0 at the truncation.
         weight = dr.clip((distance + trunc) / (trunc - self.voxel), 0, 1)
-        weight = dr.select(banded, weight, 0)
-        empty = dr.select(in_image & background, mi.Float(1), 0)
-        self.seen += weight + empty
+        weight = dr.select(banded, weight, 0) + dr.select(in_image & background, mi.Float(1), 0)
         self.behind += dr.select(hit & ~banded, mi.Float(1), 0)
-        weight += empty
         distance = dr.select(background, trunc, distance)
         self.weight += weight
         self.total += dr.select(weight > 0, weight * dr.minimum(distance / trunc, 1), 0)
-        dr.eval(self.total, self.weight, self.seen, self.behind)
+        dr.eval(self.total, self.weight, self.behind)
 
     def volume(self) -> np.ndarray:
-        inside = (self.behind > 0) & (self.seen <= UNSEEN_VOTE * self.behind)
+        inside = (self.behind > 0) & (self.weight <= UNSEEN_VOTE * self.behind)
         observed = self.weight > 0
         mean = self.total / dr.select(observed, self.weight, 1)
         value = dr.select(inside, -1, dr.select(observed, mean, 1))

@@ -33,8 +33,7 @@ class Hit:
 
 
 class Occluder:
-    """The extracted mesh in a private scene, updated in place: evaluate what is `visible` before the next
-    `update`."""
+    """The extracted mesh in a private scene, updated in place: evaluate `visible` before `update`."""
 
     NAME = "occluder"
 

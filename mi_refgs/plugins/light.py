@@ -95,8 +95,7 @@ class DirectionalLight:
 
 
 def light_of(shading: Shading, own: EnvironmentLight | None, to_world: Any, scene: Any) -> Light | None:
-    """The integrator's light, else the sum of the scene's; None if the model uses none. Raises InputError
-    without one."""
+    """The integrator's light, else the sum of the scene's (else InputError); None if the model uses none."""
     if shading.model.light == "none":
         return None
     if (light := shading.light_of(own)) is not None:
@@ -136,8 +135,7 @@ def _named(objects: list[Any]) -> str:
 
 
 def rotated(light: Any, to_world: Any) -> Any:
-    """The light under a rotation or reflection (mi.Transform4f), under AD as a rotation; InputError for scale
-    or shear."""
+    """The light, rotated or reflected by a mi.Transform4f, under AD as a rotation; else InputError."""
     matrix = rotation_part(to_world.matrix)
     value = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
     if not np.abs(value.T @ value - np.eye(3)).max() < 1e-4:

@@ -64,14 +64,11 @@ def sigmoid(x: Array) -> Array:
     return 1 / (1 + np.exp(-x))
 
 
-PARALLEL = 0.95  # |cos| between the view and `up` above which world y is taken for up
-
-
 def look_at(origin: Array, target: Array, up: tuple[float, ...] = (0.0, 0.0, 1.0)) -> Array:
     """World-from-camera (4, 4), +z towards the target; world y is up where the view runs along `up`."""
     origin, target, upward = (np.asarray(x, dtype=np.float64) for x in (origin, target, up))
     forward = (target - origin) / np.linalg.norm(target - origin)
-    if abs(forward @ upward) >= PARALLEL * np.linalg.norm(upward):
+    if abs(forward @ upward) >= 0.95 * np.linalg.norm(upward):  # nearly parallel
         upward = np.array([0.0, 1, 0])
     left = np.cross(upward, forward)
     left /= np.linalg.norm(left)

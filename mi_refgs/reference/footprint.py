@@ -118,8 +118,12 @@ class Gaussian:
         p, axes = camera_frame(raw, camera)
         σ, z = np.exp(raw["scale"]), p[:, 2]
         along = []  # pixels on the screen of one standard deviation along each axis, (N, 3) in x and in y
-        for i, ((focal, _), limits) in enumerate(zip(intrinsics(camera), _limits(camera), strict=True)):
-            slope = clip(p[:, i] / np.where(z == 0, 1, z), *limits)
+        for i, ((focal, middle), (first, last)) in enumerate(
+            zip(intrinsics(camera), camera.borders, strict=True)
+        ):
+            margin = c.GAUSSIAN_SLOPE_MARGIN * (last - first)
+            ends = [(first - margin - middle) / focal, (last + margin - middle) / focal]
+            slope = clip(p[:, i] / np.where(z == 0, 1, z), min(ends), max(ends))
             along.append(focal * σ * (axes[:, :, i] - slope[:, None] * axes[:, :, 2]) / z[:, None])
         covariance = [[np.sum(a * b, axis=1) for b in along] for a in along]
         low_pass = c.GAUSSIAN_LOW_PASS if rules.low_pass else 0.0
@@ -155,13 +159,3 @@ def _from_centre(p: Array, axes: Array, ray: Array) -> tuple[Array, list[Array]]
     lift = np.einsum("nk,nkp->np", axes[:, 2], beside) / np.sum(p * axes[:, 2], 1)[:, None]
     along = [np.einsum("nk,nkp->np", axes[:, i], beside) for i in range(2)]
     return lift, [along[i] - lift * np.sum(p * axes[:, i], 1)[:, None] for i in range(2)]
-
-
-def _limits(camera: PinholeCamera) -> list[tuple[float, float]]:
-    """Slopes p_x / p_z and p_y / p_z of the neighbourhood of the image."""
-    limits = []
-    for (focal, middle), (first, last) in zip(intrinsics(camera), camera.borders, strict=True):
-        margin = c.GAUSSIAN_SLOPE_MARGIN * (last - first)
-        ends = [(first - margin - middle) / focal, (last + margin - middle) / focal]
-        limits.append((min(ends), max(ends)))
-    return limits

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, rotation_axes, sigmoid
+from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, ray_slopes, rotation_axes, sigmoid
 from mi_refgs.reference.footprint import Rules
 from mi_refgs.reference.light import Light, radiance_of
 from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points, Taps, harmonics, positive, unit
@@ -57,8 +57,7 @@ class Image:
 
 
 def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 1e-4) -> Image:
-    """Image, and with `weights` (P, …) of some maps gradients of Σ weights · maps; `band`: of
-    discontinuities."""
+    """Image, and with `weights` (P, …) gradients of Σ weights · maps; `band`: of discontinuities."""
     raw, around = (
         {n: np.asarray(x, np.float64) for n, x in table.items()} for table in (scene.raw, scene.around or {})
     )
@@ -246,8 +245,7 @@ def inverse_alpha(alpha: Array) -> Array:
 
 def rays(camera: PinholeCamera, x: Array, y: Array) -> Array:
     """Unit directions (P, 3) in the world through points of the image (P,), in pixels."""
-    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
-    return unit(ray @ camera.to_world[:3, :3].T)
+    return unit(ray_slopes(camera, x, y).T @ camera.to_world[:3, :3].T)
 
 
 def bilinear_map(values: Array, x: Array, y: Array) -> Array:

@@ -89,7 +89,7 @@ def half_metal(metallic: Array, alpha: Array) -> float:
     return float(np.mean(alpha * metallic * (1 - metallic)))
 
 
-def _irradiances(level: Array, count: int = 256) -> Array:
+def irradiances(level: Array, count: int = 256) -> Array:
     """Colours (count, 3) of an irradiance map in the directions of a spherical Fibonacci lattice around y."""
     i = np.arange(count)
     z = 1 - (2 * i + 1) / count
@@ -97,14 +97,9 @@ def _irradiances(level: Array, count: int = 256) -> Array:
     return radiance_of(level, np.stack([ring * np.cos(φ), ring * np.sin(φ), z], axis=1))
 
 
-def mean_irradiance(level: Array) -> float:
-    """Mean over directions and channels of an irradiance map (h, 2h, 3)."""
-    return float(_irradiances(level).mean())
-
-
 def light_colour(level: Array, scale: float) -> float:
     """Mean over directions of the mean |E - grey E| of the channels, over `scale`, which is a constant."""
-    irradiance = _irradiances(level)
+    irradiance = irradiances(level)
     return float(np.mean(np.abs(irradiance - irradiance.mean(1, keepdims=True))) / scale)
 
 

@@ -83,7 +83,7 @@ def fuse_point(
 ) -> float:
     """Fused signed distance of one point, in truncations, by the table at the top of `occlusion.tsdf`."""
     truncation = truncation_voxels * voxel
-    total = weight = sightings = covered = 0.0
+    total = weight = covered = 0.0
     for depth, (to_world, focal, size) in zip(depths, views, strict=True):
         x, y, z = to_world[:3, :3].T @ (point - to_world[:3, 3])
         if z <= 0:
@@ -96,7 +96,6 @@ def fuse_point(
         rows, columns = (np.clip((k, k + 1), 0, size - 1) for k in (v0, u0))
         tap = depth[np.ix_(rows, columns)]
         if (tap == 0).all():  # background for certain
-            sightings += 1
             weight += 1
             total += 1
             continue
@@ -110,10 +109,9 @@ def fuse_point(
             covered += 1
             continue
         w = min(1.0, (distance + truncation) / (truncation - voxel))
-        sightings += w
         weight += w
         total += w * min(1.0, distance / truncation)
-    if covered and sightings <= unseen_vote * covered:
+    if covered and weight <= unseen_vote * covered:
         return -1.0
     return total / weight if weight else 1.0
 
@@ -144,8 +142,7 @@ def mesh_distance(vertices: Array, faces: Array, origin: Array, direction: Array
 def mirror_visibility(
     vertices: Array, faces: Array, eye: Array, normal: Array, ray: Array, offset: float
 ) -> Array:
-    """1 (P,), or 0 where mirror rays of unit rays (P, 3) from the eye, `offset` off along normals, are
-    blocked."""
+    """1 (P,), or 0 where mirror rays of unit rays (P, 3) from the eye, `offset` off the mesh, are blocked."""
     if not len(faces):
         return np.ones(len(normal))
     origin = np.broadcast_to(eye, ray.shape)

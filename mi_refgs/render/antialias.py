@@ -1,5 +1,4 @@
-"""Antialiasing of reflections: each pixel, composited once, is shaded at four points, at interpolated normals
-and visibility."""
+"""Antialiasing of reflections: each pixel, composited once, is shaded at four interpolated points."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Display of linear radiance, the one place of the sRGB curve: lists of mi.Float planes (H·W), raster
-order."""
+"""Display of linear radiance, the one place of the sRGB curve: lists of mi.Float planes (H·W)."""
 
 from __future__ import annotations
 

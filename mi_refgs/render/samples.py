@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.linear import linear
 from mi_refgs.kernels.trees import mapped
 from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
@@ -82,34 +83,19 @@ def box_mean(plane: Float, camera: Camera, factor: int) -> Float:
     """Mean of each factor × factor block of a supersampled plane; one of width 1 is constant."""
     if factor == 1 or dr.width(plane) == 1:
         return plane
-    return dr.custom(_BoxMean, plane, camera.width, camera.height, factor)
+    width, samples = camera.width, factor * factor
+    count = width * camera.height * samples
 
-
-class _BoxMean(dr.CustomOp):
-    """Mean of blocks of pixels, with an adjoint that gathers."""
-
-    def eval(self, plane: Float, width: int, height: int, factor: int) -> Float:
-        self.size = width, height, factor
-        return self._mean(plane)
-
-    def _mean(self, plane: Float) -> Float:
-        width, height, factor = self.size
-        sample = dr.arange(mi.UInt32, width * height * factor * factor)
-        pixel, part = sample // (factor * factor), sample % (factor * factor)
+    def mean(plane: Float) -> Float:
+        sample = dr.arange(mi.UInt32, count)
+        pixel, part = sample // samples, sample % samples
         x = (pixel % width) * factor + part % factor
         y = (pixel // width) * factor + part // factor
-        ordered = dr.gather(mi.Float, plane, y * (width * factor) + x)
-        return dr.block_sum(ordered, factor * factor) / (factor * factor)
+        return dr.block_sum(dr.gather(mi.Float, plane, y * (width * factor) + x), samples) / samples
 
-    def forward(self) -> None:
-        self.set_grad_out(self._mean(self.grad_in("plane")))
-
-    def backward(self) -> None:
-        width, height, factor = self.size
-        sample = dr.arange(mi.UInt32, width * height * factor * factor)
+    def spread(mean: Float) -> Float:
+        sample = dr.arange(mi.UInt32, count)
         x, y = sample % (width * factor), sample // (width * factor)
-        δ = dr.gather(mi.Float, self.grad_out(), (y // factor) * width + x // factor)
-        self.set_grad_in("plane", δ / (factor * factor))
+        return dr.gather(mi.Float, mean, (y // factor) * width + x // factor) / samples
 
-    def name(self) -> str:
-        return "box mean"
+    return linear(plane, mean, spread)

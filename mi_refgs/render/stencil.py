@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.kernels.linear import linear
 from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.types import Bool, Float, UInt32
 
@@ -19,45 +20,31 @@ def neighbours(
 ) -> list[Float]:
     """The plane (mi.Float, raster order) by each step: out_k(x, y) = plane(x + dx_k, y + dy_k), dx, dy in
     {-1, 0, 1}, borders repeated. A plane of compacted `pixels`, detached, is 0 at all others."""
-    if pixels is None:
-        return list(dr.custom(_Neighbours, plane, width, height, tuple(steps)))
-    dr.eval(plane)
-    inside = dr.minimum(pixels.raster, width * height - 1)  # patches reach beyond the image
-    x, y = inside % width, inside // width
-    index = [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
-    return [pixels.at(plane, i) for i in index]
-
-
-class _Neighbours(dr.CustomOp):
-    def eval(self, plane: Float, width: int, height: int, steps: tuple[Step, ...]) -> list[Float]:
-        self.width, self.height, self.steps = width, height, steps
-        return self._shift(plane)
-
-    def _shift(self, plane: Float) -> list[Float]:
+    if pixels is not None:
         dr.eval(plane)
-        x, y = _pixel(self.width, self.height)
-        return [
-            dr.gather(mi.Float, plane, _moved(y, dy, self.height) * self.width + _moved(x, dx, self.width))
-            for dx, dy in self.steps
-        ]
+        inside = dr.minimum(pixels.raster, width * height - 1)  # patches reach beyond the image
+        x, y = inside % width, inside // width
+        index = [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
+        return [pixels.at(plane, i) for i in index]
 
-    def forward(self) -> None:
-        self.set_grad_out(self._shift(self.grad_in("plane")))
+    def shifted(plane: Float) -> list[Float]:
+        dr.eval(plane)
+        x, y = _pixel(width, height)
+        index = [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
+        return [dr.gather(mi.Float, plane, i) for i in index]
 
-    def backward(self) -> None:
+    def gathered(shifts: list[Float]) -> Float:
         """Pixel s was read by the pixels p = s - step and, where the border repeats, by s itself."""
-        x, y = _pixel(self.width, self.height)
-        δ_plane = mi.Float(0)
-        δ_out = self.grad_out()
-        dr.eval(δ_out)
-        for (dx, dy), δ in zip(self.steps, δ_out, strict=True):
-            for reader_y, read_y in _readers(y, dy, self.height):
-                for reader_x, read_x in _readers(x, dx, self.width):
-                    δ_plane += dr.gather(mi.Float, δ, reader_y * self.width + reader_x, read_x & read_y)
-        self.set_grad_in("plane", δ_plane)
+        x, y = _pixel(width, height)
+        total = mi.Float(0)
+        dr.eval(shifts)
+        for (dx, dy), shift in zip(steps, shifts, strict=True):
+            for reader_y, read_y in _readers(y, dy, height):
+                for reader_x, read_x in _readers(x, dx, width):
+                    total += dr.gather(mi.Float, shift, reader_y * width + reader_x, read_x & read_y)
+        return total
 
-    def name(self) -> str:
-        return "neighbours"
+    return list(linear(plane, shifted, gathered))
 
 
 def _pixel(width: int, height: int) -> tuple[UInt32, UInt32]:

@@ -24,8 +24,7 @@ def number(default: int, least: int, most: int) -> Any:
 
 @dataclass(frozen=True)
 class ShadingOptions:
-    """How light becomes radiance; what costs extra is off by default. Raises InputError for wrong types and
-    ranges."""
+    """How light becomes radiance; what costs extra is off by default. Wrong types and ranges: InputError."""
 
     at: ShadedAt = "pixel"  # deferred shading per pixel or forward shading per surfel
     reflectance: str = "split_sum"  # a name in `reflectance.MODELS`

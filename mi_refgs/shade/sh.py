@@ -50,8 +50,7 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
 
 
 def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
-    """Σ coefs[i] basis_i(direction) of 1, 4, 9 or 16 colours (else InputError) at unit directions, not
-    clamped."""
+    """Σ coefs[i] basis_i(direction), not clamped, of 1, 4, 9 or 16 colours (else InputError)."""
     degree = math.isqrt(len(coefs)) - 1
     if (degree + 1) ** 2 != len(coefs) or not 0 <= degree <= MAX_SH_DEGREE:
         raise InputError(f"{len(coefs)} colours", "eval_sh", "coefs", "give 1, 4, 9 or 16, for degree 0 … 3")

@@ -148,8 +148,7 @@ class Camera:
         return replace(camera, offset=(x, y), film=None if size == (width, height) else size)
 
     def attached(self, sensor: Sensor) -> Camera:
-        """The camera with derivatives, where enabled, by its sensor's `x_fov`, principal point and `to_world`
-        (a rigid motion)."""
+        """The camera with derivatives by its sensor's `x_fov`, principal point and (rigid) `to_world`."""
         camera, matrix, params = self, sensor.world_transform().matrix, mi.traverse(sensor)
         if dr.grad_enabled(matrix):
             moved = (matrix[i, 3] for i in range(3))

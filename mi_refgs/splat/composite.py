@@ -3,8 +3,7 @@
     out_k = Σᵢ wᵢ f_ik,    wᵢ = αᵢ Tᵢ,    Tᵢ = Π_{j<i} (1 - αⱼ)                             [2DGS, eq. 12]
 
 Depth and accumulated alpha are two more features (f = z and f = 1). The adjoint replays the same order; with
-gᵢ = Σ_k δ_k f_ik, and S = Σ_k δ_k out_k, from which wᵢ gᵢ is subtracted at each step so that S is what lies
-behind,
+gᵢ = Σ_k δ_k f_ik, and S = Σ_k δ_k out_k less wᵢ gᵢ at each step, which is what lies behind,
 
     δf_ik = wᵢ δ_k,        δαᵢ = Tᵢ gᵢ - S_{j>i} / (1 - αᵢ)
 
@@ -58,8 +57,7 @@ def composite(footprints: Footprints, features: list[Float], lists: TileLists) -
 
 @phase("splat forward")
 def composite_compact(lists: TileLists, depth: bool) -> Composited:
-    """Maps of the pixels of patches that list a surfel, in the order of `pixels`, detached; alpha is 1 -
-    T."""
+    """Detached maps of the pixels of patches that list a surfel, in the order of `pixels`; alpha is 1 - T."""
     if not lists.pairs:
         return Composited.nothing(lists.features, lists.camera, depth)
     dr.eval(lists.rows.data)
@@ -189,9 +187,6 @@ class _Composite(dr.CustomOp):
         dr.eval(δout)  # together: to gather from them would evaluate one by one what they have in common
         δrows = _backward(self.lists, lanes, lanes.from_raster(δout), lanes.from_raster(self.out))
         self.set_grad_in("columns", δrows.columns())
-
-    def name(self) -> str:
-        return "composite"
 
 
 def _blank(count: int, camera: Camera) -> list[Float]:

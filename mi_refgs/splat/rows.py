@@ -55,8 +55,7 @@ class PackedRows:
         return [value for group in groups for value in group]
 
     def add(self, row: UInt32, values: list[Float], active: Bool) -> None:
-        """Add values, one array per column, to rows; on the CPU by copies per thread if they fit into
-        COPIES_BYTES."""
+        """Add values, one array per column, to rows; on the CPU by copies per thread within COPIES_BYTES."""
         # Dr.Jit itself always adds atomically to more than a million entries.
         copies = 4 * dr.width(self.data) * dr.thread_count()
         mode = dr.ReduceMode.Expand if copies <= COPIES_BYTES else dr.ReduceMode.Local

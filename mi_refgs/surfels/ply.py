@@ -83,8 +83,7 @@ def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
 
 
 def write_ply(path: str | Path, surfels: Surfels) -> None:
-    """Write surfels as binary float32 PLY, atomically and exactly. Raises InputError if a value is not finite
-    or the path cannot be written."""
+    """Write surfels as binary float32 PLY, atomically and exactly. Raises InputError if that fails."""
     write_bytes(path, encode_ply(surfels))
 
 

@@ -77,8 +77,7 @@ def test_surface_is_closed_outward_and_within_a_voxel(name: str) -> None:
 
 
 def test_matches_the_float64_specification() -> None:
-    """Two objects, one hiding the other, one view with a hole in it, and one that sees only part of the
-    box."""
+    """Two objects, one hiding the other, a view with a hole in it, and one that sees only part of the box."""
     shape = ref.union(ref.sphere((0.2, 0, 0.3), 0.6), ref.box((0, 0.1, -0.7), (0.9, 0.8, 0.15)))
     poses = ring_of_views(directions(9)[1:])
     poses[3][:3, 3] += np.array([1.5, 0.5, 0])

@@ -58,8 +58,7 @@ def point3(x: np.ndarray) -> mi.Point3f:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_mirror_rays_against_the_true_shape(name: str) -> None:
-    """Points up to half a voxel off the surface, either side, noisy mesh: few false occlusions, few missed
-    ones."""
+    """Points up to half a voxel off the surface, either side, noisy mesh: few false or missed occlusions."""
     shape = SHAPES[name]
     mesh = extracted(shape, noise=0.2)
     occluder = Occluder(mesh)

@@ -23,28 +23,16 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
-from tests.scenes.integrator import (
-    COUNT,
-    HEIGHT,
-    WIDTH,
-    image,
-    integrator,
-    lit_scene,
-    plane_mesh,
-    raw_channels,
-    scene,
-    sensor,
-    sky,
-)
+from tests.scenes import integrator as scenes
 
 
 def run_folder(folder: Path, background: tuple[float, float, float] | None = None) -> tuple[Surfels, Camera]:
     """What a fit leaves behind, with a principal point off the centre."""
-    surfels = Surfels.from_numpy(raw_channels())
+    surfels = Surfels.from_numpy(scenes.raw_channels())
     write_ply(folder / "surfels.ply", surfels)
-    EnvironmentLight.from_radiance(sky()).write(folder / "envmap.exr")
-    plane_mesh(folder)
-    shifted = sensor(principal_point_offset_x=0.1, principal_point_offset_y=-0.2)
+    EnvironmentLight.from_radiance(scenes.sky()).write(folder / "envmap.exr")
+    scenes.plane_mesh(folder)
+    shifted = scenes.sensor(principal_point_offset_x=0.1, principal_point_offset_y=-0.2)
     camera = Camera.from_sensor(mi.load_dict(shifted))
     files = SceneFiles("surfels.ply", "envmap.exr", "mesh.ply", background=background)
     write_scene_xml(folder / "scene.xml", files, Shading(occlusion=True), [camera])
@@ -55,10 +43,10 @@ def test_exported_scene_renders_the_same_view(tmp_path: Path) -> None:
     surfels, camera = run_folder(tmp_path)
     loaded = mi.load_file(str(tmp_path / "scene.xml"))
     occluder = loaded.integrator().occluder
-    light = EnvironmentLight.from_radiance(sky()).prefilter()
+    light = EnvironmentLight.from_radiance(scenes.sky()).prefilter()
     frame = render(SurfelScene(surfels, Shading(occlusion=True), light, occluder), camera)
-    expected = np.concatenate([frame.radiance.numpy(), frame.alpha.numpy()[None]]).T.reshape(HEIGHT, WIDTH, 4)
-    result = image(loaded)
+    result = scenes.image(loaded)
+    expected = np.concatenate([frame.radiance.numpy(), frame.alpha.numpy()[None]]).T.reshape(result.shape)
     assert expected[..., 3].max() > 0.5
     np.testing.assert_allclose(result, expected, atol=1e-5)
 
@@ -67,7 +55,7 @@ def test_parameter_keys_do_not_depend_on_the_address(tmp_path: Path) -> None:
     run_folder(tmp_path, background=(1, 0.5, 0.25))
     params = mi.traverse(mi.load_file(str(tmp_path / "scene.xml")))
     keys = [key.removeprefix("refgs.") for key in params.keys() if key.startswith("refgs.")]
-    assert keys == [*raw_channels(), "light", "light_to_world"]
+    assert keys == [*scenes.raw_channels(), "light", "light_to_world"]
     anonymous = '<scene version="3.0.0"><integrator type="refgs">'
     anonymous += f'<string name="filename" value="{tmp_path}/surfels.ply"/>'
     params = mi.traverse(mi.load_string(anonymous + "</integrator></scene>"))
@@ -75,11 +63,11 @@ def test_parameter_keys_do_not_depend_on_the_address(tmp_path: Path) -> None:
 
 
 def test_terms_add_up_and_radiance_needs_no_light() -> None:
-    shown = image(scene(aovs="d:diffuse,s:specular,i:indirect"))
+    shown = scenes.image(scenes.scene(aovs="d:diffuse,s:specular,i:indirect"))
     parts = shown[..., -9:].reshape(*shown.shape[:2], 3, 3)
     np.testing.assert_allclose(parts.sum(2), shown[..., :3], atol=1e-5)
     assert parts[..., 0, :].max() > 0.1 and parts[..., 1, :].max() > 0.01
-    assert image(lit_scene(None, reflectance="radiance")).max() > 0.1
+    assert scenes.image(scenes.lit_scene(None, reflectance="radiance")).max() > 0.1
 
 
 def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
@@ -89,21 +77,22 @@ def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
     sun = {"type": "directional", "direction": [-1, -1, -0.5], "irradiance": warm}
 
     def lit(**emitters: dict) -> mi.Scene:
-        return lit_scene(None, emitters, diffuse="irradiance")
+        return scenes.lit_scene(None, emitters, diffuse="irradiance")
 
-    alone = image(lit(sun=sun))
+    alone = scenes.image(lit(sun=sun))
     assert alone.max() > 0.1
-    np.testing.assert_allclose(image(lit(sky=sky, sun=sun)), image(lit(sky=sky)) + alone, atol=1e-6)
+    both = scenes.image(lit(sky=sky, sun=sun))
+    np.testing.assert_allclose(both, scenes.image(lit(sky=sky)) + alone, atol=1e-6)
 
     lamp = {"type": "rectangle", "bulb": {"type": "area"}}
     more = lit(sky=sky, spot={"type": "spot"}, lamp=lamp, floor={"type": "disk"})
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        image(more), image(more)
+        scenes.image(more), scenes.image(more)
     emitters, shapes = (str(warning.message) for warning in told)
     assert "AreaLight 'bulb', SpotLight 'spot'" in emitters and "'sky'" not in emitters
     assert "Disk 'floor', Rectangle 'lamp'" in shapes
-    refused(lambda: image(lit(spot={"type": "spot"})), "refgs takes none of SpotLight 'spot'")
+    refused(lambda: scenes.image(lit(spot={"type": "spot"})), "refgs takes none of SpotLight 'spot'")
 
 
 def test_the_lobe_of_a_directional_light_is_normalised() -> None:
@@ -119,13 +108,13 @@ def test_the_lobe_of_a_directional_light_is_normalised() -> None:
 
 
 def test_surfel_count_may_change() -> None:
-    of, other = scene(), raw_channels(COUNT + 9, seed=5)
+    of, other = scenes.scene(), scenes.raw_channels(scenes.COUNT + 9, seed=5)
     params = mi.traverse(of)
     tensors = {name: params[f"integrator.{name}"] for name in other}
     for name, values in other.items():
         params[f"integrator.{name}"] = mi.TensorXf(values)
     params.update()
-    np.testing.assert_array_equal(image(of), image(scene(raw=other)))
+    np.testing.assert_array_equal(scenes.image(of), scenes.image(scenes.scene(raw=other)))
     assert all(of.integrator().surfels.raw[name] is tensor for name, tensor in tensors.items())
 
 
@@ -133,12 +122,12 @@ def test_surfel_count_may_change() -> None:
     ("key", "shape", "words"),
     [
         ("position", (3, 3), "rotation: shape"),
-        ("radiance_sh", (COUNT, 10), "radiance_sh: 10 columns"),
+        ("radiance_sh", (scenes.COUNT, 10), "radiance_sh: 10 columns"),
         ("light", (8, 8, 3), "light: shape"),
     ],
 )
 def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) -> None:
-    params = mi.traverse(scene())
+    params = mi.traverse(scenes.scene())
     params[f"integrator.{key}"] = dr.zeros(mi.TensorXf, shape)
     with pytest.raises(Exception, match=words):
         params.update()
@@ -150,9 +139,9 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
 def test_a_node_of_a_torch_pipeline_may_be_a_render() -> None:
     """tanh → mi.render → sigmoid: gradients as those of the same pipeline in Dr.Jit."""
     torch = pytest.importorskip("torch")
-    of, key = scene(), "integrator.albedo"
-    params, raw = mi.traverse(of), raw_channels()["albedo"]
-    weights = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+    of, key = scenes.scene(), "integrator.albedo"
+    params, raw = mi.traverse(of), scenes.raw_channels()["albedo"]
+    weights = np.random.default_rng(0).normal(size=(scenes.HEIGHT, scenes.WIDTH, 3)).astype(np.float32)
 
     def rendered(albedo: mi.TensorXf) -> mi.TensorXf:
         params[key] = albedo
@@ -172,9 +161,9 @@ def test_a_node_of_a_torch_pipeline_may_be_a_render() -> None:
 
 def test_recording_by_dr_freeze_is_refused() -> None:
     """Dr.Jit would abort the process."""
-    of = scene()
+    of = scenes.scene()
     refused(lambda: dr.freeze(lambda t: mi.render(of) * t)(mi.Float(1)), "dr.freeze: cannot be recorded")
-    assert image(of).max() > 0.1
+    assert scenes.image(of).max() > 0.1
 
 
 # ---------------- refusals ----------------
@@ -195,23 +184,23 @@ def test_recording_by_dr_freeze_is_refused() -> None:
 )
 def test_bad_properties_are_refused(changes: dict, words: str) -> None:
     with pytest.raises(Exception, match=words):
-        mi.load_dict(integrator(**changes))
+        mi.load_dict(scenes.integrator(**changes))
 
 
 def test_missing_attributes_are_refused() -> None:
-    raw = raw_channels()
+    raw = scenes.raw_channels()
     del raw["roughness"]
     with pytest.raises(Exception, match="roughness: the surfels have no such attribute"):
-        mi.load_dict(integrator(raw, reflectance="split_sum"))
+        mi.load_dict(scenes.integrator(raw, reflectance="split_sum"))
     with pytest.raises(Exception, match="there are no surfels"):
         mi.load_dict({"type": "refgs"})
-    refused(lambda: image(lit_scene(None)), "light: there is none")
+    refused(lambda: scenes.image(scenes.lit_scene(None)), "light: there is none")
 
 
 def test_nesting_in_stock_integrators_is_refused() -> None:
-    nested = {"type": "aov", "aovs": "d:depth", "inner": integrator()}
-    outer = mi.load_dict({"type": "scene", "integrator": nested, "sensor": sensor()})
-    refused(lambda: image(outer), "whole images only")
+    nested = {"type": "aov", "aovs": "d:depth", "inner": scenes.integrator()}
+    outer = mi.load_dict({"type": "scene", "integrator": nested, "sensor": scenes.sensor()})
+    refused(lambda: scenes.image(outer), "whole images only")
 
 
 @pytest.mark.parametrize("factor", [1 - 1e-3, 1, 1 + 1e-3])
@@ -237,12 +226,12 @@ def test_an_exported_scene_has_the_trainers_tiles(
 
 
 def test_variants() -> None:
-    of = scene()
-    before = image(of)
+    of = scenes.scene()
+    before = scenes.image(of)
     mi.set_variant("scalar_rgb")
     with pytest.raises(Exception, match="'scalar_rgb' is not supported"):
         mi.load_dict({"type": "refgs"})
     with pytest.raises(Exception, match="'scalar_rgb' is not supported"):
         mi.load_dict({"type": "refgs_bsdf"})
     mi.set_variant("llvm_ad_rgb")
-    np.testing.assert_array_equal(image(scene()), before)
+    np.testing.assert_array_equal(scenes.image(scenes.scene()), before)

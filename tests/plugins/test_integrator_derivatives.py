@@ -13,17 +13,7 @@ import pytest
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from tests import gradients
 from tests.helpers import slow
-from tests.scenes.integrator import (
-    HEIGHT,
-    TANGENT_TOLERANCE,
-    WIDTH,
-    check_derivatives,
-    integrator,
-    lit_scene,
-    scene,
-    sensor,
-    sky,
-)
+from tests.scenes import integrator as scenes
 
 
 def test_every_parameter_is_in_the_table(tmp_path: Path) -> None:
@@ -32,7 +22,7 @@ def test_every_parameter_is_in_the_table(tmp_path: Path) -> None:
     assert [*listed] == [*found] and {f"integrator.{name}" for name in ATTRIBUTES} <= {*listed}
     for key, (of, able) in found.items():
         if able:
-            assert float(listed[key]) < TANGENT_TOLERANCE, key
+            assert float(listed[key]) < scenes.TANGENT_TOLERANCE, key
         else:
             assert gradients.refusals(of, key) == {listed[key]}
 
@@ -48,19 +38,19 @@ def test_derivatives_by_parameters(
     set_threads(threads)
     for key, of, able in gradients.parameters(tmp_path):
         if able and (not keys or key in keys):
-            check_derivatives(of, key)
+            scenes.check_derivatives(of, key)
 
 
 @pytest.mark.slow
 def test_rotations_of_the_environment_have_derivatives_in_loops() -> None:
-    check_derivatives(scene(reflectance="monte_carlo"), "integrator.light_to_world")
+    scenes.check_derivatives(scenes.scene(reflectance="monte_carlo"), "integrator.light_to_world")
 
 
 @pytest.mark.parametrize("key", ["integrator.albedo", "integrator.light", "sensor.x_fov"])
 def test_derivatives_by_parameters_that_are_not_used_are_zero(key: str) -> None:
     """Those of a model's other attributes and of other sensors: loops pass them at every stage and view."""
-    cameras = {"sensor": sensor(), "other": sensor(fov=40)}
-    of = mi.load_dict({"type": "scene", "integrator": integrator(reflectance="radiance"), **cameras})
+    cameras = {"sensor": scenes.sensor(), "other": scenes.sensor(fov=40)}
+    of = mi.load_dict({"type": "scene", "integrator": scenes.integrator(reflectance="radiance"), **cameras})
     params = mi.traverse(of)
     dr.enable_grad(params[key])
     params.update()
@@ -73,8 +63,8 @@ def test_derivatives_by_parameters_that_are_not_used_are_zero(key: str) -> None:
 
 def test_camera_and_environment_are_found_by_descent() -> None:
     """A rotation of the environment by 2° and a principal point that is off by 1 % of the image."""
-    camera = sensor(film={"width": 32, "height": 32})
-    of = scene(camera, diffuse="irradiance")
+    camera = scenes.sensor(film={"width": 32, "height": 32})
+    of = scenes.scene(camera, diffuse="irradiance")
     params, target = mi.traverse(of), mi.render(of)
     optimiser = mi.ad.Adam(lr=0.5, beta_1=0.5, beta_2=0.9)
     optimiser["angle"], optimiser["shift"] = mi.Float(2), mi.Float(1)  # degrees, %
@@ -90,16 +80,16 @@ def test_camera_and_environment_are_found_by_descent() -> None:
 
 
 def test_resampled_environments_have_derivatives_by_their_scale_only(tmp_path: Path) -> None:
-    mi.Bitmap(sky()[:, :48]).write(str(tmp_path / "odd.exr"))  # 32 x 48
-    of = lit_scene({"type": "envmap", "filename": str(tmp_path / "odd.exr")})
-    check_derivatives(of, "sky.scale")
+    mi.Bitmap(scenes.sky()[:, :48]).write(str(tmp_path / "odd.exr"))  # 32 x 48
+    of = scenes.lit_scene({"type": "envmap", "filename": str(tmp_path / "odd.exr")})
+    scenes.check_derivatives(of, "sky.scale")
     [sentence] = gradients.refusals(of, "sky.data")
     assert "a map of 32 x 48 is resampled" in sentence
 
 
 @pytest.mark.parametrize(
     ("key", "derived", "most"),
-    [("position", False, WIDTH * HEIGHT // 3), ("light", True, None), ("albedo", False, None)],
+    [("position", False, scenes.WIDTH * scenes.HEIGHT // 3), ("light", True, None), ("albedo", False, None)],
 )
 def test_tangents_add_up_over_losses(
     key: str, derived: bool, most: int | None, monkeypatch: pytest.MonkeyPatch
@@ -107,7 +97,7 @@ def test_tangents_add_up_over_losses(
     """Forward mode, as reverse mode, with images and other losses on a parameter, in any order."""
     if most is not None:
         monkeypatch.setattr("mi_refgs.plugins.film.DERIVATIVE_SAMPLES", most)
-    of = scene(occlusion=False)
+    of = scenes.scene(occlusion=False)
     params = mi.traverse(of)
     base = mi.TensorXf(params[f"integrator.{key}"])
 

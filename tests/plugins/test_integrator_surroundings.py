@@ -20,52 +20,40 @@ from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
-from tests.scenes.integrator import (
-    HEIGHT,
-    PREFIX,
-    WIDTH,
-    background_light,
-    far_channels,
-    image,
-    open_scene,
-    raw_channels,
-    scene,
-    sensor,
-    sky,
-)
+from tests.scenes import integrator as scenes
 
 
 def camera() -> Camera:
-    return Camera.from_sensor(mi.load_dict(sensor()))
+    return Camera.from_sensor(mi.load_dict(scenes.sensor()))
 
 
 def test_image_matches_the_renderer() -> None:
     """All over what is behind, opaque; and without both the object alone, transparent."""
-    rgba = sensor(film={"pixel_format": "rgba"})
-    seen = image(open_scene(rgba))
-    surfels, light = Surfels.from_numpy(raw_channels()), EnvironmentLight.from_radiance(sky())
-    around = Surroundings(Surfels.from_numpy(far_channels()), background_light())
+    rgba = scenes.sensor(film={"pixel_format": "rgba"})
+    seen = scenes.image(scenes.open_scene(rgba))
+    surfels, light = Surfels.from_numpy(scenes.raw_channels()), EnvironmentLight.from_radiance(scenes.sky())
+    around = Surroundings(Surfels.from_numpy(scenes.far_channels()), scenes.background_light())
     shading = Shading()
     frame = render(SurfelScene(surfels, shading, shading.light_of(light), surroundings=around), camera())
     expected = frame.radiance + (1 - frame.alpha) * frame.background
     np.testing.assert_allclose(seen[..., :3].reshape(-1, 3), expected.numpy().T, atol=1e-5)
     np.testing.assert_array_equal(seen[..., 3], 1)
-    transparent = image(scene(rgba))
+    transparent = scenes.image(scenes.scene(rgba))
     assert transparent[..., 3].min() < 0.5 and np.abs(transparent[..., :3] - seen[..., :3]).max() > 0.1
 
 
 def test_values_that_cannot_be_used_are_told_of_and_left_out() -> None:
-    raw = far_channels()
+    raw = scenes.far_channels()
     raw["position"][3] = np.nan
-    bad = {PREFIX + name: mi.TensorXf(values) for name, values in raw.items()}
+    bad = {scenes.PREFIX + name: mi.TensorXf(values) for name, values in raw.items()}
     with pytest.warns(RuntimeWarning, match=r"1 surroundings in position \(first: 3\)"):
-        of = open_scene(**bad)
-    left = {PREFIX + name: mi.TensorXf(np.delete(values, 3, axis=0)) for name, values in raw.items()}
-    np.testing.assert_array_equal(image(of), image(open_scene(**left)))
+        of = scenes.open_scene(**bad)
+    left = {scenes.PREFIX + name: mi.TensorXf(np.delete(values, 3, axis=0)) for name, values in raw.items()}
+    np.testing.assert_array_equal(scenes.image(of), scenes.image(scenes.open_scene(**left)))
 
 
 def test_refusals(tmp_path: Path) -> None:
-    raw = far_channels()
+    raw = scenes.far_channels()
     write_ply(tmp_path / "bare.ply", Surfels.from_numpy({n: x for n, x in raw.items() if n != "radiance_sh"}))
     for words, changes in (
         ("surroundings: radiance_sh", {"surroundings": str(tmp_path / "bare.ply")}),
@@ -73,12 +61,12 @@ def test_refusals(tmp_path: Path) -> None:
         ("none.exr", {"background": str(tmp_path / "none.exr")}),
         ("shape (5, 8, 3)", {"background": mi.TensorXf(np.ones((5, 8, 3), np.float32))}),
     ):
-        refused(partial(scene, **changes), words)
+        refused(partial(scenes.scene, **changes), words)
 
 
 def fitted() -> TrainedScene:
-    around = Surroundings(Surfels.from_numpy(far_channels()), background_light())
-    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
+    around = Surroundings(Surfels.from_numpy(scenes.far_channels()), scenes.background_light())
+    light, surfels = EnvironmentLight.from_radiance(scenes.sky()), Surfels.from_numpy(scenes.raw_channels())
     return TrainedScene(surfels, light, None, Shading(), 7, 1.5, surroundings=around)
 
 
@@ -90,9 +78,9 @@ def test_run_folder_contains_surroundings_and_background_until_removed(tmp_path:
     frame, again = made.renderer()(camera()), TrainedScene.read(tmp_path).renderer()(camera())
     for name in ("radiance", "alpha", "background", "object_alpha"):
         np.testing.assert_allclose(getattr(again, name), getattr(frame, name), atol=1e-5)
-    expected = (frame.radiance + (1 - frame.alpha) * frame.background).numpy().T.reshape(HEIGHT, WIDTH, 3)
-    seen = image(mi.load_file(str(tmp_path / SCENE)))
-    np.testing.assert_allclose(seen[..., :3], expected, atol=1e-4)
+    expected = (frame.radiance + (1 - frame.alpha) * frame.background).numpy().T
+    seen = scenes.image(mi.load_file(str(tmp_path / SCENE)))[..., :3]
+    np.testing.assert_allclose(seen, expected.reshape(seen.shape), atol=1e-4)
     np.testing.assert_array_equal(seen[..., 3], 1)
     for name in (AROUND_FILE, BACKGROUND_MAP):
         content = (tmp_path / name).read_bytes()

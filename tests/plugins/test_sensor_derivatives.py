@@ -19,17 +19,8 @@ from mi_refgs.occlusion.mesh import write_mesh
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import PinholeCamera, ray_slopes
 from tests.helpers import slow
+from tests.scenes import integrator as scenes
 from tests.scenes.camera_motion import moved_pose, require_slopes, transform
-from tests.scenes.integrator import (
-    TANGENT_TOLERANCE,
-    derivative_errors,
-    integrator,
-    open_scene,
-    plane_mesh,
-    scene,
-    sensor,
-    varied,
-)
 
 POSE, ANGLE, CENTRE = "sensor.to_world", "sensor.x_fov", "sensor.principal_point_offset_"
 FOV = 45.0  # degrees
@@ -89,9 +80,9 @@ class Pair:
             write_mesh(self.folder / "mesh.ply", case.mesh())
         aovs = ",".join(f"{name}:{name}" for name in ("normal", "depth", *self.materials))
         chosen = {"shade_at": case.at, "reflectance": case.reflectance, "diffuse": case.diffuse}
-        inner = integrator(case.raw, light=upload_tensor(case.light), aovs=aovs, **chosen, **options)
+        inner = scenes.integrator(case.raw, light=upload_tensor(case.light), aovs=aovs, **chosen, **options)
         film = {"width": WIDTH, "height": HEIGHT, "pixel_format": "rgba"}
-        eye = sensor(film=film, to_world=mi.ScalarTransform4f(self.start), fov=FOV / (1 + START[6]))
+        eye = scenes.sensor(film=film, to_world=mi.ScalarTransform4f(self.start), fov=FOV / (1 + START[6]))
         return Moved(mi.load_dict({"type": "scene", "integrator": inner, "sensor": eye}))
 
     def camera(self, values: np.ndarray) -> PinholeCamera:
@@ -160,18 +151,18 @@ AOVS = "nn:normal,d:depth,a:albedo"
 @pytest.mark.parametrize("kind", ["crop", *map(slow, ("occlusion", "antialias", "open"))])
 def test_derivatives_are_those_of_differences(kind: str, tmp_path: Path) -> None:
     """Supersampled images and their AOVs."""
-    mesh: dict[str, Any] = {"mesh": plane_mesh(tmp_path), "visibility_rays": 2}
+    mesh: dict[str, Any] = {"mesh": scenes.plane_mesh(tmp_path), "visibility_rays": 2}
     options = {"occlusion": mesh, "antialias": {"antialias": True}}.get(kind, {})
-    make, eye = open_scene if kind == "open" else scene, sensor(film=CROP if kind == "crop" else {})
-    moved = Moved(make(eye, aovs=AOVS, **options))
-    step, spp = mi.Float(varied((9,))), 1 if kind == "antialias" else 4
-    errors = derivative_errors(lambda t: moved.image(t * step, spp=spp), kind)
-    assert max(errors) < TANGENT_TOLERANCE, errors
+    make = scenes.open_scene if kind == "open" else scenes.scene
+    moved = Moved(make(scenes.sensor(film=CROP if kind == "crop" else {}), aovs=AOVS, **options))
+    step, spp = mi.Float(scenes.varied((9,))), 1 if kind == "antialias" else 4
+    errors = scenes.derivative_errors(lambda t: moved.image(t * step, spp=spp), kind)
+    assert max(errors) < scenes.TANGENT_TOLERANCE, errors
 
 
 def test_only_rigid_changes_have_derivatives() -> None:
     """The gradient of a matrix is a rotation's and a translation's: that of scale and shear is zero."""
-    moved = Moved(scene())
+    moved = Moved(scenes.scene())
     leaf = mi.Matrix4f(moved.start.matrix)
     dr.enable_grad(leaf)
     moved.params[POSE] = mi.Transform4f(leaf)

@@ -22,19 +22,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.integrator import (
-    HEIGHT,
-    WIDTH,
-    background_light,
-    far_channels,
-    hollow_mesh,
-    open_scene,
-    plane_mesh,
-    raw_channels,
-    scene,
-    sensor,
-    sky,
-)
+from tests.scenes import integrator as scenes
 
 FEW = 512  # samples of a pass in these tests: two rows of pixels or more of 4 × 4 samples
 SHADINGS = {
@@ -61,9 +49,10 @@ def leaves(tree: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
 
 
 def renderer(shading: Shading, samples: int, folder: Path, around: bool = False) -> Any:
-    beside = Surroundings(Surfels.from_numpy(far_channels()), background_light()) if around else None
-    mesh = read_mesh(Path(hollow_mesh(folder))) if shading.occlusion else None
-    light, surfels = EnvironmentLight.from_radiance(sky()), Surfels.from_numpy(raw_channels())
+    far, light = Surfels.from_numpy(scenes.far_channels()), EnvironmentLight.from_radiance(scenes.sky())
+    beside = Surroundings(far, scenes.background_light()) if around else None
+    mesh = read_mesh(Path(scenes.hollow_mesh(folder))) if shading.occlusion else None
+    surfels = Surfels.from_numpy(scenes.raw_channels())
     return TrainedScene(surfels, light, mesh, shading, 1, 0.0, surroundings=beside).renderer(samples=samples)
 
 
@@ -74,7 +63,7 @@ def test_a_frame_in_passes_is_the_whole_frame(
     """Each shading with one or 16 samples, and every other two of them with surroundings."""
     name, samples = [*SHADINGS][case], (16, 1)[case % 2]
     view = renderer(SHADINGS[name], samples, tmp_path, around=case % 4 < 2)
-    eye = Camera.from_sensor(mi.load_dict(sensor()))
+    eye = Camera.from_sensor(mi.load_dict(scenes.sensor()))
     whole = dict(leaves(view(eye)))
     monkeypatch.setattr(passes, "PASS_SAMPLES", FEW if samples > 1 else 64)
     assert len(passes.bands(eye, round(samples**0.5), SHADINGS[name].neighbours)) > 1
@@ -89,11 +78,11 @@ def test_a_crop_window_is_part_of_the_whole(case: int, tmp_path: Path) -> None:
     """With the random numbers of the whole, and the neighbours beside the window; 1 or 4 samples."""
     view = renderer([*SHADINGS.values()][case], (1, 4)[case % 2], tmp_path)
     crop = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
-    cameras = (Camera.from_sensor(mi.load_dict(sensor(film=film))) for film in ({}, crop))
+    cameras = (Camera.from_sensor(mi.load_dict(scenes.sensor(film=film))) for film in ({}, crop))
     whole, part = (dict(leaves(view(camera))) for camera in cameras)
     for key, value in whole.items():
-        if value.shape[-1] == HEIGHT * WIDTH:
-            value = value.reshape(*value.shape[:-1], HEIGHT, WIDTH)[..., 2:8, 5:12]
+        if value.shape[-1] == scenes.HEIGHT * scenes.WIDTH:
+            value = value.reshape(*value.shape[:-1], scenes.HEIGHT, scenes.WIDTH)[..., 2:8, 5:12]
             value = value.reshape(*value.shape[:-2], -1)
         np.testing.assert_allclose(part[key], value, atol=2e-5, err_msg=key)
 
@@ -110,12 +99,13 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In both modes, of parameters computed from others; on a film whose channels are not those rendered."""
-    options: dict[str, Any] = {"aovs": "d:depth,n:normal,a:albedo", "mesh": plane_mesh(tmp_path)}
-    camera = sensor(film={"pixel_format": "luminance_alpha" if kind == "surfel" else "rgb"})
+    options: dict[str, Any] = {"aovs": "d:depth,n:normal,a:albedo", "mesh": scenes.plane_mesh(tmp_path)}
+    camera = scenes.sensor(film={"pixel_format": "luminance_alpha" if kind == "surfel" else "rgb"})
     if kind == "surfel":
-        of = scene(camera, aovs=options["aovs"], shade_at="surfel")
+        of = scenes.scene(camera, aovs=options["aovs"], shade_at="surfel")
     else:
-        of = (open_scene if kind == "open" else scene)(camera, antialias=kind == "antialias", **options)
+        make = scenes.open_scene if kind == "open" else scenes.scene
+        of = make(camera, antialias=kind == "antialias", **options)
     params = mi.traverse(of)
     keys = ["integrator.position", "integrator.opacity", "integrator.albedo", "integrator.light"]
     start = {key: mi.TensorXf(params[key]) for key in keys}
@@ -185,8 +175,8 @@ def history(of: mi.Scene, spp: int, backward: bool) -> list[dict[str, Any]]:
 def test_passes_share_their_kernels_and_take_few_samples_at_a_time(
     backward: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    of = scene(sensor(film={"height": 16}))
-    samples = 16 * WIDTH * 64
+    of = scenes.scene(scenes.sensor(film={"height": 16}))
+    samples = 16 * scenes.WIDTH * 64
     assert max(kernel["size"] for kernel in history(of, 64, backward)) >= samples
     few(monkeypatch)
     count = len(passes.bands(Camera.from_sensor(of.sensors()[0]), 8))
@@ -213,4 +203,4 @@ def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
             top += band.size[1]
         heights = {band.camera.height for band in found}
         assert len(heights) == 1 if not margin else max(heights) <= 26
-    assert HEIGHT < 103
+    assert scenes.HEIGHT < 103

@@ -23,35 +23,27 @@ from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.integrator import (
-    HEIGHT,
-    OTHER_OPTIONS,
-    WIDTH,
-    hollow_mesh,
-    image,
-    plane_mesh,
-    raw_channels,
-    sensor,
-    sky,
-)
+from tests.scenes import integrator as scenes
+from tests.scenes.integrator import HEIGHT, WIDTH
 
 
 def shading_with(option: str) -> Shading:
     """A shading whose model honours the option, with OTHER_OPTIONS's value."""
     model = next(model for model in MODELS.values() if option in model.honoured)
-    return Shading(model.shaded_at[0], model.name, "irradiance", True, **{option: OTHER_OPTIONS[option]})
+    chosen = {option: scenes.OTHER_OPTIONS[option]}
+    return Shading(model.shaded_at[0], model.name, "irradiance", True, **chosen)
 
 
 def fitted(folder: Path, shading: Shading) -> TrainedScene:
-    made = hollow_mesh if shading.ambient_rays else plane_mesh
+    made = scenes.hollow_mesh if shading.ambient_rays else scenes.plane_mesh
     mesh = read_mesh(made(folder)) if shading.occlusion else None
-    surfels = Surfels.from_numpy(raw_channels())
-    return TrainedScene(surfels, EnvironmentLight.from_radiance(sky()), mesh, shading, 7, 1.5)
+    surfels = Surfels.from_numpy(scenes.raw_channels())
+    return TrainedScene(surfels, EnvironmentLight.from_radiance(scenes.sky()), mesh, shading, 7, 1.5)
 
 
 def view(ratio: float = 1.0, sign: float = -1.0, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> Camera:
     """Focal lengths of 18 · ratio and 18 pixels."""
-    pose = np.array(sensor()["to_world"].matrix)
+    pose = np.array(scenes.sensor()["to_world"].matrix)
     return Camera.from_pose(WIDTH, HEIGHT, sign * 18 * ratio, sign * 18, cx, cy, pose)
 
 
@@ -61,7 +53,7 @@ def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, n
     scene = mi.load_file(str(folder / "scene.xml"))
     frame = made.renderer()(camera)
     expected = np.concatenate([frame.radiance.numpy(), frame.alpha.numpy()[None]]).T
-    return scene, image(scene), expected.reshape(camera.height, camera.width, 4)
+    return scene, scenes.image(scene), expected.reshape(camera.height, camera.width, 4)
 
 
 @pytest.mark.parametrize("option", QUALITY)

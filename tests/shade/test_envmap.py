@@ -1,5 +1,4 @@
-"""Environment light: Mitsuba's orientation, the activation, the prefilter and its adjoint, lookups and their
-derivatives."""
+"""Environment light: orientation, activation, the prefilter and its adjoint, lookups and their slopes."""
 
 from __future__ import annotations
 

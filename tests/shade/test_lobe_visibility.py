@@ -61,8 +61,7 @@ def test_weights_add_up_to_the_table(roughness: float) -> None:
 
 
 def test_limits_of_the_lobe() -> None:
-    """Roughness 0 is the mirror, with Schlick's weight; beyond 1 it is 1; views along and below the surface
-    are grazing ones."""
+    """Roughness 0 is the mirror, with Schlick's weight; beyond 1 it is 1; views from below graze."""
     rng = np.random.default_rng(9)
     normal = unit(rng.normal(size=(60, 3)))
     across = unit(np.cross(normal, rng.normal(size=(60, 3))))

@@ -156,8 +156,7 @@ def test_bad_settings_are_refused(name: str, values: tuple[Any, ...]) -> None:
 
 @pytest.mark.parametrize("roughness", [0.3, 0.9, slow(0.5), slow(0.7)])
 def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -> None:
-    """Under a gradient, split sum against brute force: nearer in sum, and over twice as near where lobes are
-    wide."""
+    """Under a gradient, against brute force: nearer in sum, and over twice as near where lobes are wide."""
     h = 32
     up, around = lobe_matrices.row_angles(h)[:, None, None], lobe_matrices.column_angles(2 * h)[None, :, None]
     map_ = np.tile(2 + np.cos(up) + 0.8 * np.sin(up) * np.sin(around), 3)

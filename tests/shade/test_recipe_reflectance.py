@@ -42,10 +42,8 @@ SHARE = 0.3  # of the light that the lobe reflects
 
 
 class Phong(Reflectance):
-    """albedo irradiance(n), and a lobe about the mirror direction that narrows with the shininess.
-
-    The mesh blocks the lobe, and is shaded where it does. Other programs show a rough dielectric.
-    """
+    """albedo irradiance(n), and a lobe about the mirror direction, narrower with the shininess, that the mesh
+    blocks, and is shaded where it does. Other programs show a rough dielectric."""
 
     name = "phong"
     visibility = "mirror"

@@ -1,5 +1,4 @@
-"""Reflectance models: terms and every derivative against the float64 reference, degenerate points, lights,
-images."""
+"""Reflectance models: terms and derivatives against the float64 reference, degenerate points, lights."""
 
 from __future__ import annotations
 
@@ -149,8 +148,7 @@ def test_derivative_of_light(shading: Shading, names: tuple[str, ...], rng: np.r
 
 @EVERY
 def test_degenerate_points_stay_finite(shading: Shading, names: tuple[str, ...]) -> None:
-    """Zero normals and views, grazing, from behind, poles, roughness and colours at their ends and beyond:
-    finite values and gradients."""
+    """Zero normals and views, grazing, from behind, poles, roughness and colours at their ends and beyond."""
     normals: list[Any] = [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 1, 0], [0, -1, 0]]
     normals += [[1e-25, 0, 0], [1e15, 0, 1e15]]
     views = [[0, 0, 1], [0, 0, 0], [1, 0, 1e-6], [0, 1, 0], [0, -1, 0]]

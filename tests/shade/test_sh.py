@@ -23,11 +23,8 @@ def basis_of(d: np.ndarray, degree: int = 3) -> np.ndarray:
 
 
 def scipy_basis(d: np.ndarray) -> np.ndarray:
-    """Real combinations of SciPy's complex Y_lm, with the Condon-Shortley phase: nothing is negated here.
-
-    m < 0: √2 Im Y_l|m|, m = 0: Y_l0, m > 0: √2 Re Y_lm. With that phase degree 1 is (-y, +z, -x), as 3DGS
-    files have it.
-    """
+    """Real combinations of SciPy's complex Y_lm, with the Condon-Shortley phase, as 3DGS files have it:
+    m < 0: √2 Im Y_l|m|, m = 0: Y_l0, m > 0: √2 Re Y_lm."""
     polar, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
     out = []
     for n in range(4):

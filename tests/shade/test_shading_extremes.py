@@ -67,11 +67,8 @@ LIGHTS = {
     [("smooth", "sh"), ("a peak of 1e6", "irradiance"), *(slow(light, "irradiance") for light in LIGHTS)],
 )
 def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.random.Generator) -> None:
-    """Error ≤ 1e-4 of the brightest term, and gradients of albedo, metallic and radiance to 1 %.
-
-    The terms are at most quadratic in each of them up to S = 1, so that the reference's central difference is
-    exact.
-    """
+    """Error ≤ 1e-4 of the brightest term, and gradients to 1 %: terms are at most quadratic up to S = 1, so
+    that the reference's central difference is exact."""
     radiance = LIGHTS[light](rng)
     radiance[[0, -1]] = radiance[[0, -1]].mean(axis=1, keepdims=True)  # a pole has no azimuth, so one colour
     prefiltered = EnvironmentLight.from_radiance(radiance).prefilter()

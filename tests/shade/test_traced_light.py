@@ -24,20 +24,7 @@ from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance.split_sum import MATERIALS, shade
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import slow, unit, vector
-from tests.scenes.corner import (
-    EYE,
-    LOW_EYE,
-    channel,
-    channel_surfels,
-    corner,
-    floor_points,
-    gradient_sky,
-    mirrored,
-    seen,
-    wall_hit,
-    wall_surfels,
-    with_materials,
-)
+from tests.scenes import corner as scenes
 from tests.scenes.shading_points import exact_light, exact_terms
 
 # ---------------- materials on the mesh ----------------
@@ -62,7 +49,7 @@ def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
     )
     vertices = np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0.1], [50, 0, 0]], np.float32)
     mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 3, 2]], np.uint32), 0.1)
-    rows = np.array(with_materials(mesh, surfels).surface(surfels, MATERIALS).rows).reshape(4, 8)
+    rows = np.array(scenes.with_materials(mesh, surfels).surface(surfels, MATERIALS).rows).reshape(4, 8)
     for vertex, row in zip(vertices[:3], rows, strict=False):
         u, v, w = (vertex - position).T
         weight = opacity * np.exp(-0.5 * ((u / scale[:, 0]) ** 2 + (v / scale[:, 1]) ** 2 + (w / 0.1) ** 2))
@@ -72,7 +59,7 @@ def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
 
 
 def test_misuse_is_refused() -> None:
-    occluder, surfels = Occluder(corner()), wall_surfels()
+    occluder, surfels = Occluder(scenes.corner()), scenes.wall_surfels()
     with pytest.raises(InputError, match="none are set"):
         occluder.surface(surfels)
     occluder.set_materials(surfels)
@@ -104,7 +91,7 @@ def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: Any) -> 
 
 def harmonic_channel_surfels(albedo: np.ndarray | None = None, uneven: float = 0.0) -> Surfels:
     """Surfels of a channel with SH colours, those of a wall alike but for `uneven`."""
-    rng, surfels = np.random.default_rng(4), channel_surfels(albedo)
+    rng, surfels = np.random.default_rng(4), scenes.channel_surfels(albedo)
     harmonics = np.repeat(0.2 * rng.normal(size=(2, 12)), 400, 0) + uneven * rng.normal(size=(800, 12))
     return Surfels(surfels.raw | {"radiance_sh": mi.TensorXf(harmonics.astype(np.float32))})
 
@@ -113,10 +100,10 @@ def lengths(place: np.ndarray, directions: np.ndarray) -> list[int]:
     """Number of walls that rays from points of the floor of a channel meet one after the other."""
     found = []
     for origin, direction in zip(place, directions, strict=True):
-        count, hit = 0, wall_hit(origin, direction)
+        count, hit = 0, scenes.wall_hit(origin, direction)
         while hit is not None:
             direction = direction * [-1, 1, 1]
-            count, hit = count + 1, wall_hit(hit[0], direction)
+            count, hit = count + 1, scenes.wall_hit(hit[0], direction)
         found.append(count)
     return found
 
@@ -131,16 +118,16 @@ def lengths(place: np.ndarray, directions: np.ndarray) -> list[int]:
 )
 def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) -> None:
     """Between two walls, recursion in float64: rays that end before the last bounce, and after."""
-    place, points = floor_points(0.3, eye=LOW_EYE)
+    place, points = scenes.floor_points(0.3, eye=scenes.LOW_EYE)
     surfels = harmonic_channel_surfels()
-    light = EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    occluder = with_materials(channel(), surfels)
+    light = EnvironmentLight.from_radiance(scenes.gradient_sky()).prefilter()
+    occluder = scenes.with_materials(scenes.channel(), surfels)
     options = ShadingOptions(traced_bounces=bounces)
-    found = seen(points, place, options, surfels, light, diffuse, occluder, LOW_EYE)
+    found = scenes.seen(points, place, options, surfels, light, diffuse, occluder, scenes.LOW_EYE)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
-    outgoing, mirrors = oracle_of_walls(light, surfels, diffuse), mirrored(place, LOW_EYE)[:, 0]
+    outgoing, mirrors = oracle_of_walls(light, surfels, diffuse), scenes.mirrored(place, scenes.LOW_EYE)[:, 0]
     for k, mirror in enumerate(mirrors):
-        expected = exact.chain(wall_hit, outgoing, place[k], mirror, bounces)
+        expected = exact.chain(scenes.wall_hit, outgoing, place[k], mirror, bounces)
         assert visibility[k] == (expected is None)
         np.testing.assert_allclose(indirect[k], 0 if expected is None else expected, rtol=2e-3)
     assert {1, 2, 3, 4} <= set(lengths(place, mirrors))
@@ -149,22 +136,22 @@ def test_bounces_of_a_mirror_ray_against_the_oracle(bounces: int, diffuse: Any) 
 @pytest.mark.parametrize("rays", [slow(2), 6])
 def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
     """The mean over the blocked rays, one by one, and a single bright ray among them held back."""
-    place, points = floor_points(0.4, count=25, eye=LOW_EYE)
+    place, points = scenes.floor_points(0.4, count=25, eye=scenes.LOW_EYE)
     surfels = harmonic_channel_surfels()
-    sky = gradient_sky()
+    sky = scenes.gradient_sky()
     sky[1:4, 4:7] += 40.0  # a lamp
     light = EnvironmentLight.from_radiance(sky).prefilter()
     options = ShadingOptions(visibility_rays=rays, traced_bounces=2)
-    occluder = with_materials(channel(), surfels)
-    found = seen(points, place, options, surfels, light, "irradiance", occluder, LOW_EYE)
+    occluder = scenes.with_materials(scenes.channel(), surfels)
+    found = scenes.seen(points, place, options, surfels, light, "irradiance", occluder, scenes.LOW_EYE)
     indirect, visibility = found.indirect.numpy().T, np.array(found.visibility)
     lobe = Lobe.of(points.normal, points.view, points.roughness, mi.Color3f(0.8, 0.7, 0.6))
     samples = [lobe.sample(mi.UInt32(i), mi.UInt32(rays)) for i in range(rays)]
     direction = np.stack([d.numpy().T for d, _ in samples], 1).astype(np.float64)
     weight = np.stack([np.array(w) for _, w in samples], 1).astype(np.float64)
     outgoing, levels, held = oracle_of_walls(light, surfels, "irradiance"), exact_light(light), 0
-    for k, mirror in enumerate(mirrored(place, LOW_EYE)[:, 0]):
-        arriving = [exact.chain(wall_hit, outgoing, place[k], d, 2) for d in direction[k]]
+    for k, mirror in enumerate(scenes.mirrored(place, scenes.LOW_EYE)[:, 0]):
+        arriving = [exact.chain(scenes.wall_hit, outgoing, place[k], d, 2) for d in direction[k]]
         blocked = np.array([x is not None for x in arriving]) & (weight[k] > 0)
         radiance = np.array([np.zeros(3) if x is None else x for x in arriving])
         [free] = levels.look_up(*specular(levels, mirror[None], np.array([0.4])))
@@ -195,10 +182,10 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
     """Two bounces, both modes against central differences of the indirect radiance, with random weights and
     steps; what is held back of bright rays stays as it was, as the derivative has it."""
     rng = np.random.default_rng(8)
-    place, points = floor_points(0.4, count=60, eye=LOW_EYE)
+    place, points = scenes.floor_points(0.4, count=60, eye=scenes.LOW_EYE)
     surfels = harmonic_channel_surfels(rng.normal(size=(400, 3)), 0.1)
-    occluder = with_materials(channel(), surfels)
-    sky = gradient_sky()
+    occluder = scenes.with_materials(scenes.channel(), surfels)
+    sky = scenes.gradient_sky()
     sky[1:4, 4:7] += 20.0  # a lamp
     leaves = surfels.raw | {"light": EnvironmentLight.from_radiance(sky).raw}
     options = ShadingOptions(visibility_rays=rays, traced_bounces=2)
@@ -208,7 +195,8 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
     def indirect(value: Any) -> Any:
         changed = leaves | {name: value}
         light = EnvironmentLight(changed.pop("light")).prefilter()
-        return seen(points, place, options, Surfels(changed), light, diffuse, occluder, LOW_EYE).indirect
+        made = Surfels(changed)
+        return scenes.seen(points, place, options, made, light, diffuse, occluder, scenes.LOW_EYE).indirect
 
     kept: list[Any] = []
     held_back = reflection._firefly_clamp
@@ -219,7 +207,7 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
             dr.eval(kept)
         return kept[0]
 
-    assert max(lengths(place, mirrored(place, LOW_EYE)[:, 0])) > 1
+    assert max(lengths(place, scenes.mirrored(place, scenes.LOW_EYE)[:, 0])) > 1
     monkeypatch.setattr(reflection, "_firefly_clamp", keep)
 
     base = leaves[name].numpy().copy()
@@ -244,14 +232,14 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
 
 
 def test_rays_and_geometry_are_detached() -> None:
-    place, points = floor_points(0.4)
-    surfels, light = wall_surfels(), EnvironmentLight.from_radiance(gradient_sky()).prefilter()
-    occluder = with_materials(corner(), surfels)
+    place, points = scenes.floor_points(0.4)
+    surfels, light = scenes.wall_surfels(), EnvironmentLight.from_radiance(scenes.gradient_sky()).prefilter()
+    occluder = scenes.with_materials(scenes.corner(), surfels)
     surfels.enable_grad()
     dr.enable_grad(points.normal, points.view, points.roughness, points.albedo)
     for rays in (1, 3):
         options = ShadingOptions(visibility_rays=rays, traced_bounces=1)
-        found = seen(points, place, options, surfels, light, occluder=occluder)
+        found = scenes.seen(points, place, options, surfels, light, occluder=occluder)
         assert not dr.grad_enabled(found.visibility)
         dr.backward(dr.sum(found.indirect.x))
         assert dr.all(dr.grad(points.roughness) == 0) and dr.all(dr.grad(points.normal) == 0, axis=None)
@@ -272,23 +260,23 @@ def test_degenerate_pixels_stay_finite() -> None:
     place = np.stack([rng.uniform(-0.5, 0.9, count), np.zeros(count), rng.uniform(-3, 0.6, count)], 1)
     points = ShadingPoints(
         normal=vector(normal),
-        view=vector(unit(EYE - place)),
+        view=vector(unit(scenes.EYE - place)),
         albedo=mi.Color3f(5, -1, 0.5) + dr.zeros(mi.Color3f, count),
         metallic=dr.full(mi.Float, 1, count),
         roughness=mi.Float(roughness.astype(np.float32)),
     )
-    light, surfels = EnvironmentLight.from_radiance(gradient_sky()), wall_surfels()
+    light, surfels = EnvironmentLight.from_radiance(scenes.gradient_sky()), scenes.wall_surfels()
     empty = Occluder(Mesh.empty())
     empty.set_materials(surfels)
     options = ShadingOptions(dominant=True, visibility_rays=7, traced_bounces=2)
     for occluder, chosen in (
-        (with_materials(corner(), surfels), options),
+        (scenes.with_materials(scenes.corner(), surfels), options),
         (empty, replace(options, visibility_rays=1)),
     ):
         raw = mi.TensorXf(light.raw)
         dr.enable_grad(raw)
         prefiltered = EnvironmentLight(raw).prefilter()
-        found = seen(points, place, chosen, surfels, prefiltered, occluder=occluder)
+        found = scenes.seen(points, place, chosen, surfels, prefiltered, occluder=occluder)
         assert dr.all((found.visibility >= 0) & (found.visibility <= 1))
         total = shade(found, prefiltered, replace(chosen, diffuse="irradiance")).total()
         dr.backward(dr.sum(total.x + total.y + total.z))

@@ -19,19 +19,7 @@ from mi_refgs.reference.camera import look_at, rotation_axes
 from mi_refgs.reference.footprint import Gaussian, Rules, Surfel
 from mi_refgs.splat import Camera, list_by_tile, project, splat, tiles
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.splats import (
-    PARAMETERS,
-    Scene,
-    check_gradients,
-    check_image,
-    exact_gradients,
-    fast_gradients,
-    fast_loss,
-    fast_maps,
-    loss_weights,
-    make_gaussians,
-    make_scene,
-)
+from tests.scenes import splats as scenes
 
 
 @dataclass(frozen=True)
@@ -39,7 +27,7 @@ class Primitive:
     """A primitive with its scenes and its float64 reference."""
 
     name: str
-    make: Callable[[int], Scene]
+    make: Callable[[int], scenes.Scene]
     exact: Any
     image: float  # tolerance
     gradient: float  # relative L2
@@ -49,8 +37,8 @@ class Primitive:
 
 
 PRIMITIVES = [
-    Primitive("surfel", make_scene, Surfel, 1e-4, 3e-4),  # observed 2e-6 … 3e-5, and 1e-6 … 1.4e-4
-    Primitive("gaussian", make_gaussians, Gaussian, 1e-5, 1e-3),  # observed 2e-6
+    Primitive("surfel", scenes.make_scene, Surfel, 1e-4, 3e-4),  # observed 2e-6 … 3e-5, and 1e-6 … 1.4e-4
+    Primitive("gaussian", scenes.make_gaussians, Gaussian, 1e-5, 1e-3),  # observed 2e-6
 ]
 BOTH = pytest.mark.parametrize("kind", PRIMITIVES, ids=str)
 SEEDS = [
@@ -82,34 +70,34 @@ def tile(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tup
 @MANY
 @BOTH
 def test_image_matches_oracle(kind: Primitive, seed: int) -> None:
-    check_image(kind.make(seed), kind.image)
+    scenes.check_image(kind.make(seed), kind.image)
 
 
 @MANY
 @BOTH
 def test_gradients_match_the_oracle(kind: Primitive, seed: int) -> None:
-    check_gradients(kind.make(seed), seed, kind.gradient)
+    scenes.check_gradients(kind.make(seed), seed, kind.gradient)
 
 
 @EVERY_TILE
 @BOTH
 def test_images_and_gradients_with_tiles_of_every_size(kind: Primitive, tile: tuple[int, int]) -> None:
     assert kind.make(8).fast_camera().tile == tile
-    check_image(kind.make(8), kind.image)
-    check_gradients(kind.make(5), 5, kind.gradient)
+    scenes.check_image(kind.make(8), kind.image)
+    scenes.check_gradients(kind.make(5), 5, kind.gradient)
 
 
 @BOTH
 def test_derivatives_of_the_oracle_are_its_differences(kind: Primitive) -> None:
     """For the strongest opacity and for a few others."""
     scene = kind.make(1 if kind.name == "surfel" else 8)
-    weights = loss_weights(scene, 1)
+    weights = scenes.loss_weights(scene, 1)
 
     def maps(raw: dict[str, np.ndarray]) -> np.ndarray:
         found = oracle.splat(raw, scene.features, scene.camera)
         return np.concatenate([found.features, found.depth[..., None], found.alpha[..., None]], axis=-1)
 
-    gradients = exact_gradients(scene, weights)
+    gradients = scenes.exact_gradients(scene, weights)
     strongest = int(np.argmax(np.abs(gradients["opacity"])))
     for name, values in scene.raw.items():
         slopes = gradients[name]
@@ -129,22 +117,22 @@ def test_derivatives_of_the_oracle_are_its_differences(kind: Primitive) -> None:
 def test_forward_mode_is_the_transpose_of_reverse(kind: Primitive, seed: int) -> None:
     """⟨∇loss, v⟩ from reverse mode equals the directional derivative from forward mode, for random v."""
     scene = kind.make(seed)
-    weights = loss_weights(scene, seed)
+    weights = scenes.loss_weights(scene, seed)
     rng = np.random.default_rng(seed)
     direction = {name: rng.normal(size=values.shape) for name, values in scene.raw.items()}
     direction["features"] = rng.normal(size=scene.features.shape)
-    reverse = fast_gradients(scene, weights)
+    reverse = scenes.fast_gradients(scene, weights)
     surfels, features = scene.surfels(), scene.columns()
     dr.enable_grad(surfels.raw, features)
     for name in scene.raw:
         dr.set_grad(surfels.raw[name], mi.TensorXf(direction[name].astype(np.float32)))
     for k, column in enumerate(features):
         dr.set_grad(column, mi.Float(np.ascontiguousarray(direction["features"][:, k].astype(np.float32))))
-    forward = dr.forward_to(fast_loss(scene, surfels, features, weights), flags=dr.ADFlag.Default)[0]
-    for name in PARAMETERS:
+    forward = dr.forward_to(scenes.fast_loss(scene, surfels, features, weights), flags=dr.ADFlag.Default)[0]
+    for name in scenes.PARAMETERS:
         assert np.any(reverse[name]), name
-    expected = sum(np.sum(reverse[name] * direction[name]) for name in PARAMETERS)
-    size = np.sqrt(sum(np.sum((reverse[name] * direction[name]) ** 2) for name in PARAMETERS))
+    expected = sum(np.sum(reverse[name] * direction[name]) for name in scenes.PARAMETERS)
+    size = np.sqrt(sum(np.sum((reverse[name] * direction[name]) ** 2) for name in scenes.PARAMETERS))
     assert abs(forward - expected) <= 1e-3 * size
 
 
@@ -155,11 +143,11 @@ def test_degenerate_rows_stay_finite(kind: Primitive, case: str) -> None:
     name, columns, value = DEGENERATE[case]
     raw = {key: values[: 0 if case == "none" else None].copy() for key, values in scene.raw.items()}
     raw[name][:, columns] = scene.camera.to_world[:3, 3] if value is None else value
-    scene = Scene(raw, scene.features[: len(raw[name])], scene.camera)
-    maps = fast_maps(scene)
+    scene = scenes.Scene(raw, scene.features[: len(raw[name])], scene.camera)
+    maps = scenes.fast_maps(scene)
     assert all(np.isfinite(x.numpy()).all() for x in [*maps.features, maps.depth, maps.alpha])
     if len(scene.features):
-        gradients = fast_gradients(scene, np.ones((scene.camera.height, scene.camera.width, 6)))
+        gradients = scenes.fast_gradients(scene, np.ones((scene.camera.height, scene.camera.width, 6)))
         assert all(np.isfinite(x).all() for x in gradients.values())
 
 
@@ -209,7 +197,7 @@ def test_tile_lists_are_in_the_oracles_order(kind: Primitive, seed: int, tile: t
 
 def test_reference_footprints_match_textbook_intersections() -> None:
     """Tangent coordinates (a, b) of the point where a ray meets a disc: ray t = p + a σ_u u + b σ_v v."""
-    scene, tested = make_scene(8), 0
+    scene, tested = scenes.make_scene(8), 0
     camera, raw = scene.camera, scene.raw
     to_camera, origin = camera.to_world[:3, :3].T, camera.to_world[:3, 3]
     at = np.stack([v.ravel() + 0.5 for v in np.meshgrid(range(camera.width), range(camera.height))], axis=1)
@@ -241,18 +229,19 @@ def test_crossing_surfels_each_hide_the_other_on_their_own_side() -> None:
         "opacity": np.full((2, 1), 8.0),
     }
     camera = oracle.PinholeCamera(32, 32, -50, -50, 16, 16, look_at(np.array([0, 0, 4.0]), np.zeros(3)))
-    first, second = (f.numpy().reshape(32, 32)[16] for f in fast_maps(Scene(raw, np.eye(2), camera)).features)
+    maps = scenes.fast_maps(scenes.Scene(raw, np.eye(2), camera))
+    first, second = (f.numpy().reshape(32, 32)[16] for f in maps.features)
     left, right = first[11] - second[11], first[20] - second[20]
     assert left * right < 0 and min(abs(left), abs(right)) > 0.5
 
 
 def test_second_view_compiles_nothing() -> None:
-    scene = make_scene(15)
-    weights = loss_weights(scene, 15)
+    scene = scenes.make_scene(15)
+    weights = scenes.loss_weights(scene, 15)
     moved = replace(scene, camera=replace(scene.camera, cx=9.0, fx=-30.0))
-    fast_gradients(scene, weights)
+    scenes.fast_gradients(scene, weights)
     misses = dr.detail.launch_stats()[2]
-    fast_gradients(moved, weights)
+    scenes.fast_gradients(moved, weights)
     assert dr.detail.launch_stats()[2] == misses
 
 
@@ -266,7 +255,7 @@ def full_screen(count: int, size: int) -> tuple[Surfels, Camera]:
 
 @pytest.mark.parametrize("chunk", [1, 100, 20_000])
 def test_candidates_in_parts_give_the_same_lists(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = make_scene(13)
+    scene = scenes.make_scene(13)
     camera = scene.fast_camera()
     footprints = project(scene.surfels(), camera)
     whole = list_by_tile(footprints, camera)

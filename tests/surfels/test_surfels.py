@@ -88,8 +88,7 @@ def everything(surfels: Surfels) -> object:
 
 
 def test_gradients_of_every_channel(rng: np.random.Generator) -> None:
-    """Reverse mode against central differences in float32 (step 1e-2, truncation 1e-4) and forward mode
-    against reverse."""
+    """Reverse mode against central differences (step 1e-2, truncation 1e-4), forward mode against reverse."""
     raw = raw_table(6, rng, degree=1)
     surfels = Surfels.from_numpy(raw)
     surfels.enable_grad()

@@ -21,14 +21,10 @@ class ConstantLight:
 
     colour: Color3f
 
-    def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
+    def specular(self, direction: Vector3f, roughness: Float = None) -> Color3f:
         return mi.Color3f(self.colour)
 
-    def irradiance(self, normal: Vector3f) -> Color3f:
-        return mi.Color3f(self.colour)
-
-    def radiance(self, direction: Vector3f) -> Color3f:
-        return mi.Color3f(self.colour)
+    radiance = irradiance = specular
 
 
 class LearntColour(FittedLight):

@@ -1,8 +1,7 @@
 """The environment map: learnable lat-long radiance, its prefiltered levels, and lookups for shading.
 
 Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a row, θ from +y down the rows;
-column centres at half-integers, the first and the last row at the poles (`lobe_matrices`). Images go in and
-out unturned.
+column centres at half-integers, the first and the last row at the poles (`lobe_matrices`).
 
 Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that an
 optimiser's step bounds the change of radiance.
@@ -187,8 +186,7 @@ class FittedLight:
 
 @dataclass(frozen=True)
 class EnvironmentLight(FittedLight):
-    """A learnable lat-long light of radiance softplus(`raw`), a tensor (h, 2h, 3), h a multiple of 4, else
-    InputError."""
+    """A light of radiance softplus(`raw`), a tensor (h, 2h, 3), h a multiple of 4, else InputError."""
 
     def __post_init__(self) -> None:
         shape = tuple(self.raw.shape)

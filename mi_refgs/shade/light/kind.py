@@ -1,5 +1,4 @@
-"""Kinds of light, what a fit learns of it: a new one is a `FittedLight` and a `LightKind` registered in
-LIGHTS."""
+"""Kinds of light, what a fit learns of it: a new one is a `FittedLight` and a registered `LightKind`."""
 
 from __future__ import annotations
 

@@ -55,8 +55,7 @@ def row_areas(h: int) -> np.ndarray:
 
 
 def resampling(count: int, wanted: int, periodic: bool = False) -> csr_matrix:
-    """Matrix (wanted, count) between grids of rows, or `periodic` columns, rows of sum 1: area-weighted hats
-    to coarsen, linear to refine."""
+    """Matrix (wanted, count) between grids of rows, or `periodic` columns: hats to coarsen, else linear."""
     last = 0 if periodic else 1  # rows are on both ends of their interval, columns are not
     ratio = (count - last) / (wanted - last)
     offset = 0.5 * (ratio - 1) if periodic else 0.0
@@ -77,8 +76,7 @@ def resampling(count: int, wanted: int, periodic: bool = False) -> csr_matrix:
 
 
 def resample(radiance: np.ndarray, height: int, width: int | None = None) -> np.ndarray:
-    """Radiance (h, w, 3) at (height, width, 3), by default 2·height wide, with its number type; it keeps its
-    integral when it coarsens."""
+    """Radiance (h, w, 3) at (height, width, 3), by default 2·height wide; coarser, it keeps its integral."""
     h, w, _ = radiance.shape
     width = width or 2 * height
     rows, columns = resampling(h, height), resampling(w, width, periodic=True)

@@ -13,13 +13,13 @@ import functools
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import fft
 from scipy.sparse import csc_matrix
 
 from mi_refgs.kernels.device import upload
+from mi_refgs.kernels.linear import linear
 from mi_refgs.shade.light.lobe_matrices import build_levels
 from mi_refgs.shade.light.prefilter_kernels import TEXEL, Kernels
 from mi_refgs.types import Float, TensorXf, UInt32
@@ -114,35 +114,17 @@ def operator(height: int) -> Operator:
     return _operator(mi.variant(), height)
 
 
-class _Prefilter(dr.CustomOp):
-    """`Operator.apply` under AD; linear, so that its derivative is itself."""
-
-    def eval(self, operator: Operator, radiance: Float) -> Float:
-        self.operator = operator
-        return self._apply(radiance)
-
-    def forward(self) -> None:
-        self.set_grad_out(self._apply(self.grad_in("radiance")))
-
-    def backward(self) -> None:
-        δ, kernels = self.grad_out(), self.operator.kernels
-        if kernels is None:
-            δradiance = upload(self.operator.apply_transposed(δ.numpy().reshape(-1, TEXEL)))
-        else:
-            δradiance = kernels.apply_transposed(δ)
-        self.set_grad_in("radiance", δradiance)
-
-    def _apply(self, radiance: Float) -> Float:
-        height = self.operator.height
-        if self.operator.kernels is not None:
-            return self.operator.kernels.apply(radiance)
-        return upload(self.operator.apply(radiance.numpy().reshape(height, 2 * height, 3)))
-
-    def name(self) -> str:
-        return "prefilter"
-
-
 def prefilter(radiance: TensorXf) -> tuple[Operator, Any]:
     """Operator and levels (flat RGBA, under AD) of a radiance tensor (h, 2h, 3), h a multiple of 4."""
-    found = operator(radiance.shape[0])
-    return found, dr.custom(_Prefilter, found, radiance.array)
+    shape = tuple(radiance.shape)
+    found = operator(shape[0])
+    if found.kernels is not None:
+        return found, linear(radiance.array, found.kernels.apply, found.kernels.apply_transposed)
+
+    def levels(texels: Float) -> Float:
+        return upload(found.apply(texels.numpy().reshape(shape)))
+
+    def adjoint(δlevels: Float) -> Float:
+        return upload(found.apply_transposed(δlevels.numpy().reshape(-1, TEXEL)))
+
+    return found, linear(radiance.array, levels, adjoint)

@@ -61,8 +61,7 @@ class TraceContext:
 class Reflectance:
     """A reflectance model: declares its inputs and shades points, as separate terms. Register one object per
     subclass. In forward shading ("surfel"), `values` per surfel are shaded and radiance is blended; in
-    deferred shading ("pixel") they are blended and shaded; hits of traced rays have attributes of the surfels
-    around."""
+    deferred shading ("pixel") they are blended and shaded; traced hits have those of surfels around."""
 
     name: str = ""
     shaded_at: tuple[ShadedAt, ...] = ("pixel", "surfel")  # where it may be shaded, the default first

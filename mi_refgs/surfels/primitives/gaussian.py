@@ -19,8 +19,6 @@ needles and pancakes keep their digits in float32.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -28,8 +26,8 @@ from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS, GAUSSIAN
 from mi_refgs.surfels.primitives.primitive import (
     Camera,
     Footprints,
-    FootprintSample,
     Oriented,
+    OrientedSample,
     Surfels,
     cutoff_radius_squared,
     dot2,
@@ -37,17 +35,6 @@ from mi_refgs.surfels.primitives.primitive import (
     rectangle,
 )
 from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
-
-
-@dataclass(frozen=True)
-class GaussianSample(FootprintSample):
-    """A Gaussian's footprint at one pixel, with the intermediate values that its derivatives reuse."""
-
-    gaussian: Float  # exp(-ρ/2)
-    clamped: Bool  # α_max was reached: no derivative
-    delta: Vector2f  # pixel offset from the centre
-    u: Float  # a·δ
-    v: Float  # b δ_y
 
 
 def _as_surfel(columns: list[Float]) -> list[Float]:
@@ -98,20 +85,20 @@ class Gaussian(Oriented):
             half = half * dr.abs(focal) * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
             return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
 
-    def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> GaussianSample:
+    def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> OrientedSample:
         delta = mi.Vector2f(pixel.x - row[4], pixel.y - row[5])
         u, v = dot2(row[0], row[1], delta), row[2] * delta.y
         gaussian = dr.exp(-0.5 * dr.fma(u, u, v * v))
         alpha = row[6] * gaussian
         clamped = alpha > ALPHA_MAX
         alpha = dr.select(clamped, ALPHA_MAX, alpha)
-        return GaussianSample(alpha, row[3], alpha >= ALPHA_MIN, gaussian, clamped, delta, u, v)
+        return OrientedSample(alpha, row[3], alpha >= ALPHA_MIN, gaussian, clamped, delta, u, v)
 
     def adjoint(self) -> GaussianAdjoint:
         return GaussianAdjoint()
 
     def evaluate_forward(
-        self, row: list[Float], sample: GaussianSample, drow: list[Float]
+        self, row: list[Float], sample: OrientedSample, drow: list[Float]
     ) -> tuple[Float, Float]:
         """Apply the chain rule, column by column."""
         delta, ddelta = sample.delta, mi.Vector2f(-drow[4], -drow[5])
@@ -167,7 +154,7 @@ class GaussianAdjoint:
         self.u, self.v = [mi.Float(0)] * 3, [mi.Float(0)] * 2
         self.depth, self.opacity = mi.Float(0), mi.Float(0)
 
-    def add(self, sample: GaussianSample, δalpha: Float, δz: Float) -> None:
+    def add(self, sample: OrientedSample, δalpha: Float, δz: Float) -> None:
         delta = sample.delta
         δalpha = dr.select(sample.clamped, 0, δalpha)
         self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)

@@ -131,6 +131,17 @@ class Primitive(ABC):
             raw[name][rows] += np.log(factor) * (np.arange(raw[name].shape[1]) == along[:, None])
 
 
+@dataclass(frozen=True)
+class OrientedSample(FootprintSample):
+    """With the intermediate values that derivatives reuse."""
+
+    gaussian: Float  # exp(-ρ/2)
+    clamped: Bool  # α_max was reached: no derivative
+    delta: Vector2f  # pixel offset from the centre
+    u: Float  # standard deviations from it, along two axes
+    v: Float
+
+
 class Oriented(Primitive):
     """A primitive with a `rotation`, and a `scale` along the first two of its axes, or all three."""
 
@@ -218,8 +229,7 @@ def dot2(x: Float, y: Float, delta: Vector2f) -> Float:
 def rectangle(
     centre: Vector2f, low: Vector2f, high: Vector2f, visible: Bool, camera: Camera
 ) -> tuple[tuple[Int32, Int32], tuple[Int32, Int32]]:
-    """First and last pixel column and row of centre + `low` to centre + `high`, pixels; last < first if not
-    `visible`."""
+    """First and last pixel column and row from centre + `low` to centre + `high`; none if not `visible`."""
     first, last = [], []
     for axis, size in enumerate((camera.width, camera.height)):
         # Clamped as floats first: a rectangle far outside must not overflow an integer.

@@ -38,8 +38,8 @@ from mi_refgs.constants import (
 from mi_refgs.surfels.primitives.primitive import (
     Camera,
     Footprints,
-    FootprintSample,
     Oriented,
+    OrientedSample,
     Surfels,
     cutoff_radius_squared,
     dot2,
@@ -50,16 +50,11 @@ from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
 
 @dataclass(frozen=True)
-class SurfelSample(FootprintSample):
-    """A surfel's footprint at one pixel, with the intermediate values that its derivatives reuse."""
+class SurfelSample(OrientedSample):
+    """A surfel's footprint at one pixel; u and v are coordinates in its plane."""
 
-    ratio: Float  # of that to the depth of the centre
-    gaussian: Float  # exp(-ρ/2)
-    clamped: Bool  # α_max was reached: no derivative
+    ratio: Float  # of the depth to that of the centre
     low_pass: Bool  # the 2D filter decides
-    delta: Vector2f  # pixel offset from the centre
-    u: Float
-    v: Float
 
 
 class Surfel(Oriented):
@@ -115,7 +110,7 @@ class Surfel(Oriented):
         ratio = dr.select(low_pass, 1, ratio)
         z = row[6] * ratio
         valid = (alpha >= ALPHA_MIN) & (z > near)
-        return SurfelSample(alpha, z, valid, ratio, gaussian, clamped, low_pass, delta, u, v)
+        return SurfelSample(alpha, z, valid, gaussian, clamped, delta, u, v, ratio, low_pass)
 
     def adjoint(self) -> FootprintAdjoint:
         return FootprintAdjoint()
@@ -174,8 +169,7 @@ class Surfel(Oriented):
 
     def depth_near(self, row: list[Float], pixel: Point2f) -> Float:
         """Depth of the surfel's plane there, up to SORT_REACH standard deviations from its centre: sorted by
-        centres, the near side of a curved surface would always come first. [cf. StopThePop, Radl et al. 2024,
-        §4]"""
+        centres, the near side of a curved surface would come first. [cf. StopThePop, Radl et al. 2024, §4]"""
         a_x, a_y, b_x, b_y, c_x, c_y, z, x, y = row[:9]
         delta = mi.Vector2f(pixel.x - x, pixel.y - y)
         u, v = dot2(a_x, a_y, delta), dot2(b_x, b_y, delta)
@@ -231,8 +225,7 @@ def _extent(
 
     The contour u² + v² = r² projects to a conic; its bounds follow from the tangent lines of the dual conic
     [2DGS, appendix A, with r for 3 and the origin at the projected centre]. A contour that reaches behind the
-    camera has none. Arguments: of one standard deviation along t_u and t_v, depth in depths of the centre,
-    and offset in pixels.
+    camera has none. Depth in depths of the centre, and offset in pixels, of one deviation along t_u and t_v.
     """
     r2 = cutoff_radius_squared(opacity)
     denominator = r2 * (dr.square(depth_u) + dr.square(depth_v)) - 1
