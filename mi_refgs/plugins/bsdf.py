@@ -165,11 +165,6 @@ def _front(direction: Any, active: Any) -> tuple[Any, Any]:
     return dr.select(active, direction, mi.Vector3f(0, 0, 1)), active
 
 
-def _schlick(f0: Any, cosine: Any) -> Any:
-    grazing = dr.maximum(1 - cosine, 0)
-    return dr.fma(1 - f0, dr.square(dr.square(grazing)) * grazing, f0)
-
-
 def _enabled(ctx: Any) -> tuple[bool, bool]:
     """Whether the context enables the specular and the diffuse component."""
     return ctx.is_enabled(LOBES[SPECULAR], SPECULAR), ctx.is_enabled(LOBES[DIFFUSE], DIFFUSE)
@@ -183,7 +178,9 @@ def _value(ctx: Any, material: Material, wi: Any, wo: Any) -> Any:
         h = dr.normalize(wi + wo)
         # G / (4 cosθi cosθo) = ½ / (cosθo slope(cosθi) + cosθi slope(cosθo))
         shadowing = 0.5 * wo.z / (wo.z * material.slope(wi.z) + wi.z * material.slope(wo.z))
-        value += _schlick(material.f0, dr.dot(wi, h)) * (material.distribution().eval(h) * shadowing)
+        grazing = dr.maximum(1 - dr.dot(wi, h), 0)
+        fresnel = dr.fma(1 - material.f0, dr.square(dr.square(grazing)) * grazing, material.f0)  # Schlick's
+        value += fresnel * (material.distribution().eval(h) * shadowing)
     if diffuse:
         view = wi if ctx.mode == mi.TransportMode.Radiance else wo
         value += material.diffuse(view.z) * (wo.z * (1 / math.pi))

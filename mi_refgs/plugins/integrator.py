@@ -230,10 +230,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading)
             # Mitsuba does not announce changes of the scene's light, on which ambient ratios depend.
             self.caches_valid = self.light is not None or not self.shading.ambient_rays
-        surfels, surroundings = (
-            Surfels(self.surfels.raw, screened=True),
-            self.background.splatted(self.surfels),
-        )
+        surfels = Surfels(self.surfels.raw, screened=True)
+        surroundings = self.background.splatted(self.surfels)
         rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings, self.near)
         frame = render(rendered, camera, request)
         return replace(frame.only(request.aovs), background=self.background.behind(frame))

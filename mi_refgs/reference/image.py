@@ -58,9 +58,8 @@ class Image:
 
 def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 1e-4) -> Image:
     """Image, and with `weights` (P, …) gradients of Σ weights · maps; `band`: of discontinuities."""
-    raw, around = (
-        {n: np.asarray(x, np.float64) for n, x in table.items()} for table in (scene.raw, scene.around or {})
-    )
+    tables = scene.raw, scene.around or {}
+    raw, around = ({n: np.asarray(x, np.float64) for n, x in table.items()} for table in tables)
     camera, count = scene.camera, len(raw["position"])
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
     blend = Blend.of([raw, around] if around else [raw], camera, scene.order, x, y, scene.rules)

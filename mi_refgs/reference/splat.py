@@ -79,9 +79,8 @@ class Blend:
         before, alive, after = (_unsort(v, order) for v in (before, alive, np.exp(behind)))
         shown = hit & alive
         weight = np.where(shown, before * alpha, 0)
-        return Blend(
-            tables, camera, rules, order, x, y, sample, culled, alpha, z, before, after, alive, shown, weight
-        )
+        given, found = (tables, camera, rules, order, x, y), (sample, culled, alpha, z)
+        return Blend(*given, *found, before, after, alive, shown, weight)
 
     def sums(self, features: Array) -> Array:
         """Maps (P, K + 2): features (N, K), depth, alpha."""

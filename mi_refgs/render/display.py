@@ -56,10 +56,8 @@ def displayed(
         behind = [plane * factor for plane, factor in zip(behind, gain, strict=True)]
     if not linear and frame.background is None:
         return display_image(radiance, frame.alpha, behind)
-    return [
-        srgb_from_linear(plane + (1 - frame.alpha) * value)
-        for plane, value in zip(radiance, behind, strict=True)
-    ]
+    through = 1 - frame.alpha
+    return [srgb_from_linear(x + through * y) for x, y in zip(radiance, behind, strict=True)]
 
 
 def image_array(array: Array, height: int, width: int) -> np.ndarray:

@@ -97,9 +97,8 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
         to_world[:3, :2] *= -1
     focal = max(abs(fx), abs(fy))
     per_pixel = focal / abs(fx), focal / abs(fy)
-    width, height = (
-        max(1, round(n * ratio)) for n, ratio in zip((camera.width, camera.height), per_pixel, strict=True)
-    )
+    width = max(1, round(camera.width * per_pixel[0]))
+    height = max(1, round(camera.height * per_pixel[1]))
     if (width, height) != (camera.width, camera.height):
         size = f"{camera.width} x {camera.height} pixels of focal lengths {abs(fx):g} and {abs(fy):g}"
         scene.append(ElementTree.Comment(f" the view of {size}, with square pixels "))

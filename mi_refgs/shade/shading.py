@@ -104,9 +104,8 @@ class Shading(ShadingOptions):
     @property
     def traceable(self) -> bool:
         """Whether the model can trace visibility where it is shaded."""
-        return self.model.visibility == "own" or (
-            self.model.visibility == "mirror" and self.shaded_at == "pixel"
-        )
+        rays = self.model.visibility
+        return rays == "own" or (rays == "mirror" and self.shaded_at == "pixel")
 
     @property
     def neighbours(self) -> int:

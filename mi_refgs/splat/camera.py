@@ -232,9 +232,8 @@ class Camera:
             name: dr.opaque(mi.Float, float(getattr(self, name)[0]) * ratio)
             for name, ratio in (("fx", x), ("cx", x), ("fy", y), ("cy", y))
         }
-        return replace(
-            self, width=size[0], height=size[1], focal=self.focal * x, offset=(0, 0), film=None, **scaled
-        )
+        whole = replace(self, offset=(0, 0), film=None)
+        return replace(whole, width=size[0], height=size[1], focal=self.focal * x, **scaled)
 
     def window(self, x: int, y: int, width: int, height: int) -> Camera:
         """The part of the view from pixel (x, y), even outside; tiles and random numbers stay, kernels at

@@ -66,9 +66,8 @@ def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Floa
         if count > 1 << MAX_PAIR_BITS:
             size = f"{tiles:,} tiles of {camera.width} × {camera.height} pixels"
             remedy = "render fewer pixels, or remove the largest surfels"
-            raise InputError(
-                f"more than {1 << MAX_PAIR_BITS:,} surfels on the {size}", "splat", "surfels", remedy
-            )
+            what = f"more than {1 << MAX_PAIR_BITS:,} surfels on the {size}"
+            raise InputError(what, "splat", "surfels", remedy)
         if dr.width(kept):
             pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))
             found.append((pairs, dr.gather(mi.Float, depth, kept)))

@@ -147,10 +147,8 @@ def derivative_errors(at: Callable[[mi.Float], mi.TensorXf], name: str) -> tuple
         assert typical > 1e-3, f"{name}: no influence on the image"
         smooth = np.all(np.abs(right - left) < JUMP * (typical + np.abs(difference)), axis=2)
         if np.mean(~smooth[seen]) <= MAX_LEFT_OUT:
-            error = np.linalg.norm((tangent - difference)[smooth])
-            found.append(
-                (error / np.linalg.norm(difference[smooth]), np.where(smooth[..., None], difference, 0))
-            )
+            error = np.linalg.norm((tangent - difference)[smooth]) / np.linalg.norm(difference[smooth])
+            found.append((error, np.where(smooth[..., None], difference, 0)))
     assert found, f"{name}: too many jumps at every step"
     forward, difference = min(found, key=lambda pair: pair[0])
 

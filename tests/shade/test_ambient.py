@@ -43,9 +43,8 @@ def directions(normals: np.ndarray, rays: int) -> np.ndarray:
     """The rays (V, K, 3) of vertices."""
     frame = mi.Frame3f(mi.Vector3f(normals.T.astype(np.float32)))
     turn, count = lobe_turn(dr.arange(mi.UInt32, len(normals))), mi.UInt32(rays)
-    return np.stack(
-        [ambient.ambient_direction(frame, turn, mi.UInt32(k), count).numpy().T for k in range(rays)], 1
-    )
+    each = (ambient.ambient_direction(frame, turn, mi.UInt32(k), count) for k in range(rays))
+    return np.stack([ray.numpy().T for ray in each], 1)
 
 
 def with_ratios(mesh: Mesh, surfels: Surfels, light: PrefilteredLight, rays: int = 9) -> Any:
@@ -78,9 +77,7 @@ def test_ratios_against_rays_one_by_one() -> None:
     rays = directions(normals, RAYS).astype(np.float64)
     shape = (mesh.vertices.astype(np.float64), mesh.faces.astype(int), normals, rays)
     limits: dict[str, Any] = {"offset": OFFSET_VOXELS * VOXEL, "brightest": ambient.BRIGHTEST}
-    expected, once = (
-        exact(*shape, sky, outgoing, bounces=bounces, **limits) for bounces in (ambient.BOUNCES, 1)
-    )
+    expected, once = (exact(*shape, sky, outgoing, bounces=k, **limits) for k in (ambient.BOUNCES, 1))
     assert np.abs(once - expected).max() > 5e-3
     assert found.min() < 0.9 and np.ptp(found, axis=1).max() > 0.05
     # A ray may pass an edge on this side in one and on that side in the other.

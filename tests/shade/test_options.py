@@ -188,13 +188,8 @@ def test_properties_of_the_plugin(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rays", [3, slow(1)])
 def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
-    options: dict[str, Any] = {
-        "dominant": True,
-        "diffuse": "irradiance",
-        "visibility_rays": rays,
-        "traced_bounces": 2,
-    }
-    check_derivatives(scene(mesh=plane_mesh(tmp_path), **options), "integrator.light")
+    options: dict[str, Any] = {"dominant": True, "diffuse": "irradiance", "visibility_rays": rays}
+    check_derivatives(scene(mesh=plane_mesh(tmp_path), traced_bounces=2, **options), "integrator.light")
 
 
 def test_new_surfels_give_new_materials(tmp_path: Path) -> None:

@@ -106,9 +106,8 @@ def test_derivatives_of_each_attribute(
         for part, gradient in zip(flat(getattr(again, name)), gradients[name], strict=True):
             tangent = rng.normal(size=gradient.shape).astype(np.float32)
             dr.enable_grad(part)
-            dr.set_grad(
-                part, mi.Float(tangent[:, 0]) if tangent.shape[1] == 1 else type(part)(vector(tangent))
-            )
+            moved = mi.Float(tangent[:, 0]) if tangent.shape[1] == 1 else type(part)(vector(tangent))
+            dr.set_grad(part, moved)
             expected += float((tangent * gradient).sum())
     total = weighted(shaded(again, light, shading), weight)
     dr.forward_to(total)

@@ -19,6 +19,7 @@ from mi_refgs.reference.camera import look_at, rotation_axes
 from mi_refgs.reference.footprint import Gaussian, Rules, Surfel
 from mi_refgs.splat import Camera, list_by_tile, project, splat, tiles
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import slow
 from tests.scenes import splats as scenes
 
 
@@ -41,9 +42,7 @@ PRIMITIVES = [
     Primitive("gaussian", scenes.make_gaussians, Gaussian, 1e-5, 1e-3),  # observed 2e-6
 ]
 BOTH = pytest.mark.parametrize("kind", PRIMITIVES, ids=str)
-SEEDS = [
-    seed if seed in range(0, 20, 3) else pytest.param(seed, marks=pytest.mark.slow) for seed in range(60)
-]
+SEEDS = [seed if seed in range(0, 20, 3) else slow(seed) for seed in range(60)]
 MANY = pytest.mark.parametrize("seed", SEEDS)
 TILES = [size for _, size in constants.TILE_SIZES]
 EVERY_TILE = pytest.mark.parametrize("tile", TILES, indirect=True, ids=str)

@@ -132,9 +132,8 @@ def build_levels(h: int) -> list[np.ndarray]:
             first = resampling(2 * h, 2 * h_in, periodic=True).toarray()[0]
             offset = column_angles(2 * h) - column_angles(2 * h_in)[0]
             transfer = (first[:, None] * np.cos(m * offset[:, None])).sum(0) * (h_in / h)
-            weights = np.einsum(
-                "ikm,kn,m->inm", weights, resampling(h, h_in).toarray(), transfer, optimize=True
-            )
+            rows = resampling(h, h_in).toarray()
+            weights = np.einsum("ikm,kn,m->inm", weights, rows, transfer, optimize=True)
         rows = weights.shape[0]
         weights = weights[:, :, : rows + 1]  # a level of w columns has frequencies up to w/2
         if rows < h_in and roughness > HORIZON_CUTS:

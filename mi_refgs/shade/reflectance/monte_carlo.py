@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -97,10 +98,8 @@ class MonteCarlo(Reflectance):
         sums = [mi.Color3f(0) for _ in range(2 if incident is None else 3)]
         # A sum over directions, whose derivative keeps no state of an iteration: max_iterations = -1.
         start = (mi.UInt32(0), sums, base, roughness, safe_normalize(points.view), incident)
-        end = dr.while_loop(
-            start, lambda index, *_: index < count, body, max_iterations=-1, label="hemisphere"
-        )
-        return RadianceTerms(*end[1])
+        loop = partial(dr.while_loop, max_iterations=-1, label="hemisphere")
+        return RadianceTerms(*loop(start, lambda index, *_: index < count, body)[1])
 
 
 def _direction(index: Any, count: Any, normal: Any) -> tuple[Any, Any]:

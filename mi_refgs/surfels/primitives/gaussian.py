@@ -65,9 +65,8 @@ class Gaussian(Oriented):
         focal, middle = mi.Vector2f(camera.fx, camera.fy), mi.Vector2f(camera.cx, camera.cy)
         # In units of slope rather than pixels, so that fourth powers of sizes fit float32.
         q = _near_image(dr.select(visible, slope, 0), camera)
-        along = [
-            mi.Vector2f(*(dr.fma(-q[i], t.z, t[i]) for i in range(2))) * s[k] for k, t in enumerate(axes)
-        ]
+        across = [mi.Vector2f(*(dr.fma(-q[i], t.z, t[i]) for i in range(2))) for t in axes]
+        along = [t * size for t, size in zip(across, s, strict=True)]
         facing = [dr.fma(q.x, t.x, dr.fma(q.y, t.y, t.z)) for t in axes]
         low_pass = GAUSSIAN_LOW_PASS / dr.square(focal)
         unfiltered = mi.Vector2f(*(sum(dr.square(v[i]) for v in along) for i in range(2)))
