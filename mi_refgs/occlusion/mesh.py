@@ -104,13 +104,17 @@ def read_mesh(path: Path | str) -> Mesh:
         with path.open("rb") as file:
             header = read_header(path, file) if kind == "ply" else Header("", (), ())
             file.seek(0)
-            data = file.read()
+            data = io.BytesIO(file.read())  # in memory: no other file is resolved beside it
         voxel = _voxel(header)
         if any(element.name == "face" and not element.count for element in header.elements):
             return Mesh.empty(1.0 if voxel is None else voxel)
-        mesh = _load(path, kind, data)
+        options: Any = {"skip_materials": True} if kind in ("ply", "obj") else {}
+        mesh: Any = trimesh.load(data, kind, force="mesh", process=False, **options)
+        faces = np.asarray(mesh.faces)
+        if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
+            raise InputError("a face names a vertex that is not there", path, "mesh", "write the file again")
         if voxel is None:
-            voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(mesh.faces) else 1.0
+            voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(faces) else 1.0
     except InputError:
         raise
     except Exception as error:  # trimesh raises whatever its parsers meet
@@ -120,7 +124,7 @@ def read_mesh(path: Path | str) -> Mesh:
     if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(vertices).all()):
         wrong = f"vertices not finite, or {VOXEL_COMMENT} not above 0"
         raise InputError(wrong, path, "mesh", "extract the mesh again")
-    return Mesh(vertices, np.asarray(mesh.faces, np.uint32), voxel)
+    return Mesh(vertices, faces.astype(np.uint32), voxel)
 
 
 def _voxel(header: Header) -> float | None:
@@ -132,13 +136,3 @@ def _voxel(header: Header) -> float | None:
     if not 0 < voxel < np.inf:
         raise ValueError("a voxel without size")
     return voxel
-
-
-def _load(path: Path, kind: str, data: bytes) -> Any:
-    """The trimesh of a file's bytes, with indices checked; it resolves no other names from memory."""
-    options: Any = {"skip_materials": True} if kind in ("ply", "obj") else {}
-    mesh: Any = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, **options)
-    faces = np.asarray(mesh.faces)
-    if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
-        raise InputError("a face names a vertex that is not there", path, "mesh", "write the file again")
-    return mesh

@@ -23,6 +23,7 @@ from mi_refgs.plugins.light import light_of, used_emitters, warn_of_ignored
 from mi_refgs.plugins.properties import BackgroundProperties
 from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
@@ -120,7 +121,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
             if not self.surfels.has(name):
                 raise InputError("the surfels have no such attribute", "refgs", name, "add it, or do without")
-        self.background.require_fit(self.surfels)
+        if self.background.surfels is not None:
+            Surroundings(Surfels(self.background.surfels.raw)).check(self.surfels)
         for name, light in self._maps.items():
             try:
                 EnvironmentLight(light.raw)  # checks the shape, which an update may have changed

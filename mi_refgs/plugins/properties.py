@@ -100,11 +100,6 @@ class BackgroundProperties:
         around = Surfels({n: tensor for n, tensor in raw.items() if n in names}) if raw else None
         return BackgroundProperties(around, colour, light)
 
-    def require_fit(self, surfels: Surfels) -> None:
-        """Raise InputError unless these can surround an object of these surfels."""
-        if self.surfels is not None:
-            Surroundings(Surfels(self.surfels.raw)).check(surfels)
-
     def parameters(self) -> dict[str, Any]:
         """Raw tensors by the names of the integrator's parameters."""
         raw = {} if self.surfels is None else self.surfels.raw

@@ -107,14 +107,17 @@ def test_the_lobe_of_a_directional_light_is_normalised() -> None:
 # ---------------- parameters ----------------
 
 
-def test_surfel_count_may_change() -> None:
-    of, other = scenes.scene(), scenes.raw_channels(scenes.COUNT + 9, seed=5)
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_surfel_count_may_change(bounces: int, tmp_path: Path) -> None:
+    """Also where the mesh has their materials."""
+    traced = {"mesh": scenes.plane_mesh(tmp_path), "traced_bounces": bounces}
+    of, other = scenes.scene(**traced), scenes.raw_channels(scenes.COUNT + 9, seed=5)
     params = mi.traverse(of)
     tensors = {name: params[f"integrator.{name}"] for name in other}
     for name, values in other.items():
         params[f"integrator.{name}"] = mi.TensorXf(values)
     params.update()
-    np.testing.assert_array_equal(scenes.image(of), scenes.image(scenes.scene(raw=other)))
+    np.testing.assert_array_equal(scenes.image(of), scenes.image(scenes.scene(raw=other, **traced)))
     assert all(of.integrator().surfels.raw[name] is tensor for name, tensor in tensors.items())
 
 

@@ -14,7 +14,7 @@ from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.splat import Camera
 from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotation_of
-from tests.scenes.open_pair import CASES, MAPS, Pair, weighted
+from tests.scenes.open_pair import CASES, Pair, weighted
 
 
 def displaced(eye: Camera, motion: mi.Float) -> Camera:
@@ -50,20 +50,14 @@ def test_derivatives_of_open_scene_are_those_of_float64(case: tuple[str, str, fl
     pair = Pair(*case)
     start = np.linalg.inv(moved_pose(np.eye(4), MOTION.astype(np.float64))) @ pair.case.camera.to_world
     eye = exact.fast_camera(pair.case).moved(start)
-    rng = np.random.default_rng(11)
-    maps, band = pair.truth(pair.values)
-    weights = {
-        name: np.where(band[:, None], 0, rng.normal(size=maps[name].shape) / np.abs(maps[name]).max())
-        for name in MAPS
-    }
 
     def define(at: np.ndarray) -> float:
         maps, _ = pair.truth(pair.values, moved_pose(start, at))
-        return sum(float(np.sum(w * maps[key])) for key, w in weights.items())
+        return sum(float(np.sum(w * maps[key])) for key, w in pair.weights.items())
 
     def total(leaf: mi.Float) -> mi.Float:
         params = {name: upload_tensor(x) for name, x in pair.values.items()}
-        return weighted(pair.planes(params, displaced(eye, leaf)), weights)
+        return weighted(pair.planes(params, displaced(eye, leaf)), pair.weights)
 
     require_slopes(total, define, MOTION)
 

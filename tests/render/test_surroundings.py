@@ -24,17 +24,6 @@ def pair(request: pytest.FixtureRequest) -> Pair:
     return Pair(*request.param)
 
 
-@pytest.fixture(scope="module")
-def weights(pair: Pair) -> dict[str, np.ndarray]:
-    """Random numbers for each value of each map, 0 near a declared discontinuity."""
-    rng = np.random.default_rng(11)
-    maps, band = pair.truth(pair.values)
-    return {
-        name: np.where(band[:, None], 0, rng.normal(size=maps[name].shape) / np.abs(maps[name]).max())
-        for name in MAPS
-    }
-
-
 def test_image_matches_float64(pair: Pair) -> None:
     """Radiance, alpha and depth of both; share and materials of the object; the background by its rays."""
     maps, band = pair.truth(pair.values)
@@ -47,11 +36,11 @@ def test_image_matches_float64(pair: Pair) -> None:
         np.testing.assert_allclose(found[keep], maps[name][keep], atol=tolerance, err_msg=name)
 
 
-def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[str, np.ndarray]) -> None:
+def test_both_derivative_modes_are_those_of_float64(pair: Pair) -> None:
     """Each class of parameters along a random direction, against central differences in float64."""
     params = {name: upload_tensor(x) for name, x in pair.values.items()}
     dr.enable_grad(list(params.values()))
-    dr.backward(weighted(pair.planes(params), weights))
+    dr.backward(weighted(pair.planes(params), pair.weights))
     adjoint = {name: np.asarray(dr.grad(x).numpy(), np.float64) for name, x in params.items()}
 
     rng, step = np.random.default_rng(3), 1e-7
@@ -61,7 +50,7 @@ def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[st
         for sign in (1, -1):
             moved = np.asarray(values, np.float64) + sign * step * direction
             maps, _ = pair.truth(pair.values | {name: moved})
-            sides.append(sum(float(np.sum(w * maps[key])) for key, w in weights.items()))
+            sides.append(sum(float(np.sum(w * maps[key])) for key, w in pair.weights.items()))
         expected = (sides[0] - sides[1]) / (2 * step)
         size = max(abs(expected), 0.05 * float(np.linalg.norm(adjoint[name])))
         assert np.sum(adjoint[name] * direction) == pytest.approx(expected, abs=0.01 * size), name
@@ -69,7 +58,7 @@ def test_both_derivative_modes_are_those_of_float64(pair: Pair, weights: dict[st
         fresh = {key: upload_tensor(x) for key, x in pair.values.items()}
         dr.enable_grad(fresh[name])
         dr.set_grad(fresh[name], upload_tensor(direction))
-        total = weighted(pair.planes(fresh), weights)
+        total = weighted(pair.planes(fresh), pair.weights)
         dr.enqueue(dr.ADMode.Forward, fresh[name])
         dr.traverse(dr.ADMode.Forward)
         assert dr.grad(total).numpy()[0] == pytest.approx(expected, abs=0.01 * size), name

@@ -73,6 +73,14 @@ class Pair:
         image = oracle.render(replace(scene, around=others, background=values["background"]))
         return image.maps, image.band
 
+    @cached_property
+    def weights(self) -> dict[str, np.ndarray]:
+        """Random numbers for each value of each map, 0 near a declared discontinuity."""
+        rng = np.random.default_rng(11)
+        maps, band = self.truth(self.values)
+        drawn = {name: rng.normal(size=maps[name].shape) / np.abs(maps[name]).max() for name in MAPS}
+        return {name: np.where(band[:, None], 0, x) for name, x in drawn.items()}
+
     def frame(self, params: dict[str, Any], eye: Camera | None = None) -> Frame:
         surfels = Surfels({name: params[name] for name in self.case.raw})
         others = Surfels({name: params[f"surroundings/{name}"] for name in self.around})

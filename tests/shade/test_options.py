@@ -190,14 +190,3 @@ def test_properties_of_the_plugin(tmp_path: Path) -> None:
 def test_derivatives_of_mi_render(rays: int, tmp_path: Path) -> None:
     options: dict[str, Any] = {"dominant": True, "diffuse": "irradiance", "visibility_rays": rays}
     check_derivatives(scene(mesh=plane_mesh(tmp_path), traced_bounces=2, **options), "integrator.light")
-
-
-def test_new_surfels_give_new_materials(tmp_path: Path) -> None:
-    """Another number of surfels through the parameters, as a scene that is loaded with them."""
-    mesh = plane_mesh(tmp_path)
-    of, other = scene(mesh=mesh, traced_bounces=1), raw_channels(40, seed=5)
-    params = mi.traverse(of)
-    for name, values in other.items():
-        params[f"integrator.{name}"] = mi.TensorXf(values)
-    params.update()
-    np.testing.assert_array_equal(image(of), image(scene(raw=other, mesh=mesh, traced_bounces=1)))
