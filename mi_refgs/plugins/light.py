@@ -13,16 +13,9 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.motion import motion_of, rotation_part
+from mi_refgs.shade.light import envmap
 from mi_refgs.shade.light.constant import ConstantLight
-from mi_refgs.shade.light.envmap import (
-    DEFAULT_HEIGHT,
-    MIN_HEIGHT,
-    EnvironmentLight,
-    PrefilteredLight,
-    UnfilteredLight,
-    bounded,
-    is_height,
-)
+from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentLight, bounded, is_height
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.light.prefilter import prefilter
@@ -63,9 +56,9 @@ def emitter_light(emitter: Any, filtered: bool = True, other: Light | None = Non
         what = f"has no derivative: a map of {resampled} is resampled"
         remedy = f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
         raise InputError(what, "mi.render", f"{emitter.id()}.data", remedy)
-    light: Light = UnfilteredLight(radiance.shape[0], radiance.array)
+    light: Light = envmap.UnfilteredLight(radiance.shape[0], radiance.array)
     if filtered:
-        light = PrefilteredLight(*prefilter(radiance))
+        light = envmap.PrefilteredLight(*prefilter(radiance))
     return rotated(light, params["to_world"])
 
 

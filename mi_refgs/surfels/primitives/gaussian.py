@@ -23,17 +23,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN, GAUSSIAN_LOW_PASS, GAUSSIAN_SLOPE_MARGIN, SIZE_RANGE
-from mi_refgs.surfels.primitives.primitive import (
-    Camera,
-    Footprints,
-    Oriented,
-    OrientedSample,
-    Surfels,
-    cutoff_radius_squared,
-    dot2,
-    projected,
-    rectangle,
-)
+from mi_refgs.surfels.primitives import primitive as base
+from mi_refgs.surfels.primitives.primitive import Camera, Surfels, cutoff_radius_squared, dot2
 from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
 
@@ -44,7 +35,7 @@ def _as_surfel(columns: list[Float]) -> list[Float]:
     return [a_x, a_y, none, b, none, none, *others]
 
 
-class Gaussian(Oriented):
+class Gaussian(base.Oriented):
     """A 3D Gaussian with three standard deviations along the axes of a rotation. [3DGS, §4]"""
 
     name = "gaussian"
@@ -53,9 +44,9 @@ class Gaussian(Oriented):
     rows_as = {"surfel": _as_surfel}  # noqa: RUF012
     first_order = True
 
-    def project(self, surfels: Surfels, camera: Camera) -> Footprints:
+    def project(self, surfels: Surfels, camera: Camera) -> base.Footprints:
         """Culled: centre not beyond the near plane, opacity below ALPHA_MIN, non-finite."""
-        ahead, z, nearness, slope = projected(surfels, camera)
+        ahead, z, nearness, slope = base.projected(surfels, camera)
         axes = [camera.rotate_to_camera(t) for t in surfels.frame()]
         s, opacity = surfels.scale(), surfels.opacity()
         visible = ahead & dr.detach(
@@ -82,22 +73,22 @@ class Gaussian(Oriented):
         with dr.suspend_grad():
             half = dr.sqrt(cutoff_radius_squared(opacity) * mi.Vector2f(xx, yy))
             half = half * dr.abs(focal) * 1.0001 + 1e-3  # rounding of the contour itself, in pixels
-            return Footprints(columns, *rectangle(centre, -half, half, visible, camera), self)
+            return base.Footprints(columns, *base.rectangle(centre, -half, half, visible, camera), self)
 
-    def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> OrientedSample:
+    def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> base.OrientedSample:
         delta = mi.Vector2f(pixel.x - row[4], pixel.y - row[5])
         u, v = dot2(row[0], row[1], delta), row[2] * delta.y
         gaussian = dr.exp(-0.5 * dr.fma(u, u, v * v))
         alpha = row[6] * gaussian
         clamped = alpha > ALPHA_MAX
         alpha = dr.select(clamped, ALPHA_MAX, alpha)
-        return OrientedSample(alpha, row[3], alpha >= ALPHA_MIN, gaussian, clamped, delta, u, v)
+        return base.OrientedSample(alpha, row[3], alpha >= ALPHA_MIN, gaussian, clamped, delta, u, v)
 
     def adjoint(self) -> GaussianAdjoint:
         return GaussianAdjoint()
 
     def evaluate_forward(
-        self, row: list[Float], sample: OrientedSample, drow: list[Float]
+        self, row: list[Float], sample: base.OrientedSample, drow: list[Float]
     ) -> tuple[Float, Float]:
         """Apply the chain rule, column by column."""
         delta, ddelta = sample.delta, mi.Vector2f(-drow[4], -drow[5])
@@ -153,7 +144,7 @@ class GaussianAdjoint:
         self.u, self.v = [mi.Float(0)] * 3, [mi.Float(0)] * 2
         self.depth, self.opacity = mi.Float(0), mi.Float(0)
 
-    def add(self, sample: OrientedSample, δalpha: Float, δz: Float) -> None:
+    def add(self, sample: base.OrientedSample, δalpha: Float, δz: Float) -> None:
         delta = sample.delta
         δalpha = dr.select(sample.clamped, 0, δalpha)
         self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)

@@ -35,38 +35,29 @@ from mi_refgs.constants import (
     SORT_DEPTH_RANGE,
     SORT_REACH,
 )
-from mi_refgs.surfels.primitives.primitive import (
-    Camera,
-    Footprints,
-    Oriented,
-    OrientedSample,
-    Surfels,
-    cutoff_radius_squared,
-    dot2,
-    projected,
-    rectangle,
-)
+from mi_refgs.surfels.primitives import primitive as base
+from mi_refgs.surfels.primitives.primitive import Camera, Surfels, cutoff_radius_squared, dot2
 from mi_refgs.types import Bool, Float, Point2f, Vector2f, Vector3f
 
 
 @dataclass(frozen=True)
-class SurfelSample(OrientedSample):
+class SurfelSample(base.OrientedSample):
     """A surfel's footprint at one pixel; u and v are coordinates in its plane."""
 
     ratio: Float  # of the depth to that of the centre
     low_pass: Bool  # the 2D filter decides
 
 
-class Surfel(Oriented):
+class Surfel(base.Oriented):
     """A flat Gaussian: the point p(u, v) = position + s_u u t_u + s_v v t_v, n = t_u × t_v. [2DGS, §4.1]"""
 
     name = "surfel"
     widths = {"position": 3, "rotation": 4, "scale": 2, "opacity": 1}  # noqa: RUF012
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
 
-    def project(self, surfels: Surfels, camera: Camera) -> Footprints:
+    def project(self, surfels: Surfels, camera: Camera) -> base.Footprints:
         """Culled: centre not beyond the near plane, edge-on, opacity below ALPHA_MIN, non-finite."""
-        ahead, z, nearness, slope = projected(surfels, camera)
+        ahead, z, nearness, slope = base.projected(surfels, camera)
         t_u, t_v, n = (camera.rotate_to_camera(t) for t in surfels.frame())
         s, opacity = surfels.scale(), surfels.opacity()
         qn = dr.fma(slope.x, n.x, dr.fma(slope.y, n.y, n.z))
@@ -91,7 +82,7 @@ class Surfel(Oriented):
         with dr.suspend_grad():
             deviations = along_u * s.x * focal, along_v * s.y * focal
             low, high = _extent(t_u.z * s.x, t_v.z * s.y, *deviations, opacity)
-            return Footprints(columns, *rectangle(centre, low, high, visible, camera), self)
+            return base.Footprints(columns, *base.rectangle(centre, low, high, visible, camera), self)
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> SurfelSample:
         delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
