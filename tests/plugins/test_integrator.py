@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import drjit as dr
@@ -110,7 +111,7 @@ def test_the_lobe_of_a_directional_light_is_normalised() -> None:
 @pytest.mark.parametrize("bounces", [0, 1])
 def test_surfel_count_may_change(bounces: int, tmp_path: Path) -> None:
     """Also where the mesh has their materials."""
-    traced = {"mesh": scenes.plane_mesh(tmp_path), "traced_bounces": bounces}
+    traced: dict[str, Any] = {"mesh": scenes.plane_mesh(tmp_path), "traced_bounces": bounces}
     of, other = scenes.scene(**traced), scenes.raw_channels(scenes.COUNT + 9, seed=5)
     params = mi.traverse(of)
     tensors = {name: params[f"integrator.{name}"] for name in other}

@@ -59,7 +59,7 @@ def test_a_batch_is_its_sensors_side_by_side() -> None:
         dr.enable_grad(params[key])
         dr.backward(dr.sum(mi.render(of, params), axis=None))
         slopes.append(dr.grad(params[key]).numpy())
-    np.testing.assert_allclose(*slopes, rtol=1e-5)
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-5)
     assert slopes[0] != 0
 
 
