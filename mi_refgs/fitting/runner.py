@@ -178,11 +178,7 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Traine
 
 
 def begin(
-    method: Method,
-    views: Dataset,
-    run: Run,
-    tell: Tell = lambda _: None,
-    warn: Tell = lambda _: None,
+    method: Method, views: Dataset, run: Run, tell: Tell = lambda _: None, warn: Tell = lambda _: None
 ) -> Trainer:
     """Create a trainer that writes into `run`, from its newest checkpoint if the folder contains a run.
 
