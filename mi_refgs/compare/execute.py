@@ -101,9 +101,7 @@ def threads_each(workers: int, threads: int | None) -> int | None:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not 1 <= workers <= 4 * cores:
         raise InputError(f"{workers} is out of range", "--workers", remedy=f"give 1 to {4 * cores}")
-    if threads is not None or workers == 1:
-        return threads
-    return max(cores // workers, 1)
+    return threads if threads is not None or workers == 1 else max(cores // workers, 1)
 
 
 # ---------- dask.distributed ----------
@@ -137,8 +135,8 @@ def run_on_cluster(jobs: Sequence[Job], address: str, report: Report) -> None:
                         if failure is None:
                             report(job, future.result())
                             continue
-                        reason = str(failure).splitlines()[0]
-                        reason = f"the cluster gave it up: {type(failure).__name__}: {reason}"
+                        first = str(failure).splitlines()[0]
+                        reason = f"the cluster gave it up: {type(failure).__name__}: {first}"
                         job.run.write_json(FAILED, {"reason": reason})
                         report(job, reason)
                     release()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
@@ -92,27 +93,24 @@ def plan(
 ) -> list[Job]:
     """Plan and check the jobs of a comparison; seeds vary slowest. Raises InputError for data without test
     views, methods that do not load, equal names, and existing runs with other settings."""
-    _unique((absolute(path).name for path in data), "DATA", "give the folders different names")
-    _unique((Path(method).stem for method in methods), "--methods", "name each once")
-    _unique((str(seed) for seed in seeds), "--seeds", "give each once")
+    for option, names, remedy in (
+        ("DATA", [absolute(path).name for path in data], "give the folders different names"),
+        ("--methods", [Path(method).stem for method in methods], "name each once"),
+        ("--seeds", [str(seed) for seed in seeds], "give each once"),
+    ):
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"'{twice[0]}' is given twice", option, remedy=remedy)
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
             remedy = f"give whole numbers from 0 to {MAX_SEED}"
             raise InputError(f"{seed} is out of range", "--seeds", remedy=remedy)
     if any(setting.partition("=")[0].strip() == "seed" for setting in shared.settings):
         raise InputError("a comparison takes its seeds from --seeds", "--set", "seed", "drop it here")
-    jobs = [
-        Job(
-            folder=str(folder.resolve() / RUNS / absolute(path).name / Path(variant).stem / f"seed{seed}"),
-            data=str(absolute(path)),
-            variant=str(Path(variant).resolve()) if variant.endswith(".toml") else variant,
-            seed=seed,
-            **vars(shared),
-        )
-        for seed in seeds
-        for path in data
-        for variant in methods
-    ]
+    jobs = []
+    for seed, path, method in itertools.product(seeds, map(absolute, data), methods):
+        run = folder.resolve() / RUNS / path.name / Path(method).stem / f"seed{seed}"
+        variant = str(Path(method).resolve()) if method.endswith(".toml") else method
+        jobs.append(Job(str(run), str(path), variant, seed, **vars(shared)))
     require_settings(folder, shared)
     _require_test_views(folder, jobs)
     for job in jobs:
@@ -198,13 +196,9 @@ def finished(job: Job) -> bool:
     run = job.run
     if not run.exists() or not (saved := run.checkpoints()):
         return False
-    metrics = read_metrics(run)
-    last = run.method().iterations
-    return (
-        metrics is not None
-        and metrics.get("iterations") == last == int(saved[-1].stem)
-        and metrics.get("dataset") == job.data
-    )
+    metrics, last = read_metrics(run) or {}, run.method().iterations
+    evaluated = metrics.get("iterations") == last == int(saved[-1].stem)
+    return evaluated and metrics.get("dataset") == job.data
 
 
 def jobs_in(folder: Path) -> list[Job]:
@@ -215,11 +209,3 @@ def jobs_in(folder: Path) -> list[Job]:
 def absolute(path: Path) -> Path:
     """Return an absolute path without dots; a link keeps its own name."""
     return Path(os.path.abspath(path))
-
-
-def _unique(names: Iterable[str], option: str, remedy: str) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise InputError(f"'{name}' is given twice", option, remedy=remedy)
-        seen.add(name)

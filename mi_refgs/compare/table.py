@@ -166,7 +166,7 @@ def markdown(table: Table) -> str:
     lines: list[str] = []
     for scene in table.scenes:
         columns = columns_of(scene)
-        titles = ["method", *map(header, columns)]
+        titles = ["method", *(f"{c.title} ({c.unit.strip()})" if c.unit else c.title for c in columns)]
         body = [[label(row), *(cell(c, row.numbers.get(c.key)) for c in columns)] for row in scene.rows]
         lines += [f"### {heading(scene)}", "", *aligned(titles, body), ""]
         lines += [f"{remark}\n" for remark in remarks(scene)]
@@ -183,11 +183,9 @@ def markdown(table: Table) -> str:
 
 def heading(scene: Scene) -> str:
     """Return the name of the scene, and the images over which its numbers are means."""
-    if not scene.image_size:
-        return scene.name
-    width, height = scene.image_size
     scale = f", downscaled by {scene.downscale}" if scene.downscale not in (None, 1) else ""
-    return f"{scene.name} ({scene.test_views} test views of {width} × {height} pixels{scale})"
+    size = " × ".join(map(str, scene.image_size))
+    return f"{scene.name} ({scene.test_views} test views of {size} pixels{scale})" if size else scene.name
 
 
 def remarks(scene: Scene) -> list[str]:
@@ -207,11 +205,6 @@ def remarks(scene: Scene) -> list[str]:
 def columns_of(scene: Scene) -> list[Score]:
     """Return the columns in which at least one row has a number."""
     return [column for column in COLUMNS if any(row.numbers.get(column.key) for row in scene.rows)]
-
-
-def header(column: Score) -> str:
-    """Return the title of a column with its unit."""
-    return f"{column.title} ({column.unit.strip()})" if column.unit else column.title
 
 
 def cell(column: Score, number: Statistic | None) -> str:
@@ -234,8 +227,7 @@ def aligned(titles: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
     rule = [f":{'-' * (w - 1)}" if i == 0 else f"{'-' * (w - 1)}:" for i, w in enumerate(widths)]
 
     def line(cells: Sequence[str]) -> str:
-        first, *others = zip(cells, widths, strict=True)
-        padded = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]
-        return f"| {' | '.join(padded)} |"
+        padded = [text.rjust(width) for text, width in zip(cells, widths, strict=True)]
+        return f"| {' | '.join([cells[0].ljust(widths[0]), *padded[1:]])} |"
 
     return [line(titles), line(rule), *map(line, body)]

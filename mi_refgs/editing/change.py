@@ -18,8 +18,9 @@ from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
 ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(.*)", re.ASCII)
-COLOUR_FLOOR = 1e-3
-"""Colour below which a surfel's SH of higher degrees are set to 0 by a new colour instead of scaled."""
+COLOUR_FLOOR = (
+    1e-3  # below it, a new colour sets a surfel's SH of higher degrees to 0 instead of scaling them
+)
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,7 @@ class Assignment:
 
 
 def assignments(given: Assignments) -> tuple[Assignment, ...]:
-    """Parse texts as on the command line, or numbers by name such as {"albedo": (0.9, 0.6, 0.2)}.
-
-    Raises InputError for anything else.
-    """
+    """Parse texts as on the command line, or numbers by name; raises InputError for anything else."""
     if isinstance(given, Mapping):
         lists = {name: ",".join(map(str, np.atleast_1d(value).tolist())) for name, value in given.items()}
         given = [f"{name}={values}" for name, values in lists.items()]
@@ -62,11 +60,8 @@ def apply(
     made: Sequence[Assignment] = (),
     cut: bool = False,
 ) -> TrainedScene:
-    """Return the scene with the chosen surfels changed, or `cut`, and their triangles.
-
-    All other surfels keep their values bit for bit, and the order stays. Raises InputError for values that
-    cannot be set, for a cut of what is set, and if no surfel would be left.
-    """
+    """Return the scene with the chosen surfels changed, or `cut`, and their triangles; others stay exactly.
+    Raises InputError for values that cannot be set, a cut of what is set, and if no surfel would be left."""
     if cut and made:
         raise InputError("what is removed cannot be changed, too", "--cut", remedy="leave the rest out")
     if cut and chosen.all():
@@ -85,13 +80,8 @@ def apply(
     return replace(scene, surfels=Surfels.from_numpy(raw), mesh=mesh)
 
 
-def _mesh(
-    scene: TrainedScene,
-    chosen: np.ndarray,  # (N,) bool
-    opacity: np.ndarray,  # (chosen, 1) raw, after the change
-    cut: bool,
-) -> Mesh | None:
-    """Return the mesh after a change: triangles whose surfels are removed or have become transparent go."""
+def _mesh(scene: TrainedScene, chosen: np.ndarray, opacity: np.ndarray, cut: bool) -> Mesh | None:
+    """Return the mesh without the triangles of surfels (N,) bool that are cut, or of such raw opacity now."""
     mesh, before = scene.mesh, scene.surfels.to_numpy()["opacity"]
     stays = np.array_equal(before[chosen], opacity) and not cut
     if mesh is None or not len(mesh.faces) or stays:
@@ -105,13 +95,8 @@ def _mesh(
     return mesh.part(~theirs | (owners.share(after) >= MAJORITY))
 
 
-def _assign(
-    values: SurfelValues,
-    own: dict[str, np.ndarray],  # raw attributes (chosen, D), changed in place
-    assignment: Assignment,
-) -> None:
-    """Set attributes of the chosen surfels; raises InputError for what cannot be set."""
-    # What is set: an attribute or the colour, and its columns.
+def _assign(values: SurfelValues, own: dict[str, np.ndarray], assignment: Assignment) -> None:
+    """Set raw attributes (chosen, D) of the chosen surfels; raises InputError for what cannot be set."""
     name, given = assignment.name, np.array(assignment.values)
     if name not in values.settable:
         what = f"{abbreviated(name)} cannot be set of these surfels"

@@ -25,11 +25,8 @@ class Edited:
 
 
 def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
-    """Change surfels of a scene.
-
-    `materials` keeps the background and the near field of the light: the light stays that of the photographs.
-    Raises InputError for bad values, an unknown option, an empty selection, and if there is nothing to do.
-    """
+    """Change surfels of a scene; with `materials`, the light stays that of the photographs. Raises InputError
+    for bad values, an unknown option, an empty selection, and if there is nothing to do."""
     known = EditOptions.__annotations__
     for name in options.keys() - known:
         raise InputError("unknown option", "edit", name, f"use some of {', '.join(known)}")
@@ -37,7 +34,7 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
     selection = Selection(**{f.name: given.pop(f.name) for f in fields(Selection) if f.name in given})
     made = assignments(given.get("set", ()))
     change = Change(**given | {"set": tuple(assignment.text for assignment in made)})
-    if change.is_empty:
+    if not (change.materials or change.set or change.cut):
         raise InputError("nothing to do", "edit", remedy="give --set, --cut or another change")
     if change.materials:
         scene = replace(relightable(scene), surroundings=scene.surroundings, near=scene.near)
@@ -45,18 +42,10 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
     notes = notes_of(scene, made, change.cut)
     changed = apply(scene, chosen, made, change.cut)
     counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}
-    return Edited(changed, tuple(notes), {**_recorded(selection, change), **counts, "notes": notes})
-
-
-def _recorded(*parts: Selection | Change) -> dict[str, Any]:
-    """Return the options that differ from their defaults, as JSON values."""
-    found = {}
-    for part in parts:
-        for field in fields(part):
-            text = json.dumps(getattr(part, field.name), default=lambda x: x.tolist())
-            if (plain := json.loads(text)) and plain != field.default:
-                found[field.name] = plain
-    return found
+    used = {name: value for name, value in (vars(selection) | vars(change)).items() if value is not None}
+    record = json.loads(json.dumps(used, default=lambda x: x.tolist()))  # arrays and tuples as lists
+    record = {name: value for name, value in record.items() if value}
+    return Edited(changed, tuple(notes), {**record, **counts, "notes": notes})
 
 
 def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list[str]:
@@ -66,12 +55,8 @@ def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list
     indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
     read = {*shading.required_attributes, *surfels.primitive.widths}
     read |= {"indirect_sh"} if indirect else set()
-    notes = [
-        f"{name}: no image of this run depends on it "
-        f"(its shading is {shading.reflectance}, {shading.diffuse})"
-        for name in names
-        if ("radiance_sh" if name == COLOUR else name) not in read
-    ]
+    why = f"no image of this run depends on it (its shading is {shading.reflectance}, {shading.diffuse})"
+    notes = [f"{n}: {why}" for n in names if ("radiance_sh" if n == COLOUR else n) not in read]
     lit = shading.model.light != "none" and "radiance_sh" in read
     has_materials = not lacking(scene)
     convert = "; --materials computes an albedo instead" if has_materials and lit else ""

@@ -46,18 +46,9 @@ class Change:
     cut: Flag = False
     """remove the selection; with --invert everything else"""
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether it changes nothing."""
-        return not (self.materials or self.set or self.cut)
-
 
 class EditOptions(TypedDict, total=False):
-    """Keywords of `Reconstruction.edit`, described by `Selection` and `Change` of `mi_refgs.editing.options`.
-
-    The surfels that meet every given condition are selected, without a condition all of them. Changes are
-    applied in the order of `Change`.
-    """
+    """Keywords of `Reconstruction.edit`: those of `Selection` and of `Change`, applied in its order."""
 
     where: str | None
     box: Sequence[float] | None  # (6,)

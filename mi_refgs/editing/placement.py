@@ -1,9 +1,4 @@
-"""Triangles that belong to surfels: each follows the surfels around it.
-
-A mesh extracted again would lose what no view sees, and would need the views. A triangle whose surfels are
-removed casts no shadow and appears in no reflection; where an object is cut, its mesh is open, as the surfels
-are.
-"""
+"""Triangles that belong to surfels: a new mesh would need views, and lose what none sees."""
 
 from __future__ import annotations
 
@@ -13,11 +8,8 @@ from scipy.spatial import cKDTree
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import sigmoid
 
-NEIGHBOURS = 8
-"""Surfels around the middle of a triangle that decide about it: as many as give a vertex its materials."""
-MAJORITY = 0.5
-"""Share of their opacity."""
-TINY = np.finfo(np.float64).tiny
+NEIGHBOURS = 8  # surfels around the middle of a triangle that decide about it
+MAJORITY = 0.5  # share of their opacity
 
 
 class Owners:
@@ -35,7 +27,7 @@ class Owners:
         near = np.arange(1, min(NEIGHBOURS, len(position)) + 1)
         _, self.surfel = cKDTree(position).query(scene.mesh.vertices[scene.mesh.faces].mean(axis=1), k=near)
         self.opacity = sigmoid(opacity[:, 0])
-        self.total = np.maximum(self.opacity[self.surfel].sum(axis=1), TINY)
+        self.total = np.maximum(self.opacity[self.surfel].sum(axis=1), np.finfo(float).tiny)
 
     def share(self, opacity: np.ndarray) -> np.ndarray:
         """Return the part (F,) of the opacity around each triangle that new opacities (N,) leave."""

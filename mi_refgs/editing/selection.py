@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,17 +15,12 @@ from mi_refgs.runs.relightable import outward
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import ATTRIBUTES, SH_DC, sigmoid
 
-COLOUR = "colour"
-"""The SH term of degree 0 of radiance_sh, ½ + c Y₀: linear radiance."""
+COLOUR = "colour"  # the SH term of degree 0 of radiance_sh, ½ + c Y₀: linear radiance
 AXES = "xyz"
 NORMALS = [f"normal.{axis}" for axis in AXES]
 COMPARISON = re.compile(r"\s*([A-Za-z_][\w.]*)\s*([<>]=?)\s*(\S+)\s*", re.ASCII)
-OPERATORS: dict[str, Callable[..., Any]] = {
-    "<": np.less,
-    "<=": np.less_equal,
-    ">": np.greater,
-    ">=": np.greater_equal,
-}
+OPERATORS: dict[str, Callable[..., Any]]
+OPERATORS = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
 Condition = list[list[tuple[str, str, float]]]
 """Groups of comparisons: those of at least one group are all true."""
 
@@ -56,9 +51,8 @@ def activated(name: str, raw: dict[str, np.ndarray]) -> np.ndarray:
 class SurfelValues:
     """The activated attributes of a scene's surfels, (N,) float64 by name, computed when they are read.
 
-    Names: single columns, such as `roughness`, `albedo.r`, `position.x` or `x`; `colour.r` … `.b` (COLOUR);
-    `size`, the largest standard deviation (scene units); and `normal.x` … `.z`, outwards as in
-    `runs.relightable.outward`.
+    Names: single columns, such as `roughness`, `albedo.r` or `x`; `colour.r` … `.b` (COLOUR); `size`, the
+    largest standard deviation (scene units); and `normal.x` … `.z`, outwards.
     """
 
     def __init__(self, scene: TrainedScene) -> None:
@@ -82,9 +76,8 @@ class SurfelValues:
     @property
     def settable(self) -> list[str]:
         """The names that can be given other values, of all columns of an attribute or of one."""
-        return [
-            n for n, (of, _) in self.columns.items() if of == COLOUR or ATTRIBUTES[of].activation == "sigmoid"
-        ]
+        bounded = {COLOUR} | {n for n, one in ATTRIBUTES.items() if one.activation == "sigmoid"}
+        return [name for name, (of, _) in self.columns.items() if of in bounded]
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the values (N,) of a name; raises InputError for an unknown one."""
@@ -112,22 +105,17 @@ def select(scene: TrainedScene, selection: Selection) -> np.ndarray:
     if selection.where is not None:
         chosen &= SurfelValues(scene).where(parse_condition(selection.where))
     if selection.box is not None:
-        corners = _finite_corners(selection.box)
+        try:
+            corners = np.asarray(selection.box, dtype=np.float64)
+        except (ValueError, TypeError):
+            corners = np.zeros(0)
+        if corners.shape != (6,) or not (np.abs(corners) <= MAX_NUMBER).all():
+            what = f"6 finite numbers are needed, none beyond {MAX_NUMBER:g}"
+            raise InputError(what, "--box", remedy="give them")
+        corners = corners.reshape(2, 3)
         position = scene.surfels.to_numpy()["position"].astype(np.float64)
         chosen &= np.all((position >= corners.min(0)) & (position <= corners.max(0)), axis=1)
     chosen = ~chosen if selection.invert else chosen
     if not chosen.any():
         raise InputError(f"none of the {count} surfels is in it", "selection", remedy="choose a wider one")
     return chosen
-
-
-def _finite_corners(numbers: Sequence[float]) -> np.ndarray:
-    """Return two corners (2, 3) float64 from six numbers; raises InputError for anything else."""
-    try:
-        found = np.asarray(numbers, dtype=np.float64)
-    except (ValueError, TypeError):
-        found = np.zeros(0)
-    if found.shape != (6,) or not (np.abs(found) <= MAX_NUMBER).all():
-        what = f"6 finite numbers are needed, none beyond {MAX_NUMBER:g}"
-        raise InputError(what, "--box", remedy="give them")
-    return found.reshape(2, 3)

@@ -45,6 +45,7 @@ class Decision(Event[Trainer]):
 
     outside: ClassVar[bool] = True
     validates: ClassVar[bool] = True  # by views that are held out
+    gain: ClassVar[float]  # dB on validation views from which a component stays
 
     def components(self) -> Sequence[str]:
         """The components, in the order in which they are decided."""
@@ -58,6 +59,34 @@ class Decision(Event[Trainer]):
         """The components that are not decided yet."""
         decided = {row["component"] for row in decisions}
         return [name for name in self.components() if name not in decided]
+
+    def begin(self, rival: Trainer) -> str:
+        """Prepare the fork of a fit that has a component; returns why there is nothing to try, if so."""
+        return ""
+
+    def decide(self, trainer: Trainer, steps: int) -> None:
+        """Decide about the next component by continuing the fit with and without it for some steps."""
+        began = time.perf_counter()
+        conclude(trainer, self._tried(trainer, self.pending(trainer.fit.decisions)[0], steps), began)
+
+    def _tried(self, trainer: Trainer, component: str, steps: int) -> Row:
+        begin = trainer.iteration
+        if begin + steps > trainer.method.iterations:
+            return Row(component, begin, False, "too late in the fit")
+        try:
+            rival = fork(trainer, self.chosen(trainer.method, component))
+            if reason := self.begin(rival):
+                return Row(component, begin, False, reason)
+            better = validation_psnr(run(rival, steps, trainer))
+        except InputError as error:
+            return Row(component, begin, False, f"its fit failed: {error}")
+        plain = run(fork(trainer, trainer.method), steps, trainer)
+        psnr = validation_psnr(plain)
+        gained = better - psnr
+        chosen = rival if gained >= self.gain else plain
+        trainer.take(chosen, chosen.method)
+        reason = f"{gained:+.2f} dB on validation views, {self.gain:+.2f} dB required"
+        return Row(component, begin, bool(gained >= self.gain), reason, psnr, better)
 
 
 def waiting(trainer: Trainer) -> list[str]:
@@ -147,22 +176,6 @@ def run(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
         trainer.step()
         of.release()
     return trainer
-
-
-def tried(trainer: Trainer, component: str, rival: Trainer, steps: int, gain: float) -> Row:
-    """Continue copies of a fit and of a rival, which stays if its validation PSNR is `gain` dB higher."""
-    begin = trainer.iteration
-    try:
-        better = validation_psnr(run(rival, steps, trainer))
-    except InputError as error:
-        return Row(component, begin, False, f"its fit failed: {error}")
-    plain = run(fork(trainer, trainer.method), steps, trainer)
-    psnr = validation_psnr(plain)
-    gained = better - psnr
-    chosen = rival if gained >= gain else plain
-    trainer.take(chosen, chosen.method)
-    reason = f"{gained:+.2f} dB on validation views, {gain:+.2f} dB required"
-    return Row(component, begin, bool(gained >= gain), reason, psnr, better)
 
 
 def validation_psnr(trainer: Trainer) -> float:

@@ -18,9 +18,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
 
-REACH = 2.0
-"""Standard deviations to which a surfel extends: one that extends through the plane below the object is the
-table's. Against the jug's mask of *tabletop*, the object has an IoU of 0.90 by centres, 0.96 with 2."""
+REACH = 2.0  # deviations to which a surfel extends: one through the plane below the object is the table's
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 

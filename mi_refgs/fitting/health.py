@@ -20,7 +20,6 @@ from mi_refgs.surfels.table import Surfels
 
 CULL_SHARE = 0.1  # fraction of the surfels from which on they are not the cause: a pixel has tens
 PATIENCE = 3  # log intervals in which every step fails before the fit ends: removing surfels may help first
-NAMED = 5  # surfels that a message names
 
 
 @dataclass
@@ -33,10 +32,7 @@ class Health:
 
     def check(self, setup: FitSetup, state: FitState) -> str | None:
         """Remove the surfels that made steps fail since the last check; returns a sentence about it, if any.
-
-        Raises InputError if the light is not finite, if no surfel is left, or if nothing helps. Waits for the
-        device.
-        """
+        Raises InputError if the light is not finite, if no surfel is left, or if nothing helps."""
         skipped, steps = state.optimiser.report(), state.iteration - self.checked
         self.checked, self.skipped = state.iteration, self.skipped + skipped.count
         self.failed = self.failed + steps if skipped.count >= steps else 0
@@ -82,5 +78,5 @@ def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str
     indices = together(rows)
     if not len(indices):
         return f"{where}{channels} not finite; {skipped.count} steps were left out"
-    named = ", ".join(map(str, indices[:NAMED])) + (" …" if len(indices) > NAMED else "")
+    named = ", ".join(map(str, indices[:5])) + (" …" if len(indices) > 5 else "")
     return f"{where}{channels} not finite at surfels {named}: {len(indices)} were removed"

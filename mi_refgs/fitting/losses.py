@@ -22,17 +22,13 @@ from mi_refgs.types import Bool, Color3f, Float, TensorXf, Vector3f
 SATURATED = 254.5 / 255.0  # from here up, 8-bit values are clipped: 255 means "at least this bright"
 CLIPPED = 0.9  # linear radiance from which a photograph may be clipped: the light may be brighter, not darker
 HUE = 0.3  # weight of the colour of light that no photograph shows
-DIRECTIONS = 256  # directions in which irradiance is sampled, 13° apart
 
 
 def saturated(
     target: Iterable[Float], alpha: Float | None = None, background: Iterable[float] = (0, 0, 0)
 ) -> list[Bool]:
-    """Masks (mi.Bool planes) of where the object's own colour is clipped in a display-encoded target.
-
-    That is (target - (1 - A) background) / A ≥ 254.5/255, and A > 0: a white background is no highlight.
-    Without `alpha`, every pixel is the object's.
-    """
+    """Masks (mi.Bool planes) of where the object's own colour is clipped in a display-encoded target:
+    (target - (1 - A) background) / A ≥ 254.5/255, and A > 0; without `alpha`, every pixel is the object's."""
     if alpha is None:
         return [plane >= SATURATED for plane in target]
     return [
@@ -121,20 +117,14 @@ def sobel(plane: Float, width: int, height: int) -> tuple[Float, Float]:
 
 
 def half_metal(metallic: Float, alpha: Float) -> Float:
-    """Mean over all pixels of A m (1 - m), with A detached: 0 if every surface is either metal or dielectric.
-
-    Values in between explain the images under lights of any colour.
-    """
+    """Mean over all pixels of A m (1 - m), with A detached: 0 if every surface is metal or dielectric."""
     return _mean(dr.detach(alpha) * metallic * (1 - metallic))
 
 
 def light_colour(light: Light) -> Float:
-    """Colour of the irradiance: mean of |E - grey E| over the mean of E, in DIRECTIONS all around.
-
-    Images determine only the product of light and albedo per channel: this prior leaves colour to the albedo.
-    """
-    index = dr.arange(mi.Float, DIRECTIONS)
-    height = 1 - (index + 0.5) * (2 / DIRECTIONS)
+    """Colour of the irradiance: mean of |E - grey E| over the mean of E, in 256 directions all around."""
+    index = dr.arange(mi.Float, 256)
+    height = 1 - (index + 0.5) * (2 / 256)
     sin, cos = dr.sincos(index * GOLDEN_ANGLE)
     ring = dr.sqrt(1 - dr.square(height))
     irradiance = light.irradiance(mi.Vector3f(ring * cos, ring * sin, height))

@@ -60,10 +60,6 @@ class LossInputs:
         return LossInputs(frame, image, target, light, log_gain, photographed)
 
 
-def _l1(inputs: LossInputs) -> Float:
-    return losses.l1(inputs.image, inputs.target.image)
-
-
 def _gain(inputs: LossInputs) -> Float | None:
     squares = [dr.square(value) for value in inputs.log_gain or ()]
     return squares[0] + squares[1] + squares[2] if squares else None
@@ -99,29 +95,26 @@ def _materials(inputs: LossInputs) -> Float | None:
     return losses.smoothness(maps, inputs.target.image, camera.width, camera.height, MATERIAL_EDGE)
 
 
-def _light_colour(inputs: LossInputs) -> Float | None:
-    return None if inputs.light is None else losses.light_colour(inputs.light)
-
-
 def _alpha(inputs: LossInputs) -> Float | None:
     mask = inputs.target.alpha
     return None if mask is None else losses.alpha_loss(inputs.frame.alpha, mask)
 
 
 def _photographed(inputs: LossInputs) -> Float | None:
-    if inputs.light is None or inputs.photographed is None:
-        return None
-    return inputs.photographed.difference(inputs.light)
+    known, light = inputs.photographed, inputs.light
+    return None if known is None or light is None else known.difference(light)
 
 
-register(Loss("l1", _l1))
+register(Loss("l1", lambda of: losses.l1(of.image, of.target.image)))
 register(Loss("gain", _gain))
 register(Loss("ssim", _ssim))
 register(Loss("normal", _normal, normals=True))
 register(Loss("smooth", _smooth, normals=True))
 register(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
 register(Loss("materials", _materials, maps=True, attributes=MATERIALS))
-register(Loss("light_colour", _light_colour, light=True))
+register(
+    Loss("light_colour", lambda of: None if of.light is None else losses.light_colour(of.light), light=True)
+)
 register(Loss("photographed", _photographed, light=True))
 register(Loss("alpha", _alpha))
 
@@ -143,10 +136,8 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
     loss = None
     for name, registered in LOSSES.items():
         if name in factors and (value := registered.value(inputs)) is not None:
-            if dr.width(value) != 1:
-                raise InputError(
-                    f"has {dr.width(value)} values", f"loss.{name}", remedy="reduce it, as with dr.mean"
-                )
+            if (width := dr.width(value)) != 1:
+                raise InputError(f"has {width} values", f"loss.{name}", remedy="reduce it, as with dr.mean")
             value = factors[name] * value
             loss = value if loss is None else loss + value
     if loss is None:

@@ -7,9 +7,7 @@ Letters: θ parameter, g gradient, m v first and second moment, t step count of 
 Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, and
 the host reads later (`Adam.report`) how many there were and which rows had such gradients. And |g| is cut to
 OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is more, and
-to RAW_LIMIT, whose square float32 can represent. The cut bounds the memory of v: after a gradient of 10¹⁰, an
-entry of usual gradients 10⁻⁷ would not move for 71,000 steps; cut, it moves 3 to 10 times slower. It shortens
-the present step by less than 5 %.
+to RAW_LIMIT, whose square float32 can represent: else v would stop an entry after one huge gradient.
 """
 
 from __future__ import annotations
@@ -33,7 +31,6 @@ from mi_refgs.types import Bool, Float, TensorXf, UInt32
 BETA_1, BETA_2 = 0.9, 0.999
 EPSILON = 1e-15  # as in 3DGS: tiny, as per-surfel gradients of a pixel mean are about 1e-7
 OUTLIER = 100.0  # gradients beyond this many times the usual are cut; see above
-SAMPLES = 10_000  # entries that a median is computed from
 WIDE_ROW = 64  # columns beyond which rows are not distinguished: SH have 48, a row of the light hundreds
 WORD = 32  # tensors whose bits fit one integer of the marks
 MEMORY = 4096  # steps that `report` may come late
@@ -113,10 +110,7 @@ class Skips:
         return rows if width <= WIDE_ROW else 1
 
     def _not_finite(self, gradients: Mapping[str, Float]) -> list[Bool]:
-        """Masks of what is not finite, by rows or by entries; rows are marked with the bit of each group.
-
-        Only head columns are tested: the gradient of the other SH columns is theirs times a bounded function.
-        """
+        """Masks of what is not finite, by rows or by entries; rows are marked with the bit of each group."""
         by_entry: list[Bool] = []
         by_row: dict[tuple[int, int], UInt32] = {}
         for i, name in enumerate(self._groups):
@@ -132,6 +126,7 @@ class Skips:
                 continue
             width = dr.width(g) // rows
             first = dr.arange(mi.UInt32, rows) * width
+            # The gradient of SH columns beyond the head is that of the head times a bounded function.
             columns = [dr.gather(mi.Float, g, first + c) for c in range(self._groups[name].head or width)]
             found = dr.select(reduce(operator.and_, map(dr.isfinite, columns)), mi.UInt32(0), bit)
             by_row[key] = by_row.get(key, mi.UInt32(0)) | found
@@ -215,8 +210,12 @@ class Adam:
             θ = dr.detach(self.params[name].array)
             if group.relative:
                 η = η * dr.maximum(θ, 1)
-            if group.centre is not None:
-                η = η * _distance(θ, group.centre) / dr.opaque(mi.Float, group.unit)
+            if group.centre is not None:  # the distance of each entry's row
+                row = dr.arange(mi.UInt32, dr.width(θ)) // 3 * 3
+                offset = (
+                    dr.gather(mi.Float, θ, row + k) - dr.opaque(mi.Float, group.centre[k]) for k in range(3)
+                )
+                η = η * dr.norm(mi.Vector3f(*offset)) / dr.opaque(mi.Float, group.unit)
             updated[name] = (dr.select(good, θ - η * m / (dr.sqrt(v) + EPSILON), θ), shape)
             self._first[name] = dr.select(good, m, self._first[name])
             self._second[name] = dr.select(good, v, self._second[name])
@@ -229,10 +228,7 @@ class Adam:
             self._make_leaf(name)
 
     def _cut(self, name: str, g: Float, t: int, inverse: Float) -> Float:
-        """The gradient of step t, without unit, cut where it is far beyond the usual, 0 where not finite.
-
-        `inverse` is 1 / (1 - β₂ᵗ⁻¹), width 1.
-        """
+        """The gradient of step t, without unit, cut, 0 where not finite; `inverse` is 1 / (1 - β₂ᵗ⁻¹)."""
         if self.groups[name].unit != 1:
             g = g * dr.opaque(mi.Float, self.groups[name].unit)
         if t & (t - 1) == 0:  # at steps 1, 2, 4, …, since it waits for the device
@@ -305,15 +301,8 @@ class Adam:
         dr.enable_grad(self.params[name])
 
 
-def _distance(positions: Float, centre: tuple[float, float, float]) -> Float:
-    """The distance of each entry's row from a point, (3 N,)."""
-    first = dr.arange(mi.UInt32, dr.width(positions)) // 3 * 3
-    offset = (dr.gather(mi.Float, positions, first + k) - dr.opaque(mi.Float, centre[k]) for k in range(3))
-    return dr.norm(mi.Vector3f(*offset))
-
-
 def _median(values: Float) -> float:
-    """Median |x| of the finite entries that are not 0, of at most SAMPLES; 0 if there are none."""
-    x = np.abs(values.numpy()[:: max(dr.width(values) // SAMPLES, 1)])
+    """Median |x| of the finite entries that are not 0, of about 10,000; 0 if there are none."""
+    x = np.abs(values.numpy()[:: max(dr.width(values) // 10_000, 1)])
     x = x[(x > 0) & np.isfinite(x)]
     return float(np.median(x)) if len(x) else 0.0

@@ -46,10 +46,7 @@ class PhotographedLight:
     def of(
         surfels: Surfels, surroundings: Surroundings, region: Region, views: Sequence[View], height: int
     ) -> PhotographedLight:
-        """Render the background from the region's centre, with `height` rows.
-
-        A texel counts if views show the surface there: it is in their image, and nothing is in front.
-        """
+        """Render the background from the region's centre, with `height` rows; what views show counts."""
         centre, radius = np.array(region.centre), region.radius
         seen = panorama(surroundings, centre, height, NEAR * radius)
         points = seen.points(FARTHEST * radius).reshape(-1, 3)
@@ -74,9 +71,7 @@ class PhotographedLight:
         shown = seen * area[..., None]
         mean = np.sum(shown * self.panorama.radiance, axis=(0, 1)) / max(shown.sum(), 1e-9)
         radiance = seen * self.panorama.radiance + (1 - seen) * mean
-        direction, colour = (
-            x.reshape(-1, 3).T.astype(np.float32) for x in (map_directions(height), radiance)
-        )
+        direction, colour = (x.reshape(-1, 3).T.astype("f4") for x in (map_directions(height), radiance))
         weight, size = (upload(x.astype(np.float32)) for x in (self.weight, area))
         return mi.Vector3f(direction), mi.Color3f(colour), weight, size
 
@@ -98,9 +93,6 @@ class PhotographedLight:
 def _shown(points: np.ndarray, view: View, depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Whether points (N, 3) are visible in a view, not hidden by what is in front of them: (N,) bool."""
     row, column, inside = view.project(points)
-    pixel = (
-        np.clip(np.rint(where), 0, size - 1).astype(int)
-        for where, size in ((row, view.height), (column, view.width))
-    )
+    pixel = (np.clip(np.rint(x), 0, n - 1).astype(int) for x, n in ((row, view.height), (column, view.width)))
     surface = np.where(alpha > SURFACE, depth, np.inf).reshape(view.height, view.width)
     return inside & (view.depth_of(points) <= BEHIND * surface[tuple(pixel)])

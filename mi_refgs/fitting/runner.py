@@ -121,11 +121,7 @@ def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, pro
 
 
 def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> tuple[Method, Dataset]:
-    """The method of a new fit, with the size of images decided, and the training views.
-
-    Without a name, images without alpha have `about.without_alpha` of the method. Raises InputError for an
-    unknown name or setting, and for bad data.
-    """
+    """The method of a new fit, with the size of images decided, and the training views; raises InputError."""
     if isinstance(choice.method, Method):
         return sized(choice.method, data, say)
     if choice.method is not None:
@@ -142,7 +138,7 @@ def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> 
 
 
 def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:
-    """The name of the method for a purpose: for images without alpha, `about.without_alpha`."""
+    """The name of the method, for images without alpha its `about.without_alpha`."""
     return name if views.has_alpha or views.region is None else method.about.without_alpha or name
 
 
@@ -151,7 +147,11 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Traine
     output, resumed = run.path, run.exists()
     trainer = begin(method, views, run, progress.say, progress.warn)
     if resumed:
-        _record_data(run, views, progress)  # what cannot be resumed with it has been refused
+        # Commands that follow read the data set of the last fit.
+        before = run.dataset()
+        if before is not None and str(before.resolve()) != views.folder:
+            progress.warn(f"{output}: was fitted to {before.resolve()} before, now to {views.path}")
+            run.write_dataset(views.folder, run.region())
         progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
 
     progress.begin(trainer)
@@ -182,9 +182,8 @@ def begin(
 ) -> Trainer:
     """Create a trainer that writes into `run`, from its newest checkpoint if the folder contains a run.
 
-    A new fit of photographs starts from the points of the data set and those of stereo. `tell` is called with
-    what is found and decided, `warn` with steps that failed. Raises InputError for cameras that are all in
-    one place, for damaged or missing checkpoints, and for a folder that cannot be written.
+    `tell` is called with what is found and decided, `warn` with steps that failed. Raises InputError for
+    cameras that are all in one place, damaged checkpoints, and a folder that cannot be written.
     """
     resumed = run.exists()
     views = with_region(views, run.region(), tell)
@@ -251,10 +250,7 @@ def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn
 
 
 def finish(trainer: Trainer, run: Run) -> str | None:
-    """Save the state if no checkpoint contains it, and write the artefacts; returns a warning, if any.
-
-    The camera of scene.xml is that of the first test view, or else of the first training view.
-    """
+    """Save the state if no checkpoint contains it, and write the artefacts; returns a warning, if any."""
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
         run.save_checkpoint(trainer.iteration, trainer.state())
     if trainer.fit.decisions:
@@ -300,20 +296,7 @@ def _require_same(run: Run, made: Method, choice: Choice, views: Dataset) -> Non
             name = _for_images(name, load_method(name, None), views)
         settings = methods.assignments(choice.settings) or made.assignments
         now = methods.load(name or made.file, choice.preset or made.preset or DEFAULT_PRESET, settings)
-    for key, (before, after) in sorted(
-        differences(run, now).items(), key=lambda item: item[0] not in ("name", "preset")
-    ):
-        raise InputError(
-            f"the run was started with {before}, and would now have {after}",
-            run.path / "config.toml",
-            key,
-            "drop what says so, or choose another -o",
-        )
-
-
-def _record_data(run: Run, data: Dataset, progress: Progress) -> None:
-    """Record another data set, with a warning: commands that follow read that of the last fit."""
-    before = run.dataset()
-    if before is not None and str(before.resolve()) != data.folder:
-        progress.warn(f"{run.path}: was fitted to {before.resolve()} before, now to {data.path}")
-        run.write_dataset(data.folder, run.region())
+    if found := differences(run, now):
+        key = min(found, key=lambda key: key not in ("name", "preset"))
+        what = "the run was started with {}, and would now have {}".format(*found[key])
+        raise InputError(what, run.path / "config.toml", key, "drop what says so, or choose another -o")

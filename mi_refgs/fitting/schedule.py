@@ -47,11 +47,9 @@ LEARNT_BESIDE = {
     LIGHT_ROTATION: (1e-2, 1e-4),
     LIGHT_SCALE: (1e-2, 1e-4),
 }
-"""Learning rates of log gains, of corrections, radians or half widths, and of the rotation, radians, and log
-scale of a known light, at the start and at the end."""
+"""Rates at start and end: of log gains, of radians or half widths, of radians and log scale of a light."""
 POSITION_STEPS, POSITION_FINAL = 0.6, 1.6e-6
-"""Fraction of the iterations after which positions learn at their final rate, scene extents per step: after
-30,000 of 50,000 in the released Ref-Gaussian code."""
+"""Share of the iterations until positions learn at their final rate, extents per step. [Ref-Gaussian]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +178,10 @@ class FitSetup:
 
 
 def learning_rates(
-    names: Iterable[str], extent: float, iterations: int, rates: Rates = DEFAULT_RATES
+    names: Iterable[str],
+    extent: float,
+    iterations: int,
+    rates: Rates = DEFAULT_RATES,
 ) -> dict[str, LearningRate]:
     """The rates at which attributes of surfels learn in a fit of so many iterations, by their names.
 

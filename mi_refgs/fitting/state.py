@@ -65,11 +65,7 @@ class TableEdit:
 
 @dataclass(eq=False)
 class ParameterTable:
-    """One set of surfels as parameters: edits of its rows, which moments and statistics follow.
-
-    In a loop of one's own: `observe` adds a score of the surfels after each step, and `apply` takes what
-    `densify_and_prune` returns; `clear` then sets the scores to zero.
-    """
+    """One set of surfels as parameters: edits of its rows, which moments and statistics follow."""
 
     params: MutableMapping[str, TensorXf]  # (N, D) each, also of others; this table's have the prefix
     optimiser: Adam
@@ -181,13 +177,11 @@ class FitState:
 
     def observe(self, error: Float) -> None:
         """Add the squared error of a step, by responsible surfel, the object's first, to the statistics."""
-        if len(self.tables) == 1:
-            self.tables[0].observe(error)
-            return
         begin = mi.UInt32(0)
         for table in self.tables:
             count = dr.width(table.error_sum)
-            table.observe(dr.gather(mi.Float, error, dr.arange(mi.UInt32, count) + begin))
+            one = len(self.tables) == 1
+            table.observe(error if one else dr.gather(mi.Float, error, dr.arange(mi.UInt32, count) + begin))
             begin = dr.opaque(mi.UInt32, count)
 
     @property
@@ -207,7 +201,6 @@ class FitState:
 
     @property
     def near(self) -> NearField | None:
-        """Distances of what the environment map shows."""
         return None if self.photographed is None else self.photographed.near
 
     def shading(self, stage: Stage) -> Shading:

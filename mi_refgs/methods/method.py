@@ -30,15 +30,8 @@ GAIN = "gain"  # log exposure gains of the training views
 POSE = "pose"  # corrections of their cameras
 PER_VIEW = (GAIN, POSE)  # parameters with a row per training view, which a fit may lack
 AROUND = "surroundings/"  # prefix of the background Gaussians' attributes
-APART = (
-    LIGHT,
-    LIGHT_ROTATION,
-    LIGHT_SCALE,
-    BACKGROUND,
-    *PER_VIEW,
-)  # parameters that are not attributes of surfels
+APART = (LIGHT, LIGHT_ROTATION, LIGHT_SCALE, BACKGROUND, *PER_VIEW)  # not attributes of surfels
 AT_ONCE = Window(0, 3, 1)  # one SH degree more in each of the first three iterations
-LEAST_CROP = 64 * 64  # pixels; SSIM compares windows of 11 × 11
 
 
 @dataclass(frozen=True)
@@ -213,7 +206,7 @@ class DataOptions:
     downscale: int | None = field(default=None, metadata=at_least(1))
     coarse: tuple[CoarseImages, ...] = ()  # downscaled images at the start of a fit
     # Pixels that a step renders at most, of a larger image; absent: all of it.
-    crop: int | None = field(default=None, metadata=at_least(LEAST_CROP))
+    crop: int | None = field(default=None, metadata=at_least(64 * 64))
 
     def block_at(self, iteration: int, pixels: int) -> int:
         """Pixels along a side that a (1-based) iteration averages into one, in an image of so many."""

@@ -120,15 +120,13 @@ def for_purpose(purpose: str) -> str:
     found = {_read(path).get("about", {}).get("purpose"): path.stem for path in files}
     if not purpose or purpose not in found:
         known = ", ".join(sorted(filter(None, found)))
-        raise InputError(
-            "no method is for that", "--for", purpose, f"use one of {known}, or choose a --method"
-        )
+        remedy = f"use one of {known}, or choose a --method"
+        raise InputError("no method is for that", "--for", purpose, remedy)
     return found[purpose]
 
 
 def differences(before: Method, now: Method) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys by which two resolved methods differ beside `about`, with both values, None for no such
-    key."""
+    """Dotted keys by which two resolved methods differ beside `about`, with both values, None for none."""
     left_out: dict[str, Any] = {"about": About(), "file": "", "assignments": (), "plugins": ()}
     first, second = (_flat(plain(replace(method, **left_out))) for method in (before, now))
     keys = sorted(first.keys() | second.keys())

@@ -23,8 +23,6 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
 
-PSNR_MEMORY = 0.9  # weight of the old value in the running PSNR of the bar
-
 
 def fit(
     data: str | Path | Dataset,
@@ -146,7 +144,7 @@ class ProgressBar(Previews):
         if trainer.iteration % trainer.method.log_every == 0:
             numbers = trainer.statistics()
             new = float(numbers["psnr"])
-            self.psnr = new if self.psnr is None else PSNR_MEMORY * self.psnr + (1 - PSNR_MEMORY) * new
+            self.psnr = new if self.psnr is None else 0.9 * self.psnr + 0.1 * new  # a running mean
             text = f"loss {numbers['loss']:.4f}, PSNR {self.psnr:.1f} dB, {numbers['surfels']} surfels"
             self.bar.set_postfix_str(text, refresh=False)
         super().step(trainer)

@@ -45,11 +45,9 @@ class Provenance:
 
     def with_data(self, folder: Path | None) -> Provenance:
         """Replace the data set, unless `folder` is None; raises InputError for a path that is no folder."""
-        if folder is None:
-            return self
-        if not folder.is_dir():
+        if folder is not None and not folder.is_dir():
             raise InputError("no such folder", folder, "--data", "give the folder of a data set")
-        return replace(self, data=folder)
+        return self if folder is None else replace(self, data=folder)
 
     @property
     def has_data(self) -> bool:
@@ -67,11 +65,7 @@ class Provenance:
         """Return the named cameras of some splits, without images; around the surfels without a data set."""
         if self.data is None or not self.has_data:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
-
-        def relative(path: Path) -> Path:
-            return Path(os.path.relpath(path, self.data))
-
-        shots = []
+        relative, shots = (lambda path: Path(os.path.relpath(path, self.data))), []
         for split in splits:
             data = read_views(self.method, self.data, split, truth=False)
             views, originals = with_poses(data, self.records.get(CAMERAS, {})).views, data.views
@@ -93,8 +87,9 @@ class Provenance:
     def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
         """Cameras on a circle around the object at the test views' distance; InputError below 1."""
         if count < 1:
-            remedy = "give a number of cameras from 1"
-            raise InputError(f"{count} is out of range", "turntable", remedy=remedy)
+            raise InputError(
+                f"{count} is out of range", "turntable", remedy="give a number of cameras from 1"
+            )
         cameras, region = [shot.camera for shot in self.shots(trained, "test")], None
         if trained.surroundings is not None:  # the mesh contains the background, too
             trained, region = replace(trained, mesh=None), self.region

@@ -36,17 +36,14 @@ from mi_refgs.runs.export import export
 from mi_refgs.runs.run import Run
 
 SHEET, RESULT = "sheet.png", "relight.json"
-SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
-SHEET_COLUMNS = 6  # most frames of a turntable per row of its sheet
+SHEET_VIEWS, SHEET_COLUMNS = 4, 6  # test views of a sheet, spread evenly; most frames of a turntable per row
 NO_TRUTH = "the data set has no test views under this light; make them with `refgs dataset --relight`"
 NO_DATA = "there is no data set, so cameras are around the object; name its folder with --data"
 FITTED_COLOUR = (
     "its diffuse part was fitted as a colour; albedo is that colour divided by the irradiance of the fitted "
     "light, with the errors of that light; `refgs train --for relighting` fits materials"
 )
-SCALE_REACH = 2.0  # stops around the ratio of the means within which the scale is searched
 INSIDE = 0.99  # alpha from which a pixel is inside the object: the coverage of edges does not depend on light
-SCALE_PIXELS = 200_000  # maximum number of pixels that the scale is fitted to
 
 
 def relight(
@@ -61,12 +58,10 @@ def relight(
 ) -> dict[str, Any]:
     """Render the scene of a run under another light into a folder; return the content of relight.json.
 
-    `out` is RUN/relight/NAME by default. Only materials stay (`runs.relightable`): diffuse light is the new
-    light's irradiance with the mesh's shadows and bounces; reflections are traced. The views are the test
-    views of the run's data set, or of `data`; with `turntable`, so many cameras on a circle instead; without
-    data both are around the object. Test views are compared with ground truth under this light
-    (`truth_under`), if any. Raises InputError for a run without light or materials, a light or a data set
-    that cannot be read, and a folder that cannot be written or has other files."""
+    `out` is RUN/relight/NAME by default. Only materials stay, as in `Reconstruction.relight`. The views are
+    test views of the run's data set, or of `data`, compared with ground truth under this light, if any; with
+    `turntable`, so many cameras on a circle; without data both are around the object. Raises InputError for a
+    run without light or materials, an unreadable light or data set, and a folder with other files."""
     # The views, and the ground truth under this light.
     fitted = load(run.path)
     fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
@@ -161,7 +156,7 @@ def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.
     displayed colours inside the object over all images; 1 for a channel that is black in either."""
     a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))
     inside = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
-    a, b = (x[inside[:: max(1, len(inside) // SCALE_PIXELS)]] for x in (a, b))
+    a, b = (x[inside[:: max(1, len(inside) // 200_000)]] for x in (a, b))
     scale = np.ones(3)
     for c in range(3):
         goal, mean = encoded_over_black(b[:, c], b[:, 3]), (a[:, c].sum(), b[:, c].sum())
@@ -172,7 +167,7 @@ def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.
             return float(np.mean((encoded_over_black(a[:, c] * 2**stops, a[:, 3]) - goal) ** 2))
 
         middle = float(np.log2(mean[1] / mean[0]))
-        found = minimize_scalar(error, bounds=(middle - SCALE_REACH, middle + SCALE_REACH))
+        found = minimize_scalar(error, bounds=(middle - 2, middle + 2))  # stops
         scale[c] = 2.0 ** min((0.0, middle, float(found.x)), key=error)
     return scale
 

@@ -30,7 +30,6 @@ DATA = "data"  # folder of the rendered views, in the run folder
 PURPOSE = "relighting"  # of the default method: `auto` would keep colours alone, which are those of the file
 VIEWS = {"train": 100, "test": 12}
 ELEVATION = (-90.0, 90.0)  # degrees: files of other programs have any side up
-SMALL = 64  # pixels of a side of the views by which an object is told from a scene around it
 OPAQUE_BORDER = 0.3  # mean alpha at the border of the views above which a file is a scene: a room has 0.48
 
 
@@ -47,21 +46,18 @@ def import_relightable(
 ) -> Reconstruction:
     """Fit materials, normals and an environment map to views of a PLY file of 3DGS or 2DGS.
 
-    Views from all around, rendered by the formulas of the file, become a data set, the folder `data` of the
-    run folder `output`. linear, box: as in `import_splats`. cameras: of the views; every eighth is a test
-    view. method: as in `fit`, by default that for relighting. preset, progress: as in `fit`; the preset
-    also chooses the size of the views. Raises InputError for a file that `import_splats` refuses or
-    that shows no free object, for a folder with another run or foreign files, and as `fit` does."""
+    Views from all around become a data set, folder `data` of the run folder `output`. linear, box: as in
+    `import_splats`. cameras: of the views; every eighth is a test view. method, preset, progress: as in `fit`,
+    by default the method for relighting; the preset also chooses the size of the views. Raises InputError as
+    both do, for a file that shows no free object, and for a folder with another run or foreign files."""
     path, run = Path(path), Run(output)
     run.require_none()
     if method is None:
         method = methods.for_purpose(PURPOSE)
     wanted = runner.load_method(None if method is None else str(method), preset)
     made = import_splats(path, linear=linear, box=box)
-    given = []
-    for split in VIEWS:
-        chosen = enumerate(held_out(cameras or (), split))
-        given += [Shot(f"{split}/r_{i:03d}", split, camera) for i, camera in chosen]
+    chosen = [(split, enumerate(held_out(cameras or (), split))) for split in VIEWS]
+    given = [Shot(f"{split}/r_{i:03d}", split, camera) for split, some in chosen for i, camera in some]
     views, owner = run.path / DATA, f"import of {path.resolve()}"
     pixels = PRESETS.get(wanted.preset, PRESETS[DEFAULT_PRESET]).pixels
     shots = given or shots_around(made.trained.surfels, VIEWS, math.isqrt(pixels), ELEVATION)
@@ -81,7 +77,7 @@ def import_relightable(
 def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> None:
     """Raise InputError if the test views show nothing, or are opaque up to the border, as within a scene."""
     cameras = [shot.camera for shot in shots if shot.split == "test"]
-    seen = [made.render(camera, size=SMALL)[..., 3] for camera in cameras]
+    seen = [made.render(camera, size=64)[..., 3] for camera in cameras]
     if max(alpha.max() for alpha in seen) < OPAQUE_BORDER:
         raise InputError("views of the surfels show nothing", path, "opacity", "export the file again")
     border = [np.concatenate([x[0], x[-1], x[:, 0], x[:, -1]]).mean() for x in seen]

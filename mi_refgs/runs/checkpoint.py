@@ -1,5 +1,4 @@
-"""A checkpoint: named arrays in an .npz file whose comment is "sha256 " and the SHA-256 of all bytes before
-it."""
+"""A checkpoint: named arrays in an .npz file whose comment is "sha256 " and that of all bytes before it."""
 
 from __future__ import annotations
 
@@ -99,7 +98,6 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 
 def tensors(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:
-    """`part`, uploaded."""
     return {name: upload_tensor(value) for name, value in part(state, prefix).items()}
 
 

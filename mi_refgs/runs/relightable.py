@@ -28,7 +28,6 @@ from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
 COSINE_LOBE = (1.0, 2 / 3, 1 / 4, 0.0)  # by SH degree. [Ramamoorthi and Hanrahan 2001, eq. 8, over π]
-IRRADIANCE_FLOOR = 1e-4  # of the brightest irradiance; darker surfels are dark whatever their albedo
 
 
 def lacking(scene: TrainedScene) -> str:
@@ -77,7 +76,7 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
             np.atleast_2d(np.array(x, dtype=np.float64)).T  # (N, C)
             for x in (radiance, arrives, surfels.value("metallic"), surfels.value("albedo"))
         )
-        floor = IRRADIANCE_FLOOR * arrives_.max()
+        floor = 1e-4 * arrives_.max()  # darker surfels are dark whatever their albedo
 
         def with_shadows(ratio: Any) -> Surfels:
             diffuse = np.clip(radiance_ / np.maximum(arrives_ * ratio, floor), 0, 1)

@@ -40,7 +40,6 @@ CAMERAS = "cameras.json"  # the decision about camera corrections, and the corre
 LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
 LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
-CHECKPOINTS_KEPT = 2  # writes are atomic: two survive a disk that loses writes
 
 
 class Run:
@@ -126,9 +125,9 @@ class Run:
         return sorted(x for x in (self.path / "checkpoints").glob("*.npz") if x.stem.isdecimal())
 
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
-        """Save a state, then remove all but the newest CHECKPOINTS_KEPT; raises InputError on failure."""
+        """Save a state, then remove all but the newest two: a disk may lose writes. Raises InputError."""
         write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", checkpoint.encode(state))
-        for old in self.checkpoints()[:-CHECKPOINTS_KEPT]:
+        for old in self.checkpoints()[:-2]:
             old.unlink(missing_ok=True)
 
     def load_checkpoint(self) -> dict[str, np.ndarray] | None:

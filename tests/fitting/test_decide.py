@@ -16,7 +16,7 @@ from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import decide
 from mi_refgs.fitting.decide import Decision, as_decided, differences, fork
-from mi_refgs.fitting.events import colour_alone, more_surfels
+from mi_refgs.fitting.events import more_surfels
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
@@ -256,7 +256,7 @@ def test_what_cannot_be_tried_is_said(
         raise InputError("no surfel is left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(colour_alone, "fork", failing)
+        patch.setattr(decide, "fork", failing)
         (row,) = fitted(without(method, "more_surfels"), views, tmp_path / "failed").fit.decisions
     assert not row["stays"] and "no surfel is left" in row["reason"]
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from mi_refgs import methods
-from mi_refgs.errors import InputError
-from mi_refgs.fitting.decide import Decision, Row, conclude, fork, tried
+from mi_refgs.fitting.decide import Decision
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import register
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.ranges import at_least
 from mi_refgs.methods.window import ITERATIONS
-
-GAIN = -0.1  # dB on validation views from which colour alone stays: it costs less, and may lose a little
 
 
 @register
@@ -25,6 +21,7 @@ class ColourAlone(Decision):
     """Tries a method without light and materials."""
 
     name: ClassVar[str] = "colour_alone"
+    gain: ClassVar[float] = -0.1  # it costs less, and may lose a little
     method: str  # the other method, by its name or path
     after: int = field(metadata=ITERATIONS | at_least(0))  # iterations before it is tried
     trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations of both that are compared
@@ -54,16 +51,7 @@ class ColourAlone(Decision):
         return not waits and bool(self.pending(trainer.fit.decisions))
 
     def apply(self, trainer: Trainer) -> None:
-        began = time.perf_counter()
-        if trainer.iteration + self.trial > trainer.method.iterations:
-            row = Row(self.name, trainer.iteration, False, "too late in the fit")
-        else:
-            try:
-                rival = fork(trainer, self.chosen(trainer.method, self.name))
-                row = tried(trainer, self.name, rival, self.trial, GAIN)
-            except InputError as error:
-                row = Row(self.name, trainer.iteration, False, f"its fit failed: {error}")
-        conclude(trainer, row, began)
+        self.decide(trainer, self.trial)
 
 
 def _has_table(method: dict[str, object], assignment: str) -> bool:

@@ -30,13 +30,13 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 SPLIT_OFFSET, SPLIT_SCALE = 0.6, 0.72
-"""Distance of a split surfel's two children from its centre, and their scale, both relative to its longest
-scale and along that axis. With `split_opacity` their composited profile is the parent's but for 0.4 to 1.8 %
-of its energy."""
+"""Distance of the two children from the centre, and their scale, relative to the longest scale and along it:
+with `split_opacity` their profile is the parent's but for 2 % of its energy."""
 BACKGROUND_EXTENT = 0.5  # distances from the region's centre; larger surfels of the background are removed
-WEIGHED_VIEWS, WEIGHED_SIZE = 48, 128
-"""Training views in which faint surfels are looked for, and the longer side of their images, pixels: an event
-then takes as long as 5 to 10 steps."""
+WEIGHED_VIEWS, WEIGHED_SIZE = (
+    48,
+    128,
+)  # views in which faint surfels are looked for; their longer side, pixels
 NO_ROWS = np.empty(0, np.int64)
 
 
@@ -147,13 +147,9 @@ def densify_and_prune(
     if keep_one and not keep.any():
         keep[np.argmax(opacity)] = True
     if not keep.any():
-        raise InputError(
-            "no surfel is opaque and small enough to stay",
-            "event.densify.prune_opacity",
-            remedy=(
-                "lower it, raise prune_extent, or check that the images and their cameras belong together"
-            ),
-        )
+        remedy = "lower it, raise prune_extent, or check that the images and their cameras belong together"
+        what = "no surfel is opaque and small enough to stay"
+        raise InputError(what, "event.densify.prune_opacity", remedy=remedy)
 
     # Early in a fit most surfels are faint, those that will be needed, too: they only make room.
     needed = math.ceil((1 + grow) * keep.sum()) - most
@@ -185,9 +181,7 @@ def densify_and_prune(
 
 
 def least_weight(weight: np.ndarray, cost: np.ndarray, share: float) -> np.ndarray:
-    """Rows of the surfels that together have at most this share of all weight, least weight per cost first.
-
-    `weight`: blending weights (N,); `cost`: tiles (N,) in whose lists they are.
-    """
+    """Rows of the surfels that together have at most this share of all weight (N,), in the order of weight
+    per cost (N,), the tiles in whose lists they are."""
     order = np.argsort(weight / np.maximum(cost, 1), kind="stable")
     return order[np.cumsum(weight[order]) <= share * weight.sum()]

@@ -14,14 +14,13 @@ import numpy as np
 from mi_refgs.data.object_region import camera_positions, fitted_region, seen_share
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.fitting.exchange import exchange
-from mi_refgs.fitting.train import Trainer
+from mi_refgs.fitting.train import FEW_VIEWS, Trainer
 from mi_refgs.methods.event import Event, register
 from mi_refgs.render.panorama import SURFACE
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.types import Float
 
 AFTER = 1 / 3  # fraction of the iterations after which the region follows the object
-DEPTH_VIEWS = 24  # training views whose depth is rendered
 LEVEL = 0.05  # difference of depth, in radii of the region, up to which two pixels show one surface
 LEVEL_COUNT = 3  # of the eight neighbours of a pixel; fewer are where an outline mixes near and far
 
@@ -46,7 +45,7 @@ class FollowObject(Event[Trainer]):
         assert region is not None and around is not None
         tables = trainer.surfels.detach(), around.surfels.detach()
         points = []
-        for i in evenly_spread(len(views), DEPTH_VIEWS):
+        for i in evenly_spread(len(views), FEW_VIEWS):
             depth, alpha = render_depth(tables[0], views[i].camera(), tables[1])
             points.append(surface_points(views[i], depth, alpha, region.radius))
         seen, cameras = partial(seen_share, views), camera_positions(views)

@@ -31,15 +31,9 @@ from mi_refgs.splat.weights import blended_weights
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
-DIELECTRIC, METAL = 0.1, 0.9
-"""Metallic during the trials: 0 and 1 have no slope, so that no surfel could leave them afterwards."""
-
-METAL_GAIN = 1.5
-"""Gain in dB from which surfels start as metal: `plastic_hollows` gains 0.7, `mixed` 2.3, `gold_cavities` 2.6
-dB."""
-
+DIELECTRIC, METAL = 0.1, 0.9  # metallic during the trials: 0 and 1 have no slope to leave them by
+METAL_GAIN = 1.5  # dB from which surfels start as metal: plastic gains 0.7, gold and mixed scenes 2.3 or more
 JUDGED_VIEWS = 24  # training views whose errors decide
-
 NEIGHBOURHOOD = 0.05  # fraction of the surfels that a surfel shares its choice with: single errors are noise
 CENTRES = 5_000  # surfels that the fraction is counted in: so many sums are computed
 
@@ -115,8 +109,7 @@ def _attributed(surfels: Surfels, views: list[View], errors: list[np.ndarray]) -
 
 
 def _sum_around(positions: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sum (N,) of the values over the nearest NEIGHBOURHOOD of the surfels; equal for those that share the
-    nearest of CENTRES surfels."""
+    """Sum (N,) of the values over the NEIGHBOURHOOD of the nearest of CENTRES surfels."""
     centres = positions[evenly_spread(len(positions), CENTRES)]
     tree = cKDTree(centres)
     _, own = tree.query(positions)

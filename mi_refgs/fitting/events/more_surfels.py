@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-from mi_refgs.fitting.decide import Decision, Row, conclude, fork, tried
+from mi_refgs.fitting.decide import Decision
 from mi_refgs.fitting.events.densify import fill
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.event import register
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.ranges import at_least
 from mi_refgs.methods.window import ITERATIONS
-
-GAIN = 0.15  # dB on validation views from which twice as many surfels stay: a part of their gain in the end
 
 
 @dataclass(frozen=True)
@@ -33,6 +30,7 @@ class MoreSurfels(Decision):
     """Doubles the largest number of surfels as long as that pays."""
 
     name: ClassVar[str] = "more_surfels"
+    gain: ClassVar[float] = 0.15  # a part of what twice as many gain in the end
     doubling: tuple[Doubling, ...]  # trials, in their order
 
     def components(self) -> Sequence[str]:
@@ -47,19 +45,14 @@ class MoreSurfels(Decision):
         return doubling is not None and trainer.iteration >= doubling.after
 
     def apply(self, trainer: Trainer) -> None:
-        began, doubling = time.perf_counter(), self._next(trainer)
+        doubling = self._next(trainer)
         assert doubling is not None
-        component = self.pending(trainer.fit.decisions)[0]
-        if trainer.iteration + doubling.trial > trainer.method.iterations:
-            conclude(trainer, Row(component, trainer.iteration, False, "too late in the fit"), began)
-            return
-        rival = fork(trainer, self.chosen(trainer.method, component))
+        self.decide(trainer, doubling.trial)
+
+    def begin(self, rival: Trainer) -> str:
+        before = rival.surfels.count
         fill(rival)
-        if rival.surfels.count <= trainer.surfels.count:
-            row = Row(component, trainer.iteration, False, "no surfels to split: densification has ended")
-        else:
-            row = tried(trainer, component, rival, doubling.trial, GAIN)
-        conclude(trainer, row, began)
+        return "" if rival.surfels.count > before else "no surfels to split: densification has ended"
 
     def _next(self, trainer: Trainer) -> Doubling | None:
         """The doubling to decide; None without validation views, and after one that did not pay."""

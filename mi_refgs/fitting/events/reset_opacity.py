@@ -17,8 +17,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES, logit
 from mi_refgs.surfels.table import Surfels
 
 OPACITY = 0.01  # of all surfels after a reset, at most
-PATIENCE = 4.5
-"""Factor of the fewest steps in which an opacity can grow back; with 2, a diffuse scene lost every surfel."""
+PATIENCE = 4.5  # factor of the fewest steps in which an opacity can grow back; with 2, a scene was lost
 
 
 @register
@@ -36,9 +35,8 @@ class ResetOpacity(Event[Trainer]):
     def require(self, attributes: Collection[str]) -> None:
         for name in self.raise_to_start:
             if name not in attributes or ATTRIBUTES[name].activation != "sigmoid":
-                raise InputError(
-                    f"'{name}' is no attribute between 0 and 1", "raise_to_start", remedy="remove it"
-                )
+                what = f"'{name}' is no attribute between 0 and 1"
+                raise InputError(what, "raise_to_start", remedy="remove it")
 
     def due(self, trainer: Trainer) -> bool:
         return self.when.due(trainer.iteration)
@@ -52,10 +50,7 @@ class ResetOpacity(Event[Trainer]):
         trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=cleared)
 
     def grown(self, iteration: int, opacity: float, rate: float) -> bool:
-        """Whether opacities had time since the last reset before an iteration to grow back to `opacity`.
-
-        Adam raises a logit by about its rate per step.
-        """
+        """Whether opacities had time since the last reset to grow back: Adam raises a logit by its rate."""
         if (since := self.when.since(iteration)) is None:
             return True
         lift = max(logit(opacity) - logit(OPACITY), 0.0)

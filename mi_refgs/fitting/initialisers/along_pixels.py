@@ -10,11 +10,7 @@ from mi_refgs.methods.initialiser import Initialiser, Start, Wanted, register
 
 def along_pixels(wanted: Wanted) -> Start | None:
     """Points outside of the region with the colours of pixels, of random depth, uniform in 1/z, beyond the
-    region's centre.
-
-    They are where points of surfaces are missing, such as walls that few views show, and nowhere near a
-    camera. With median colours of all views instead, held-out views of the kitchen around *figure* lose 3 dB.
-    """
+    region's centre: where points of surfaces are missing, and nowhere near a camera."""
     pixels, region, rng, count = wanted.data.unknown, wanted.region, wanted.rng, wanted.count
     if pixels is None or region is None or wanted.inside:
         return None

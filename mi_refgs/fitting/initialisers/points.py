@@ -15,11 +15,8 @@ from mi_refgs.surfels import init
 
 
 def at_points(wanted: Wanted) -> Start | None:
-    """At the points, with their colours or the images'; in an open scene those on its side of the border.
-
-    There a share is elsewhere: along pixels of unknown depth, or at random. Copies of a point lie around it,
-    as far away as its neighbours, whose distance is a surfel's size.
-    """
+    """At the points, with their colours or the images'; copies of a point lie as far away as its neighbours.
+    In an open scene those on its side of the border, and a share elsewhere."""
     cloud, region, rng = wanted.data.points, wanted.region, wanted.rng
     if cloud is not None and region is not None:
         rows = region.contains(cloud.position) == wanted.inside

@@ -13,16 +13,13 @@ from mi_refgs.errors import InputError
 from mi_refgs.methods.initialiser import Initialiser, Start, Wanted, register
 from mi_refgs.surfels import init
 
-FARTHEST_CONTRACTED = 2 - 1 / FARTHEST
-"""Contracted distance of the farthest random points: beyond it the background map is as good."""
-SEEN_SHARE = 0.1
-"""Fraction of the views that must see a random point: fewer views cannot determine its position."""
+FARTHEST_CONTRACTED = 2 - 1 / FARTHEST  # of random points: beyond it the background map is as good
+SEEN_SHARE = 0.1  # fraction of the views that must see a random point: fewer cannot determine its position
 DRAWS = 64  # rounds of rejection sampling; cameras on one side of a scene accept about a tenth per round
 
 
 def at_random(wanted: Wanted) -> Start:
-    """Points uniform where all cameras look, or in the region of an open scene; those of its background in
-    contracted space."""
+    """Points uniform where all cameras look, or in the region; the background's in contracted space."""
     data, region, rng = wanted.data, wanted.region, wanted.rng
     if region is None:
         low, high = hull.camera_bounds(data.views)
@@ -48,8 +45,7 @@ def _within(count: int, region: Region, rng: np.random.Generator) -> np.ndarray:
 
 
 def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, 3) uniform in contracted space outside of the region, where enough views see them,
-    but not right in front of a camera; anywhere there if too few are seen."""
+    """Points (count, 3) uniform in contracted space outside of the region, in enough views if possible."""
     nearest = 0.0 if region.planes else 1.0  # the sphere has points below planes
 
     def draw(number: int) -> np.ndarray:
