@@ -46,9 +46,9 @@ def import_relightable(
 ) -> Reconstruction:
     """Fit materials, normals and an environment map to views of a PLY file of 3DGS or 2DGS.
 
-    Views from all around become a data set, folder `data` of the run folder `output`. linear, box: as in
-    `import_splats`. cameras: of the views; every eighth is a test view. method, preset, progress: as in `fit`,
-    by default the method for relighting; the preset also chooses the size of the views. Raises InputError as
+    Views from all around become a data set, `data` in the run folder `output`. linear, box: as in
+    `import_splats`. cameras: of the views; every eighth is a test view. method, preset, progress: as in
+    `fit`, by default that for relighting; the preset also chooses the size of the views. Raises InputError as
     both do, for a file that shows no free object, and for a folder with another run or foreign files."""
     path, run = Path(path), Run(output)
     run.require_none()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import shutil
@@ -11,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from mi_refgs.runs.run import Run
 from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS, write_data, write_method
 
+Paths = tuple[Path, Path]
 SIX = [setting for setting in SETTINGS if "preview" not in setting]
 
 
@@ -43,13 +44,11 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def variants(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def variants(tmp_path_factory: pytest.TempPathFactory) -> Paths:
     """The tiny method, and one that deviates from it and stands for a row of the paper."""
     first = write_method(tmp_path_factory.mktemp("variants"))
     second = first.with_name("other.toml")
-    about = (
-        '[about]\nname = "Other"\npaper_row = "2DGS"\ndeviations = ["a ball <and> no scene", "six steps"]\n'
-    )
+    about = '[about]\nname = "Other"\npaper_row = "2DGS"\ndeviations = ["a <and> no scene", "six steps"]\n'
     second.write_text(f'extends = "tiny.toml"\n{about}[rates]\ndecay = 0.5\n')
     return first, second
 
@@ -63,48 +62,43 @@ def copied(folder: Path, target: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def compared(
-    ball: Path, variants: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, int]:
-    """A comparison in which one of four jobs failed, and its exit code; do not change it."""
+def compared(ball: Path, variants: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A comparison in which one of four jobs failed; do not change it."""
     folder = tmp_path_factory.mktemp("compared")
     broken = folder / "runs" / "ball" / "tiny" / "seed1"
     own_folder(folder, "compare")
     own_folder(broken, RUN)
     (broken / "checkpoints").write_text("in the way")
-    code = main(command(ball, folder, *variants, more=("--seeds", "0,1", "--workers", "2")))
-    return folder, code
+    assert main(command(ball, folder, *variants, more=("--seeds", "0,1", "--workers", "2"))) == 3
+    return folder
 
 
 # ---------- The main job ----------
 
 
-def test_comparison_has_a_run_per_job(compared: tuple[Path, int]) -> None:
-    folder, code = compared
-    assert code == 3  # one failed
+def test_comparison_has_a_run_per_job(compared: Path) -> None:
     for variant, seed in (("tiny", 0), ("other", 0), ("other", 1)):
-        run = Run(folder / "runs" / "ball" / variant / f"seed{seed}")
+        run = Run(compared / "runs" / "ball" / variant / f"seed{seed}")
         assert run.method().seed == seed and run.method().iterations == 6
 
 
-def test_failed_job_is_a_row_with_its_reason(compared: tuple[Path, int]) -> None:
-    table = json.loads((compared[0] / "table.json").read_text())
+def test_failed_job_is_a_row_with_its_reason(compared: Path) -> None:
+    table = json.loads((compared / "table.json").read_text())
     [scene] = table["scenes"]
     tiny, other = scene["rows"]
     assert tiny["variant"] == "tiny" and tiny["seeds"] == [0] and list(tiny["failed"]) == ["1"]
     assert "seed1/checkpoints: output: cannot be created" in tiny["failed"]["1"]
     assert other["seeds"] == [0, 1] and not other["failed"]
-    assert f"tiny, seed 1: failed: {tiny['failed']['1']}" in (compared[0] / "table.md").read_text()
+    assert f"tiny, seed 1: failed: {tiny['failed']['1']}" in (compared / "table.md").read_text()
 
 
-def test_numbers_are_means_over_the_runs(compared: tuple[Path, int]) -> None:
-    folder, _ = compared
-    [scene] = json.loads((folder / "table.json").read_text())["scenes"]
-    other = scene["rows"][1]
-    metrics = [
-        json.loads((folder / "runs/ball/other" / f"seed{seed}" / "metrics.json").read_text())
-        for seed in (0, 1)
-    ]
+def test_numbers_are_means_over_the_runs(compared: Path) -> None:
+    [scene] = json.loads((compared / "table.json").read_text())["scenes"]
+    other, folders = (
+        scene["rows"][1],
+        (compared / "runs/ball/other/seed0", compared / "runs/ball/other/seed1"),
+    )
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in folders]
     values = [found["psnr"] for found in metrics]
     number = other["numbers"]["psnr"]
     assert number["values"] == values and values[0] != values[1]
@@ -115,20 +109,15 @@ def test_numbers_are_means_over_the_runs(compared: tuple[Path, int]) -> None:
 
 
 def test_finished_jobs_are_not_repeated(
-    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    compared: Path, ball: Path, variants: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def nothing(*_: object) -> None:
-        raise AssertionError("a finished job was begun again")
-
-    monkeypatch.setattr(execute, "_process", nothing)
-    assert main(command(ball, compared[0], variants[1], more=("--seeds", "0,1"))) == 3
+    monkeypatch.setattr(execute, "_process", lambda *_: pytest.fail("a finished job was begun again"))
+    assert main(command(ball, compared, variants[1], more=("--seeds", "0,1"))) == 3
 
 
-def test_interrupted_job_resumes_from_checkpoint(
-    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_an_interrupted_job_resumes(compared: Path, ball: Path, variants: Paths, tmp_path: Path) -> None:
     """With one thread the resumed run is the straight one; what came after the checkpoint is done again."""
-    done = compared[0] / "runs" / "ball" / "other" / "seed0"
+    done = compared / "runs" / "ball" / "other" / "seed0"
     run = tmp_path / "runs" / "ball" / "other" / "seed0"
     own_folder(tmp_path, "compare")
     shutil.copytree(done, run)
@@ -140,19 +129,15 @@ def test_interrupted_job_resumes_from_checkpoint(
         assert (run / name).read_bytes() == (done / name).read_bytes(), name
 
 
-def test_job_is_finished_with_metrics_of_last_checkpoint(
-    compared: tuple[Path, int], ball: Path, tmp_path: Path
-) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(compared[0] / "runs" / "ball" / "other" / "seed0", folder)
+def test_job_is_finished_with_metrics_of_last_checkpoint(compared: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(compared / "runs" / "ball" / "other" / "seed0", tmp_path / "run")
     job = Job(**(json.loads((folder / "job.json").read_text()) | {"folder": str(folder)}))
     assert jobs.finished(job)
     metrics = json.loads((folder / "metrics.json").read_text())
-    for change in ({"iterations": 3}, {"dataset": str(tmp_path)}):
-        (folder / "metrics.json").write_text(json.dumps(metrics | change))
+    changed = [json.dumps(metrics | change) for change in ({"iterations": 3}, {"dataset": str(tmp_path)})]
+    for text in (*changed, "{"):
+        (folder / "metrics.json").write_text(text)
         assert not jobs.finished(job)
-    (folder / "metrics.json").write_text("{")
-    assert not jobs.finished(job)
     (folder / "metrics.json").write_text(json.dumps(metrics))
     assert jobs.finished(job)
     (folder / "checkpoints" / "0000006.npz").unlink()
@@ -163,7 +148,7 @@ def test_job_is_finished_with_metrics_of_last_checkpoint(
 
 
 def test_crash_is_retried_and_becomes_a_row(
-    ball: Path, variants: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ball: Path, variants: Paths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each worker process dies of a segmentation fault before it does anything."""
     crash = tmp_path / "crash"
@@ -179,7 +164,7 @@ def test_crash_is_retried_and_becomes_a_row(
     assert (tmp_path / "began").read_text() == "x" * (1 + execute.RETRIES)
 
 
-def test_worker_ends_with_its_parent(ball: Path, variants: tuple[Path, Path]) -> None:
+def test_worker_ends_with_its_parent() -> None:
     """It ends when its standard input closes."""
     code = (
         "import os, time\nfrom mi_refgs.compare import worker\nimport threading\n"
@@ -192,15 +177,14 @@ def test_worker_ends_with_its_parent(ball: Path, variants: tuple[Path, Path]) ->
 
 
 @pytest.mark.slow
-def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Path], tmp_path: Path) -> None:
+def test_killed_cluster_worker_is_replaced(ball: Path, variants: Paths, tmp_path: Path) -> None:
     """Another worker goes on from the checkpoint; the log has each iteration once."""
     distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
     from mi_refgs.compare.execute import run_on_cluster
 
     settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
     [job] = jobs.plan(tmp_path, [ball], [str(variants[1])], [0], Shared("quick", settings, threads=1))
-    reports: list[tuple[Job, str | None]] = []
-    killed: list[int] = []
+    reports, killed = list[tuple[Job, str | None]](), list[int]()
 
     def kill(address: str) -> None:
         until = time.monotonic() + 60
@@ -213,18 +197,14 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Pat
         assert not job.run.checkpoints()[-1].stem.endswith("150")
         os.kill(killed[0], signal.SIGKILL)
 
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as cluster:
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         killer = threading.Thread(target=kill, args=[cluster.scheduler_address])
         killer.start()
         run_on_cluster([job], cluster.scheduler_address, lambda *said: reports.append(said))
         killer.join()
     assert killed and reports == [(job, None)] and jobs.finished(job)
-    logged = [
-        json.loads(line)["iteration"] for line in (job.run.path / "metrics.jsonl").read_text().splitlines()
-    ]
-    assert logged == list(range(10, 151, 10))
+    lines = (job.run.path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == list(range(10, 151, 10))
     assert (job.run.path / "job.log").read_text().count("resumed at iteration") == 1
 
 
@@ -246,7 +226,7 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: tuple[Path, Pat
     ],
 )
 def test_bad_input_is_refused(
-    arguments: list[str], words: list[str], ball: Path, variants: tuple[Path, Path], tmp_path: Path
+    arguments: list[str], words: list[str], ball: Path, variants: Paths, tmp_path: Path
 ) -> None:
     (tmp_path / "twin").mkdir()
     os.symlink(ball, tmp_path / "twin" / "ball")
@@ -256,12 +236,12 @@ def test_bad_input_is_refused(
 
 
 def test_different_image_sizes_are_refused(
-    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
+    compared: Path, ball: Path, variants: Paths, tmp_path: Path
 ) -> None:
     """Before anything is fitted: two methods, or one and existing runs; and existing runs."""
     smaller = tmp_path / "smaller.toml"
     smaller.write_text(f'extends = "{variants[0]}"\n[data]\ndownscale = 2\n')
-    copy = copied(compared[0], tmp_path / "copy")
+    copy = copied(compared, tmp_path / "copy")
     for folder, chosen in ((tmp_path / "new", (variants[0], smaller)), (copy, (smaller,))):
         refused(command(ball, folder, *chosen), "20 × 20", "10 × 10", "smaller")
         assert not (folder / "runs/ball/smaller").exists()
@@ -270,26 +250,23 @@ def test_different_image_sizes_are_refused(
     refused(["compare", "-o", copy], "20 × 20", "10 × 10", "runs/ball/other/seed1")
 
 
-def test_other_settings_are_refused_by_the_run_itself(
-    compared: tuple[Path, int], ball: Path, variants: tuple[Path, Path], tmp_path: Path
-) -> None:
-    """Without compare.json; with it, see `test_option_that_cannot_change_is_refused`."""
-    folder = copied(compared[0], tmp_path / "copy")
+def test_a_run_refuses_other_settings(compared: Path, ball: Path, variants: Paths, tmp_path: Path) -> None:
+    """With compare.json and without it."""
+    folder = copied(compared, tmp_path / "copy")
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
     (folder / "compare.json").unlink()
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
 
 
-def test_table_says_how_it_was_made(compared: tuple[Path, int]) -> None:
-    folder, _ = compared
-    text = (folder / "table.md").read_text()
-    command_line = json.loads((folder / "compare.json").read_text())["command"]
-    for said in ("a ball <and> no scene", "llvm_ad_rgb", "jobs at once", command_line):
+def test_table_says_how_it_was_made(compared: Path) -> None:
+    text = (compared / "table.md").read_text()
+    command_line = json.loads((compared / "compare.json").read_text())["command"]
+    for said in ("a <and> no scene", "llvm_ad_rgb", "jobs at once", command_line):
         assert said in text, said
 
 
-def test_unreadable_run_is_a_failed_row(compared: tuple[Path, int], tmp_path: Path) -> None:
-    folder = copied(compared[0], tmp_path / "copy")
+def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:
+    folder = copied(compared, tmp_path / "copy")
     (folder / "runs" / "ball" / "other" / "seed0" / "config.toml").write_text("future = 1")
     row = write(folder).scenes[0].rows[1]
     assert row.seeds == [1] and "future" in row.failed[0]
@@ -307,6 +284,6 @@ def test_run_that_was_decided_is_accepted(
     state = {"decisions": np.frombuffer(json.dumps(rows).encode(), np.uint8)}
     monkeypatch.setattr(Run, "load_checkpoint", lambda _: state)
     jobs.require_same(job)
-    job.run.write_method(dataclasses.replace(chosen, seed=3))
+    job.run.write_method(replace(chosen, seed=3))
     with pytest.raises(InputError, match=r"seed: the run was made with 3"):
         jobs.require_same(job)

@@ -134,12 +134,8 @@ def test_components_stay_by_their_gain_alone(
 
 def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> None:
     """Those of tables that the other method has not are left out; what Python changed is kept."""
-    settings = [
-        "loss.ssim=0.3",
-        "light.height=16",
-        "event.mesh.resolution=9",
-        "stage.deferred.traced_bounces=1",
-    ]
+    settings = ["loss.ssim=0.3", "light.height=16", "event.mesh.resolution=9"]
+    settings.append("stage.deferred.traced_bounces=1")
     own = methods.load(file, "quick", [*SETTINGS, *settings])
     own = replace(own.downscaled(3), seed=5)
     (decision,) = (x for name, x in own.event.items() if name == "colour_alone")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ STEPS = 14
 def changed(change: Callable[[View], dict[str, Any]], linear: bool = False, views: int = 6) -> Dataset:
     data = ball(views=views)
     found = (with_pixels(view, **change(view)) for view in data.views)
-    found = (dataclasses.replace(view, is_linear_radiance=linear) for view in found)
-    return dataclasses.replace(data, views=tuple(found), is_linear_radiance=linear)
+    found = (replace(view, is_linear_radiance=linear) for view in found)
+    return replace(data, views=tuple(found), is_linear_radiance=linear)
 
 
 def radiance(view: View, peak: float) -> dict[str, Any]:
@@ -56,7 +56,7 @@ CASES: dict[str, Callable[[], Dataset]] = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
-    method = dataclasses.replace(small_method(tmp_path), iterations=STEPS)
+    method = replace(small_method(tmp_path), iterations=STEPS)
     trainer = Trainer(method, CASES[name](), warn=pytest.fail)
     trainer.train()
     assert trainer.iteration == STEPS and trainer.health.skipped == 0

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -43,7 +43,7 @@ def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
     method: Method, tmp_path: Path
 ) -> None:
     """Steps on view 2 fail until the next check, every third iteration; then the culprits are gone."""
-    still = dataclasses.replace(without(method), iterations=9)
+    still = replace(without(method), iterations=9)
     run = run_folder(tmp_path / "run", still)
     said: list[str] = []
     trainer = Trainer(still, ball(), run, warn=said.append)
@@ -72,7 +72,7 @@ def test_surfels_that_are_not_finite_are_removed_and_fit_goes_on(
     name: str, value: float, method: Method
 ) -> None:
     said: list[str] = []
-    trainer = Trainer(dataclasses.replace(method, iterations=12), ball(), warn=said.append)
+    trainer = Trainer(replace(method, iterations=12), ball(), warn=said.append)
     assert trainer.statistics()["loss"] is None  # before the first step
     trainer.step()
     raw = trainer.surfels.to_numpy()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,9 +26,8 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> dataset.Dataset:
     """Twelve views of a ball coloured by its normals, at RADIUS around the origin."""
-    return dataset.read_dataset(
-        write_data(tmp_path_factory.mktemp("hull") / "ball", views=12, truth=False), "train"
-    )
+    folder = write_data(tmp_path_factory.mktemp("hull") / "ball", views=12, truth=False)
+    return dataset.read_dataset(folder, "train")
 
 
 def start(ball: dataset.Dataset, inside: float, seed: int = 0, *settings: str) -> dict[str, np.ndarray]:
@@ -79,7 +78,7 @@ def test_albedo_starts_with_hue_of_images(ball: dataset.Dataset) -> None:
 
 
 def test_without_alpha_surfels_fill_box(ball: dataset.Dataset) -> None:
-    bare = dataclasses.replace(ball, views=tuple(with_pixels(view, alpha=None) for view in ball.views))
+    bare = replace(ball, views=tuple(with_pixels(view, alpha=None) for view in ball.views))
     table = start(bare, 0.5)
     assert len(table["position"]) == COUNT and np.linalg.norm(table["position"], axis=1).max() > 1.1 * RADIUS
 

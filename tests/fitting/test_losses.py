@@ -18,14 +18,15 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from tests.fitting.image_checks import HEIGHT, WIDTH, check, planes, stack
 from tests.helpers import level_maps
 
+Images = tuple[np.ndarray, np.ndarray]
+
 
 @pytest.fixture
-def images(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def images(rng: np.random.Generator) -> Images:
     """Two correlated images, so that no term of SSIM is negligible."""
     first = rng.random((HEIGHT, WIDTH, 3))
-    return first, np.clip(0.6 * first + 0.4 * rng.random((HEIGHT, WIDTH, 3)), 0, 1).astype(np.float32).astype(
-        np.float64
-    )
+    second = np.clip(0.6 * first + 0.4 * rng.random((HEIGHT, WIDTH, 3)), 0, 1)
+    return first, second.astype(np.float32).astype(np.float64)
 
 
 def d_ssim(image: list[Any], target: list[Any]) -> Any:
@@ -40,10 +41,7 @@ def d_ssim(image: list[Any], target: list[Any]) -> Any:
     ],
 )
 def test_image_losses(
-    loss: Callable[..., Any],
-    define: Callable[..., float],
-    share: float,
-    images: tuple[np.ndarray, np.ndarray],
+    loss: Callable[..., Any], define: Callable[..., float], share: float, images: Images
 ) -> None:
     image, target = images
     check(lambda x: loss(x, planes(target)), lambda x: define(x, target), image, share)
@@ -51,7 +49,7 @@ def test_image_losses(
 
 @pytest.mark.parametrize(("loss", "most"), [(losses.l1, 0.0), (d_ssim, 1e-6)])
 def test_equal_images_cost_nothing_and_have_no_slope(
-    loss: Callable[..., Any], most: float, images: tuple[np.ndarray, np.ndarray]
+    loss: Callable[..., Any], most: float, images: Images
 ) -> None:
     leaves = planes(images[0])
     dr.enable_grad(leaves)
@@ -60,7 +58,7 @@ def test_equal_images_cost_nothing_and_have_no_slope(
     assert abs(float(value[0])) <= most and np.abs(stack(leaves)).max() <= most
 
 
-def test_l1_of_clipped_highlights(images: tuple[np.ndarray, np.ndarray]) -> None:
+def test_l1_of_clipped_highlights(images: Images) -> None:
     image, target = images
     target = target.copy()
     target[3:9, 4:12] = 1.0
@@ -127,9 +125,7 @@ def test_display_image_shows_background_of_empty_pixels() -> None:
 
 
 @pytest.mark.parametrize(("count", "edge"), [(3, 1.0), (2, 10.0)])
-def test_smoothness(
-    count: int, edge: float, images: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
-) -> None:
+def test_smoothness(count: int, edge: float, images: Images, rng: np.random.Generator) -> None:
     guide, _ = images
     check(
         lambda x: losses.smoothness(x, planes(guide), WIDTH, HEIGHT, edge),

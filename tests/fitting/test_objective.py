@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -36,7 +36,7 @@ def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
     planes = [upload(radiance[..., c].astype(np.float32)) for c in range(3)]
     opacity = upload(alpha.astype(np.float32))
     frame = Frame(alpha=opacity, depth=upload(flat), normal=normal, radiance=mi.Color3f(*planes))
-    return dataclasses.replace(frame, object_alpha=opacity)
+    return replace(frame, object_alpha=opacity)
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_priors_are_weighed_as_method_says(
     data, target = made(True, *picture)
     radiance, alpha = picture
     maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}
-    frame = dataclasses.replace(
+    frame = replace(
         frame_of(radiance, alpha), maps={name: upload(x.astype(np.float32)) for name, x in maps.items()}
     )
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()

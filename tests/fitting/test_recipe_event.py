@@ -89,9 +89,7 @@ def test_a_registered_event_happens(file: str, tmp_path: Path, one_thread: None)
 
 def test_other_tables_are_refused(file: str) -> None:
     refused(lambda: methods.load(file, "quick", ["event.clone.share=-1"]), "event.clone.share", "0 or more")
-    refused(
-        lambda: methods.load(file, "quick", ["event.clones={}"]), "'clones' is unknown", "densify", "clone"
-    )
+    refused(lambda: methods.load(file, "quick", ["event.clones={}"]), "'clones' is unknown", "densify")
     attributes = ["surfels.attributes=['albedo', 'metallic', 'roughness']", "surfels.degree={}"]
     refused(
         lambda: methods.load(file, "quick", [*attributes, "stage.deferred.diffuse='irradiance'"]),

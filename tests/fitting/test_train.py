@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import resource
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ def method(tmp_path: Path) -> Method:
 
 def test_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
-    method = dataclasses.replace(without(method), data=DataOptions(), iterations=60)
+    method = replace(without(method), data=DataOptions(), iterations=60)
     trainer = Trainer(method, data)
     before = {name: tensor.numpy().copy() for name, tensor in trainer.fit.params.items()}
     losses = []
@@ -48,11 +48,9 @@ def test_loss_falls_and_everything_trains(method: Method) -> None:
 def with_deferred(method: Method, options: dict[str, Any]) -> Method:
     """The method with these options of its second stage, and with a `crop` of its images."""
     options, deferred = dict(options), method.stage["deferred"]
-    method = dataclasses.replace(
-        method, data=dataclasses.replace(method.data, crop=options.pop("crop", None))
-    )
-    deferred = dataclasses.replace(deferred, shading=dataclasses.replace(deferred.shading, **options))
-    return dataclasses.replace(method, stage=method.stage | {"deferred": deferred})
+    method = replace(method, data=replace(method.data, crop=options.pop("crop", None)))
+    deferred = replace(deferred, shading=replace(deferred.shading, **options))
+    return replace(method, stage=method.stage | {"deferred": deferred})
 
 
 @pytest.mark.parametrize(
@@ -85,10 +83,10 @@ def test_resume_repeats_straight_run_bit_for_bit(
 
 
 def test_stage_has_its_own_rates(method: Method) -> None:
-    initial = dataclasses.replace(method.stage["initial"], rates={"metallic": 0.0, "light": 0.1})
-    slow = dataclasses.replace(without(method), stage=method.stage | {"initial": initial})
+    initial = replace(method.stage["initial"], rates={"metallic": 0.0, "light": 0.1})
+    slow = replace(without(method), stage=method.stage | {"initial": initial})
     first = {}
-    for name, chosen in (("slow", slow), ("own", dataclasses.replace(slow, stage=method.stage))):
+    for name, chosen in (("slow", slow), ("own", replace(slow, stage=method.stage))):
         trainer = Trainer(chosen, ball())
         before = {key: tensor.numpy().copy() for key, tensor in trainer.fit.params.items()}
         trainer.step()
@@ -121,8 +119,8 @@ def test_statistics_distribute_the_squared_error_over_surfels(
     stage: str, method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They sum to the squared error times alpha, and each gets that of the pixels that show it."""
-    only = {"only": dataclasses.replace(method.stage[stage], until=30)}
-    method = dataclasses.replace(without(method, "mesh"), stage=only)
+    only = {"only": replace(method.stage[stage], until=30)}
+    method = replace(without(method, "mesh"), stage=only)
     frames, errors = [], []
     render, measure = train.render, train.objective
 
@@ -148,11 +146,9 @@ def test_a_step_on_a_crop_has_the_loss_and_the_gradient_of_that_part(
     method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a step on the whole image that weighs the pixels of the crop alone."""
-    only = {"only": dataclasses.replace(method.stage["deferred"], until=30)}
-    plain = dataclasses.replace(
-        without(method, "mesh"), stage=only, data=DataOptions(), loss={"l1": LossWeight(1)}
-    )
-    cropped = Trainer(dataclasses.replace(plain, data=DataOptions(crop=12 * 12)), ball())
+    only = {"only": replace(method.stage["deferred"], until=30)}
+    plain = replace(without(method, "mesh"), stage=only, data=DataOptions(), loss={"l1": LossWeight(1)})
+    cropped = Trainer(replace(plain, data=DataOptions(crop=12 * 12)), ball())
     column, row, width, height = cropped.setup.crop(1, SIZE, SIZE) or (0, 0, SIZE, SIZE)
     assert width == height == 8
     place = np.zeros((SIZE, SIZE), np.float32)
@@ -286,8 +282,8 @@ def test_shared_light_learns_sum_of_gradients(method: Method, monkeypatch: pytes
     assert method.light is not None
     rates, sums = Rates(attribute=dict.fromkeys(method.surfels.names, 0.0), light=0.0), {}
     for every in (1, 3):
-        light = dataclasses.replace(method.light, every=every)
-        trainer = Trainer(dataclasses.replace(method, light=light, rates=rates), ball())
+        light = replace(method.light, every=every)
+        trainer = Trainer(replace(method, light=light, rates=rates), ball())
         seen: list[np.ndarray] = []
         real = trainer.fit.optimiser.step
 

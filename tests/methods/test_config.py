@@ -174,9 +174,8 @@ def test_every_preset_has_the_same_events_in_the_same_order(
     monkeypatch.setattr(Shading, "resolve", staticmethod(functools.cache(Shading.resolve)))
     sequences = {}
     for preset in methods.PRESETS:
-        method = methods.load(
-            str(path), preset, ["surfels.count=20", "surfels.max_count=20", "light.height=8"]
-        )
+        small = ["surfels.count=20", "surfels.max_count=20", "light.height=8"]
+        method = methods.load(str(path), preset, small)
         trainer = Trainer(method, ball())
         done.clear()
         while trainer.iteration < method.iterations:

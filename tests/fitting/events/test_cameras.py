@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -37,7 +37,7 @@ AFTER = 8
 @pytest.fixture
 def method(tmp_path: Path) -> Method:
     """Without coarse images and other events; cameras learn from iteration AFTER on."""
-    return dataclasses.replace(small_method(tmp_path), event={"cameras": Cameras(AFTER)}, data=DataOptions())
+    return replace(small_method(tmp_path), event={"cameras": Cameras(AFTER)}, data=DataOptions())
 
 
 def with_rows(trainer: Trainer, rows: np.ndarray) -> Trainer:
@@ -125,8 +125,8 @@ def test_fit_with_corrections_resumes_bit_for_bit(
     run.write_json(CAMERAS, {"to_world": poses})
     for i, view in enumerate(with_poses(second.data, run.cameras()).views):
         np.testing.assert_array_equal(view.to_world, second.camera(i).pose())
-    fewer = dataclasses.replace(ball(), views=ball().views[1:])
-    for others in (fewer, dataclasses.replace(ball(), split="test")):
+    fewer = replace(ball(), views=ball().views[1:])
+    for others in (fewer, replace(ball(), split="test")):
         assert with_poses(others, run.cameras()) is others
     second.save()
     with pytest.raises(InputError, match=r"pose: it has \(6, 6\), a fit .* \(5, 6\)"):
@@ -198,7 +198,7 @@ def disturbed_discs(
         image = np.stack([np.array(x) for x in displayed(frame, background, False)], -1)
         alpha = np.array(frame.alpha).reshape(size, size)
         pixels = Pixels(image.reshape(size, size, 3).clip(0, 1).astype(np.float32), alpha)
-        made.append(dataclasses.replace(view, to_world=wrong[i], pixels=pixels))
+        made.append(replace(view, to_world=wrong[i], pixels=pixels))
     return Dataset(Path("discs"), "train", tuple(made), background, False, None), surfels, true
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -27,17 +27,10 @@ OPTIONS = Densify(Window(0, 1, 1))
 
 def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels:
     rng = np.random.default_rng(0)
-    return Surfels.from_numpy(
-        {
-            "position": rng.normal(size=(count, 3)),
-            "rotation": rng.normal(size=(count, 4)),
-            "scale": np.full((count, 2), np.log(scale)),
-            "opacity": np.full((count, 1), logit(opacity)),
-            "metallic": np.full((count, 1), logit(0.5)),
-            "roughness": np.full((count, 1), logit(0.05)),
-            "albedo": rng.normal(size=(count, 3)),
-        }
-    )
+    raw = {name: rng.normal(size=(count, n)) for name, n in (("position", 3), ("rotation", 4), ("albedo", 3))}
+    for name, value in (("opacity", opacity), ("metallic", 0.5), ("roughness", 0.05)):
+        raw[name] = np.full((count, 1), logit(value))
+    return Surfels.from_numpy(raw | {"scale": np.full((count, 2), np.log(scale))})
 
 
 def densify(
@@ -58,7 +51,7 @@ def test_surfels_with_the_largest_error_are_split() -> None:
     assert densify(surfels, error).parent.tolist() == [0, 1, 2, 3, 4, 5, *(6, 7), *(6, 7)]
     assert densify(surfels, error, most=9).parent.tolist() == [0, 1, 2, 3, 4, 5, 7, 6, 6]
     assert densify(surfels, error, most=8).parent.tolist() == [*range(8)]
-    every = densify(surfels, error, options=dataclasses.replace(OPTIONS, grow=1.0))
+    every = densify(surfels, error, options=replace(OPTIONS, grow=1.0))
     assert every.parent.tolist() == [0, 3, 5, *(1, 2, 4, 6, 7), *(1, 2, 4, 6, 7)]
     assert every.fresh.tolist() == [False] * 3 + [True] * 10
     for name in ("metallic", "roughness", "albedo", "rotation"):
@@ -70,12 +63,11 @@ def test_children_lie_on_the_longest_axis_of_their_parent() -> None:
     surfels = table(2).to_numpy()
     surfels["scale"] = np.log([[0.02, 0.01], [0.01, 0.02]])
     whole = Surfels.from_numpy(surfels)
-    children = densify(whole, np.ones(2), options=dataclasses.replace(OPTIONS, grow=1.0)).surfels.to_numpy()
+    children = densify(whole, np.ones(2), options=replace(OPTIONS, grow=1.0)).surfels.to_numpy()
     axes = np.array(whole.frame()).transpose(2, 0, 1)
     along = 0.02 * event.SPLIT_OFFSET * np.stack([axes[0, 0], axes[1, 1]])
-    np.testing.assert_allclose(
-        children["position"] - surfels["position"][[0, 1, 0, 1]], [*along, *-along], atol=1e-6
-    )
+    moved = children["position"] - surfels["position"][[0, 1, 0, 1]]
+    np.testing.assert_allclose(moved, [*along, *-along], atol=1e-6)
     shrunk = np.exp(children["scale"] - surfels["scale"][[0, 1, 0, 1]])
     np.testing.assert_allclose(shrunk, [[event.SPLIT_SCALE, 1], [1, event.SPLIT_SCALE]] * 2, rtol=1e-5)
 
@@ -99,14 +91,14 @@ def test_no_child_is_too_transparent_to_stay() -> None:
     """It would be removed at the next event; while removal waits for a reset, it is split."""
     surfels, error = table(opacity=0.06), np.ones(6)
     assert densify(surfels, error).parent.tolist() == [*range(6)]
-    assert len(densify(surfels, error, options=dataclasses.replace(OPTIONS, prune_opacity=0.0)).parent) == 8
+    assert len(densify(surfels, error, options=replace(OPTIONS, prune_opacity=0.0)).parent) == 8
     with pytest.raises(InputError, match="prune_opacity"):
         densify(table(opacity=0.02), np.zeros(6))
 
 
 def test_faint_surfels_make_room_for_splits() -> None:
     """As many as splits need, the first ones first."""
-    options = dataclasses.replace(OPTIONS, grow=0.5)  # three of six
+    options = replace(OPTIONS, grow=0.5)  # three of six
     for most, kept in ((9, [0, 1, 2, 3, 4, 5]), (8, [0, 1, 2, 3, 5]), (7, [0, 2, 3, 5]), (6, [0, 2, 3, 5])):
         edited = densify(table(), np.zeros(6), most, options=options, faint=np.array([4, 1]))
         assert edited.parent.tolist() == kept, most

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,11 @@ from tests.scenes.highlight import ball, require_same_state, run_folder, small_m
 GAINS = np.array([1.4, 0.7, 0.9])
 WEIGHTS = {name: LOSS_WEIGHTS[name] for name in ("l1", "gain")}
 AFTER = 8
+Picture = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture
-def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def picture(rng: np.random.Generator) -> Picture:
     """Premultiplied radiance, some of it beyond white, and alpha with empty and full pixels."""
     alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
     return rng.uniform(0.01, 0.9, (HEIGHT, WIDTH, 3)) * alpha[..., None], alpha
@@ -44,18 +45,15 @@ def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("has_alpha", [False, True])
-def test_gain_is_found_beside_clipped_pixels(
-    linear: bool, has_alpha: bool, picture: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_gain_is_found_beside_clipped_pixels(linear: bool, has_alpha: bool, picture: Picture) -> None:
     """An 8-bit image clips what the gain makes brighter than white."""
     radiance, alpha = picture
     if not has_alpha:
         radiance, alpha = radiance / np.maximum(alpha, 1e-9)[..., None], np.ones_like(alpha)
     image = shown(radiance, alpha, linear, GAINS)
     if not linear:
-        clipped = reference.display_image(
-            np.minimum(radiance * GAINS, alpha[..., None]), alpha, (1.0, 0.5, 0.25)
-        )
+        limited = np.minimum(radiance * GAINS, alpha[..., None])
+        clipped = reference.display_image(limited, alpha, (1.0, 0.5, 0.25))
         assert np.any(clipped < image - 0.05)
         image = clipped
     view = view_of(image, alpha if has_alpha else None, linear)
@@ -69,7 +67,7 @@ def test_gain_is_found_beside_clipped_pixels(
 
 @pytest.mark.parametrize("linear", [False, True])
 def test_exposure_of_step_and_its_derivative(
-    linear: bool, picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
+    linear: bool, picture: Picture, rng: np.random.Generator
 ) -> None:
     """Value, both modes, against differences of the float64 definition; the prior is part of it."""
     radiance, alpha = (x.astype(np.float32).astype(np.float64) for x in picture)
@@ -86,9 +84,8 @@ def test_exposure_of_step_and_its_derivative(
     def define(log: np.ndarray) -> float:
         image = shown(radiance, alpha, linear, np.exp(log))
         image = encode(image) if linear else image
-        return WEIGHTS["l1"].weight * reference.l1(image, goal, clipped) + WEIGHTS["gain"].weight * float(
-            np.sum(log**2)
-        )
+        prior = WEIGHTS["gain"].weight * float(np.sum(log**2))
+        return WEIGHTS["l1"].weight * reference.l1(image, goal, clipped) + prior
 
     log = np.array([0.3, -0.4, 0.2])
     leaves = [mi.Float(float(value)) for value in log]
@@ -107,7 +104,7 @@ def test_exposure_of_step_and_its_derivative(
     assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
 
 
-def test_gain_of_open_scene_counts_what_lies_behind(picture: tuple[np.ndarray, np.ndarray]) -> None:
+def test_gain_of_open_scene_counts_what_lies_behind(picture: Picture) -> None:
     """Images without alpha show object, surroundings and background at one exposure."""
     radiance, alpha = picture
     behind = np.array([0.3, 0.2, 0.4])
@@ -130,16 +127,16 @@ def exposed(data: Dataset, log: np.ndarray) -> Dataset:
         colour = np.clip(srgb_from_linear(view.colour(data.background) * gain), 0, 1)
         image = (alpha * colour + (1 - alpha) * data.background).astype(np.float32)
         views.append(with_pixels(view, image=image))
-    return dataclasses.replace(data, views=tuple(views))
+    return replace(data, views=tuple(views))
 
 
 @pytest.fixture
 def method(tmp_path: Path) -> Method:
     """Without refinement, so that a few dozen steps settle."""
     small = small_method(tmp_path)
-    rates = dataclasses.replace(small.rates, attribute={"albedo": 0.1, "radiance_sh": 0.1, "opacity": 0.2})
-    small = dataclasses.replace(small, event={"exposure": Exposure(AFTER)}, rates=rates)
-    return dataclasses.replace(small, data=DataOptions(), iterations=120)
+    rates = replace(small.rates, attribute={"albedo": 0.1, "radiance_sh": 0.1, "opacity": 0.2})
+    small = replace(small, event={"exposure": Exposure(AFTER)}, rates=rates)
+    return replace(small, data=DataOptions(), iterations=120)
 
 
 def perfect(data: Dataset) -> Any:
@@ -187,7 +184,7 @@ def test_fit_with_gains_resumes_bit_for_bit(
     stop: int, method: Method, rng: np.random.Generator, tmp_path: Path, one_thread: None
 ) -> None:
     """Stopped before or after the gains begin to learn."""
-    method = dataclasses.replace(method, iterations=AFTER + 6)
+    method = replace(method, iterations=AFTER + 6)
     data = exposed(ball(), rng.uniform(-0.5, 0.3, (6, 3)))
     straight = step_to(Trainer(method, data), method.iterations)
     step_to(Trainer(method, data, run_folder(tmp_path / "run", method)), stop).save()
@@ -196,14 +193,14 @@ def test_fit_with_gains_resumes_bit_for_bit(
     step_to(second, method.iterations)
     assert len(said) == (stop < AFTER) and f"params/{GAIN}" in require_same_state(straight, second)
     second.save()
-    fewer = dataclasses.replace(data, views=data.views[1:])
+    fewer = replace(data, views=data.views[1:])
     with pytest.raises(InputError, match=r"gain: it has \(6, 3\), a fit .* \(5, 3\)"):
         Trainer(method, fewer, Run(tmp_path / "run"))
 
 
 def test_warm_step_with_gains_compiles_nothing(method: Method) -> None:
     """Another view has other gains, and no other kernel; a view's gain moves with its own gradient."""
-    trainer = Trainer(dataclasses.replace(method, event={"exposure": Exposure(2)}), ball())
+    trainer = Trainer(replace(method, event={"exposure": Exposure(2)}), ball())
     step_to(trainer, 16)
     misses = dr.detail.launch_stats()[2]
     step_to(trainer, 20)

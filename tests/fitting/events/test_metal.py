@@ -133,13 +133,8 @@ def test_images_of_a_fit_decide(
     sentence = next(one for one in said if "continues as" in one)
     metal, dielectric = (float(part.split(" dB")[0].split()[-1]) for part in sentence.split(",")[:2])
     value = event.METAL if metal >= dielectric + event.METAL_GAIN else event.DIELECTRIC
-    again, _ = fitted(
-        views,
-        tmp_path / "again",
-        "iterations=4",
-        f"surfels.initial={{metallic={value}}}",
-        "rates.attribute={metallic=0}",
-    )
+    held = f"surfels.initial={{metallic={value}}}", "rates.attribute={metallic=0}"
+    again, _ = fitted(views, tmp_path / "again", "iterations=4", *held)
     assert trainer.iteration == again.iteration == 4
     for name, raw in trainer.surfels.raw.items():
         np.testing.assert_array_equal(raw.numpy(), again.surfels.raw[name].numpy(), name)
