@@ -104,9 +104,6 @@ def threads_each(workers: int, threads: int | None) -> int | None:
     return threads if threads is not None or workers == 1 else max(cores // workers, 1)
 
 
-# ---------- dask.distributed ----------
-
-
 def run_on_cluster(jobs: Sequence[Job], address: str, report: Report) -> None:
     """Run jobs on the scheduler at `address`, whose workers see the same paths; a signal cancels them. A job
     whose worker died continues on another one, at most RETRIES times. Raises InputError without

@@ -158,9 +158,6 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
             row.missing[column.key] = str(reasons[0])
 
 
-# ---------- Markdown ----------
-
-
 def markdown(table: Table) -> str:
     """Return one table per scene, failures, deviations of methods as footnotes, and how it was made."""
     lines: list[str] = []

@@ -18,7 +18,7 @@ from mi_refgs.fitting.image_error import displayed_image, psnr
 from mi_refgs.fitting.initial import converted, with_columns
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import Event
+from mi_refgs.methods.event import Event, register
 from mi_refgs.methods.method import APART, AROUND, LIGHT, Method
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.runs.run import Run
@@ -119,6 +119,22 @@ def hold_out(trainer: Trainer) -> None:
         trainer.use(trainer.whole)
 
 
+@register
+@dataclass(frozen=True)
+class HoldOut(Event[Trainer]):
+    """Begins to hold validation views out, in a new or a resumed fit; the last decision ends it."""
+
+    name: ClassVar[str] = "hold_out"
+    always: ClassVar[bool] = True
+    outside: ClassVar[bool] = True
+
+    def due(self, trainer: Trainer) -> bool:
+        return trainer.validation is None and validates(trainer)
+
+    def apply(self, trainer: Trainer) -> None:
+        hold_out(trainer)
+
+
 def as_decided(method: Method, decisions: Sequence[Mapping[str, Any]]) -> Method:
     """The method with the components that decisions kept; those that it has already change nothing."""
     for row in decisions:
@@ -141,14 +157,9 @@ def differences(run: Run, now: Method) -> dict[str, tuple[Any, Any]]:
     return methods.differences(made, now)
 
 
-# ---------------- a trial ----------------
-
-
 def fork(trainer: Trainer, method: Method) -> Trainer:
-    """Copy a fit to a trainer of another method, at the same iteration, without a run folder.
-
-    What the other method lacks is dropped, SH are cut or filled with zeros, new attributes start as it says.
-    """
+    """Copy a fit to a trainer of another method, at the same iteration, without a run folder; what it lacks
+    is dropped, SH are cut or filled with zeros, new attributes start as it says."""
     state = trainer.state()
     old, rng = part(state, PARAMS), trainer.setup.rng(trainer.iteration, "branch")
     widths = {name: method.surfels.columns(name) for name in method.surfels.names}

@@ -60,10 +60,8 @@ def exchanged(
 
 
 def depth_outside(position: np.ndarray, region: Region, reach: np.ndarray | float = 0.0) -> np.ndarray:
-    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside.
-
-    From planes, it is the distance of the lower ends of what extends by `reach` (N, P) along their normals.
-    """
+    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside; that of
+    the lower ends of what extends by `reach` (N, P) along the normals of planes."""
     sphere = np.linalg.norm(position - np.array(region.centre), axis=1) / region.radius - 1
     below = (reach - region.heights(position)) / region.radius
     return np.asarray(np.maximum(sphere, below.max(axis=1, initial=-np.inf)))

@@ -45,9 +45,6 @@ def clip_highlights(render: Iterable[Float], target: Iterable[Float], clipped: I
     ]
 
 
-# ---------------- image losses ----------------
-
-
 def planes(image: TensorXf) -> list[Float]:
     """The channels (H·W,) of an image (H, W, C), as `mi.render` returns it, under AD."""
     return columns_of(image.array, int(image.shape[-1]))
@@ -67,9 +64,6 @@ def d_ssim(render: Iterable[Float], target: Iterable[Float], width: int, height:
 def alpha_loss(alpha: Float, target: Float) -> Float:
     """Mean absolute difference of accumulated alpha and a mask in [0, 1]."""
     return _mean(_abs(alpha - dr.detach(target)))
-
-
-# ---------------- geometry losses ----------------
 
 
 def normal_consistency(
@@ -111,9 +105,6 @@ def sobel(plane: Float, width: int, height: int) -> tuple[Float, Float]:
     along_x = at[1, -1] - at[-1, -1] + 2 * (at[1, 0] - at[-1, 0]) + at[1, 1] - at[-1, 1]
     along_y = at[-1, 1] - at[-1, -1] + 2 * (at[0, 1] - at[0, -1]) + at[1, 1] - at[1, -1]
     return along_x / 8, along_y / 8
-
-
-# ---------------- priors ----------------
 
 
 def half_metal(metallic: Float, alpha: Float) -> Float:

@@ -1,8 +1,5 @@
 """The light that photographs show: a panorama of the fitted background, near which the environment map stays.
-
-In photographs without alpha the background is what lights the object, so the environment map is compared with
-it, texel by texel. What no photograph shows, such as a ceiling, is left to the reflections.
-"""
+What no photograph shows, such as a ceiling, is left to the reflections."""
 
 from __future__ import annotations
 

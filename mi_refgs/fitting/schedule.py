@@ -106,9 +106,7 @@ class FitSetup:
 
     def crop(self, iteration: int, width: int, height: int) -> tuple[int, int, int, int] | None:
         """Column, row, width and height of the part of an image that an iteration renders; None: all of it.
-
-        A rectangle drawn uniformly among those that overlap the image, then moved into it.
-        """
+        It is drawn uniformly among the rectangles that overlap the image, then moved into it."""
         size = self.method.data.crop_of(width, height)
         if size == (width, height):
             return None
@@ -150,10 +148,8 @@ class FitSetup:
         return groups
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
-        """Raise InputError for a parameter of a state, written to `run`, of another shape than this fit's.
-
-        Rows are compared where they are views, and not where they are surfels or pixels.
-        """
+        """Raise InputError for a parameter of a state, written to `run`, of another shape than this fit's,
+        but for the numbers of surfels and pixels."""
         surfels, around, light = self.method.surfels, self.method.surroundings, self.method.light
         wanted: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
         if self.open_scene and around is not None:
@@ -183,10 +179,8 @@ def learning_rates(
     iterations: int,
     rates: Rates = DEFAULT_RATES,
 ) -> dict[str, LearningRate]:
-    """The rates at which attributes of surfels learn in a fit of so many iterations, by their names.
-
-    extent: of the scene, its units, `Dataset.scene_extent`: positions learn in parts of it.
-    """
+    """The rates at which attributes of surfels learn in a fit of so many iterations, by their names;
+    positions in parts of the scene's extent, scene units (`Dataset.scene_extent`)."""
     groups = {}
     for name in names:
         rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
@@ -200,10 +194,8 @@ GATHERED = "light_gradient"  # name of the gradient of the levels in a checkpoin
 
 
 class SharedPrefilter:
-    """The light of a fit, filtered once for several steps, whose gradients it learns from together.
-
-    Filtering with its adjoint costs a quarter of a step of 200² pixels. `close` ends the steps that share it.
-    """
+    """The light of a fit, filtered once for several steps, whose gradients it learns from together when
+    `close` ends them: filtering costs a quarter of a small step."""
 
     def __init__(self) -> None:
         self._light: PrefilteredLight | None = None  # attached to the environment

@@ -23,8 +23,7 @@ WINDOW_RADIUS = 5  # half width of the 11-pixel window, in pixels [Wang et al. 2
 WINDOW_SIGMA = 1.5  # standard deviation of the window, in pixels [ibid.]
 RUN = 4  # pixels in a row that one lane blurs: they share most of what they read
 C1, C2 = 1e-4, 9e-4  # (0.01 L)² and (0.03 L)² for the dynamic range L = 1 [ibid.]
-RECORDINGS = 8  # image sizes whose kernels are kept ready: to trace them takes as long as to run them
-_replayed = functools.partial(replayed, limit=RECORDINGS)
+_replayed = functools.partial(replayed, limit=8)  # image sizes: to trace takes as long as to run
 
 
 def window() -> list[float]:

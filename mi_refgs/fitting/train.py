@@ -53,10 +53,8 @@ class Trainer:
         tell: Callable[[str], None] = lambda _: None,
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start.
-
-        `targets` of another fit are shared if they are of the same data. `warn` tells of failed steps.
-        """
+        """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start. `targets` of
+        another fit are shared if they are of the same data."""
         method.require_registered()
         require_memory(method, data)
         self.run, self.tell, self.warn = run, tell, warn
@@ -102,8 +100,6 @@ class Trainer:
         self.setup.require_own(state, None if self.run is None else self.run.path)
         self.fit = FitState.from_arrays(self.setup, state)
         self.health.checked = self.fit.iteration
-
-    # ---------------- the present state ----------------
 
     @property
     def method(self) -> Method:
@@ -159,8 +155,6 @@ class Trainer:
             "surfels": sum(table.surfels.count for table in self.fit.tables),
             "skipped_steps": self.health.skipped,
         }
-
-    # ---------------- the loop ----------------
 
     def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
         """Run to the last iteration; an interrupt ends it after the current step, saved, and is passed on.

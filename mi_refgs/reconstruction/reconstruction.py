@@ -130,8 +130,6 @@ class Reconstruction:
             raise InputError("no camera", "camera", type(camera).__name__, remedy)
         return found if size is None else found.resized(size)
 
-    # ---------------- images ----------------
-
     def render(
         self,
         camera: CameraLike = 0,
@@ -224,8 +222,6 @@ class Reconstruction:
         package, and a path that cannot be written."""
         shots = self.provenance.shots(self.trained, "test", "train")
         return formats.write(self.trained, [form], Path(path), shots, options, self.folder)[form]
-
-    # ---------------- changes ----------------
 
     def relight(
         self, light: AnyLight, *, world: bool = False, rotate: float = 0.0, exposure: float = 0.0

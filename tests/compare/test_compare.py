@@ -73,9 +73,6 @@ def compared(ball: Path, variants: Paths, tmp_path_factory: pytest.TempPathFacto
     return folder
 
 
-# ---------- The main job ----------
-
-
 def test_comparison_has_a_run_per_job(compared: Path) -> None:
     for variant, seed in (("tiny", 0), ("other", 0), ("other", 1)):
         run = Run(compared / "runs" / "ball" / variant / f"seed{seed}")
@@ -144,9 +141,6 @@ def test_job_is_finished_with_metrics_of_last_checkpoint(compared: Path, tmp_pat
     assert not jobs.finished(job)
 
 
-# ---------- Crashes ----------
-
-
 def test_crash_is_retried_and_becomes_a_row(
     ball: Path, variants: Paths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,9 +200,6 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: Paths, tmp_path
     lines = (job.run.path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["iteration"] for line in lines] == list(range(10, 151, 10))
     assert (job.run.path / "job.log").read_text().count("resumed at iteration") == 1
-
-
-# ---------- Refusals ----------
 
 
 @pytest.mark.parametrize(

@@ -71,9 +71,6 @@ def scene() -> TrainedScene:
     return balls()
 
 
-# ---------------- selection ----------------
-
-
 @pytest.mark.parametrize(
     ("selection", "count"),
     [
@@ -103,9 +100,6 @@ def test_values_are_activated_attributes(scene: TrainedScene) -> None:
     assert {*fields.names} >= {"albedo.r", "opacity", "metallic", "x", "position.z", "size"}
     for name in fields.names:
         assert fields[name].shape == (2 * HALF,) and fields[name].dtype == np.float64
-
-
-# ---------------- materials ----------------
 
 
 def test_set_is_exact_and_other_surfels_stay_bit_for_bit(scene: TrainedScene) -> None:
@@ -198,9 +192,6 @@ def test_bad_options_are_refused_in_one_sentence(
     assert "\n" not in refused(lambda: edit(scene, **given), message)
 
 
-# ---------------- meshes ----------------
-
-
 def test_cut_removes_a_ball_its_shadow_and_its_reflection() -> None:
     """The rest renders like the other ball without any of the first, mesh included."""
     whole = balls(EnvironmentLight.from_radiance(sky(16)), **TRACED_LIGHT)
@@ -232,9 +223,6 @@ def test_transparent_surfels_lose_their_triangles(scene: TrainedScene) -> None:
         assert mesh is not None and len(mesh.faces) == kept * len(scene.mesh.faces)
 
 
-# ---------------- notes ----------------
-
-
 def test_notes_name_what_stays_as_fitted(scene: TrainedScene) -> None:
     assert edit(scene, set=["roughness=0.1"]).notes == ()
     metal = edit(scene, set=["metallic=1"]).notes
@@ -242,9 +230,6 @@ def test_notes_name_what_stays_as_fitted(scene: TrainedScene) -> None:
     plain = edit(balls(reflectance="radiance", occlusion=False), set=["metallic=1"]).notes
     assert any("metallic: no image of this run depends" in note for note in plain)
     assert edit(balls(diffuse="irradiance", occlusion=False), set=["metallic=1"]).notes == ()
-
-
-# ---------------- run folders ----------------
 
 
 def files(folder: Path) -> dict[str, bytes]:

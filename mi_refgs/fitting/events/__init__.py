@@ -1,4 +1,4 @@
-"""Events of a fit, one file each: its settings, when it is due, and what it does."""
+"""Events of a fit, one file each: its settings, when it is due, what it does. `decide` has `hold_out`."""
 
 ORDER = (
     # After every step:

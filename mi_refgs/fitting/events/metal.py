@@ -1,9 +1,7 @@
 """Choice between metal and dielectric at the start of a fit, surfel by surfel, by a trial of both.
 
-The fit begins twice, once with every surfel metal and once with none, each with its own light and geometry.
-The one that explains the training images better continues, and each of its surfels starts as what explains
-the images around it better. Were metallic to learn freely, a light of another contrast would explain the
-images with values in between.
+The fit begins twice, once with every surfel metal and once with none. The one that explains the training
+images better continues, and each of its surfels starts as what explains the images around it better.
 """
 
 from __future__ import annotations

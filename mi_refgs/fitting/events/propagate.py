@@ -1,7 +1,7 @@
 """Normal propagation: surfels become opaque, and reflective ones grow over their neighbours.
 
-Enlarged opaque surfels cover their neighbours, whose reflections then follow the normals that already explain
-them. [3DGS-DR, Ye et al. 2024, §3.3; material-aware: Ref-Gaussian §3.4]
+Reflections then follow the normals that already explain them. [3DGS-DR, Ye et al. 2024, §3.3; material-aware:
+Ref-Gaussian §3.4]
 """
 
 from __future__ import annotations
@@ -29,10 +29,7 @@ DULL = 0.05  # metallic up to which a surfel's colour gets noise
 @register
 @dataclass(frozen=True)
 class Propagate(Event[Trainer]):
-    """Enlarges the reflective surfels of the object; a rough metal has no sharp reflection.
-
-    Noise on the colour of the others keeps it from explaining reflections.
-    """
+    """Enlarges the reflective surfels of the object; noise keeps the colour of others from reflections."""
 
     name: ClassVar[str] = "propagate"
     when: Window  # iterations at which it happens

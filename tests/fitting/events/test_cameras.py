@@ -107,9 +107,6 @@ def opposed(trainer: Trainer, rows: np.ndarray, index: int, i: int, change: floa
     return moved
 
 
-# ---------------- when they are switched on ----------------
-
-
 @pytest.mark.parametrize("stop", [AFTER - 1, AFTER + 3])
 def test_fit_with_corrections_resumes_bit_for_bit(
     stop: int, method: Method, tmp_path: Path, one_thread: None
@@ -145,8 +142,6 @@ def test_warm_step_with_corrections_compiles_nothing(method: Method) -> None:
     moved = np.flatnonzero(np.any(trainer.fit.params[POSE].numpy() != before, axis=1))
     assert moved.tolist() == [trainer.setup.view(trainer.iteration)]
 
-
-# ---------------- cameras that are recovered ----------------
 
 RADIANCE = """
 iterations = 480
