@@ -226,9 +226,7 @@ def test_bad_input_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_different_image_sizes_are_refused(
-    compared: Path, ball: Path, variants: Paths, tmp_path: Path
-) -> None:
+def test_different_sizes_are_refused(compared: Path, ball: Path, variants: Paths, tmp_path: Path) -> None:
     """Before anything is fitted: two methods, or one and existing runs; and existing runs."""
     smaller = tmp_path / "smaller.toml"
     smaller.write_text(f'extends = "{variants[0]}"\n[data]\ndownscale = 2\n')
@@ -263,9 +261,7 @@ def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:
     assert row.seeds == [1] and "future" in row.failed[0]
 
 
-def test_run_that_was_decided_is_accepted(
-    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_decided_run_is_accepted(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A finished fit that went on with another method is not taken for one of other settings."""
     job = jobs.plan(tmp_path / "out", [ball], ["auto"], [0], Shared("quick", threads=1))[0]
     rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x")]

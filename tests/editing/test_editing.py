@@ -186,9 +186,7 @@ def test_the_background_stays(change: Any) -> None:
         ({"wehre": "x > 0", "set": ["roughness=1"]}, "edit: wehre: unknown option; use some of where, box"),
     ],
 )
-def test_bad_options_are_refused_in_one_sentence(
-    scene: TrainedScene, given: dict[str, Any], message: str
-) -> None:
+def test_bad_options_are_refused(scene: TrainedScene, given: dict[str, Any], message: str) -> None:
     assert "\n" not in refused(lambda: edit(scene, **given), message)
 
 

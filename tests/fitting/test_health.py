@@ -39,9 +39,7 @@ def spoil_gradient(trainer: Trainer, name: str, rows: list[int], views: set[int]
     optimiser.step = step  # type: ignore[method-assign]
 
 
-def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
-    method: Method, tmp_path: Path
-) -> None:
+def test_surfels_with_bad_gradients_are_removed_and_named(method: Method, tmp_path: Path) -> None:
     """Steps on view 2 fail until the next check, every third iteration; then the culprits are gone."""
     still = replace(without(method), iterations=9)
     run = run_folder(tmp_path / "run", still)
@@ -68,9 +66,7 @@ def test_surfels_with_gradient_that_is_not_finite_are_removed_and_named(
 
 @pytest.mark.parametrize("name", ["position", "roughness", "indirect_sh"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_surfels_that_are_not_finite_are_removed_and_fit_goes_on(
-    name: str, value: float, method: Method
-) -> None:
+def test_bad_surfels_are_removed_and_the_fit_goes_on(name: str, value: float, method: Method) -> None:
     said: list[str] = []
     trainer = Trainer(replace(method, iterations=12), ball(), warn=said.append)
     assert trainer.statistics()["loss"] is None  # before the first step

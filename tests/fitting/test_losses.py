@@ -19,6 +19,7 @@ from tests.fitting.image_checks import HEIGHT, WIDTH, check, planes, stack
 from tests.helpers import level_maps
 
 Images = tuple[np.ndarray, np.ndarray]
+Loss = Callable[..., Any]
 
 
 @pytest.fixture
@@ -40,17 +41,13 @@ def d_ssim(image: list[Any], target: list[Any]) -> Any:
         (d_ssim, lambda x, target: 1 - reference.ssim(x, target), 0.008),  # its loop over windows is slow
     ],
 )
-def test_image_losses(
-    loss: Callable[..., Any], define: Callable[..., float], share: float, images: Images
-) -> None:
+def test_image_losses(loss: Loss, define: Loss, share: float, images: Images) -> None:
     image, target = images
     check(lambda x: loss(x, planes(target)), lambda x: define(x, target), image, share)
 
 
 @pytest.mark.parametrize(("loss", "most"), [(losses.l1, 0.0), (d_ssim, 1e-6)])
-def test_equal_images_cost_nothing_and_have_no_slope(
-    loss: Callable[..., Any], most: float, images: Images
-) -> None:
+def test_equal_images_cost_nothing(loss: Loss, most: float, images: Images) -> None:
     leaves = planes(images[0])
     dr.enable_grad(leaves)
     value = loss(leaves, planes(images[0]))

@@ -39,8 +39,11 @@ def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
     return replace(frame, object_alpha=opacity)
 
 
+Picture = tuple[np.ndarray, np.ndarray]
+
+
 @pytest.fixture
-def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def picture(rng: np.random.Generator) -> Picture:
     """Premultiplied radiance below 1, and alpha with empty and full pixels."""
     alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
     colour = linear_from_srgb(rng.uniform(0.05, 0.9, (HEIGHT, WIDTH, 3)))
@@ -48,7 +51,7 @@ def picture(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("linear", [False, True])
-def test_perfect_image_costs_nothing(linear: bool, picture: tuple[np.ndarray, np.ndarray]) -> None:
+def test_perfect_image_costs_nothing(linear: bool, picture: Picture) -> None:
     """8-bit images are composited as displayed, linear ones before they are encoded; either once."""
     data, target = made(linear, *picture)
     weights = {"l1": LossWeight(0.8), "ssim": LossWeight(0.2), "alpha": LossWeight(0.3)}
@@ -56,9 +59,7 @@ def test_perfect_image_costs_nothing(linear: bool, picture: tuple[np.ndarray, np
     assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
 
 
-def test_losses_are_weighed_as_method_says(
-    picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
-) -> None:
+def test_losses_are_weighed_as_method_says(picture: Picture, rng: np.random.Generator) -> None:
     data, target = made(True, *picture)
     radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
     weights = {"l1": LossWeight(0.7), "ssim": LossWeight(0.3), "alpha": LossWeight(0.4)}
@@ -72,9 +73,7 @@ def test_losses_are_weighed_as_method_says(
     np.testing.assert_allclose(error.numpy(), np.mean((shown - goal) ** 2, axis=-1).ravel(), atol=1e-6)
 
 
-def test_priors_are_weighed_as_method_says(
-    picture: tuple[np.ndarray, np.ndarray], rng: np.random.Generator
-) -> None:
+def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Generator) -> None:
     data, target = made(True, *picture)
     radiance, alpha = picture
     maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}

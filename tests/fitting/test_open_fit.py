@@ -99,9 +99,7 @@ def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None
     assert 0.1 < seen.mean() < 0.9 and np.mean(error < 0.05) > 0.2  # the ball hides the rest
 
 
-def test_sparse_points_start_on_their_side_of_border(
-    data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_keep_to_their_side(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SurroundingsOptions, "scattered", 0.0)
     rng = np.random.default_rng(1)
     near, far = rng.normal(size=(2, 30, 3))
@@ -349,9 +347,7 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
         views_of_run(run, method, "test")
 
 
-def test_resume_with_images_of_the_other_kind_changes_nothing(
-    data: Dataset, method: Method, tmp_path: Path
-) -> None:
+def test_resume_with_other_images_changes_nothing(data: Dataset, method: Method, tmp_path: Path) -> None:
     """Images with alpha for an open run, and the reverse: the message names both folders."""
     closed = read_dataset(write_data(tmp_path / "alpha", truth=False), "train")
     for name, own, other in (("open", data, closed), ("closed", closed, data)):

@@ -60,9 +60,8 @@ def _model(shading: str) -> Any:
 
 
 def _traceable(shading: str) -> bool:
-    return _model(shading).visibility == "own" or (
-        _model(shading).visibility == "mirror" and "/pixel" in shading
-    )
+    visibility = _model(shading).visibility
+    return visibility == "own" or (visibility == "mirror" and "/pixel" in shading)
 
 
 RULES = [

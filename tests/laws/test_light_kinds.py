@@ -97,17 +97,15 @@ def test_a_run_saves_what_was_fitted(fitted: tuple[str, Path]) -> None:
         rotation, scale = (state[PARAMS + name][0] for name in (LIGHT_ROTATION, LIGHT_SCALE))
         assert np.all(np.abs([rotation, scale]) > 1e-4) and np.all(np.abs([rotation, scale]) < 0.2)
         found = json.loads((folder / "run" / "light.json").read_text())
-        np.testing.assert_allclose(
-            found["world_from_map"], Rotation.from_rotvec(rotation).as_matrix(), atol=1e-5
-        )
+        turn = Rotation.from_rotvec(rotation).as_matrix()
+        np.testing.assert_allclose(found["world_from_map"], turn, atol=1e-5)
         np.testing.assert_allclose(found["scale"], np.exp(scale), atol=1e-5)
 
 
 def test_resumed_fits_repeat(fitted: tuple[str, Path], tmp_path: Path) -> None:
     _, folder = fitted
     shutil.copytree(folder / "run", tmp_path / "run")
-    newest = Run(tmp_path / "run").checkpoints()[-1]
-    newest.unlink()
+    Run(tmp_path / "run").checkpoints()[-1].unlink()
     assert main(["train", str(folder / "data"), "-o", str(tmp_path / "run"), "--resume"]) == 0
     before, after = state_of(folder / "run"), state_of(tmp_path / "run")
     for name in [name for name in before if LIGHT in name]:
@@ -170,13 +168,8 @@ def test_derivatives_of_rotation_and_scale_with_other_losses(tmp_path: Path) -> 
     sky = 0.6 + 0.3 * lobe_matrices.map_directions(32)
     write_exr(tmp_path / "sky.exr", sky.astype(np.float32))
     (tmp_path / "own.toml").write_text(METHOD.replace("height = 8\n", KINDS["placed"]))
-    more = [
-        "loss.ssim=1",
-        "loss.smooth=0.1",
-        "loss.half_metal=0.1",
-        "loss.normal=0.1",
-        "surfels.initial={metallic=0.9}",
-    ]
+    more = ["loss.ssim=1", *(f"loss.{name}=0.1" for name in ("smooth", "half_metal", "normal"))]
+    more.append("surfels.initial={metallic=0.9}")
     method = methods.load(str(tmp_path / "own.toml"), "quick", [*SETTINGS, *more])
     trainer = Trainer(method, read_dataset(write_data(tmp_path / "data"), "train"))
     trainer.train()

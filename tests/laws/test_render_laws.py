@@ -97,9 +97,8 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
     leaves, image = rendered()
     δ = rng.normal(size=image.shape).astype(np.float32)
     dr.backward(dr.sum(image * upload_tensor(δ), axis=None))
-    reverse = {
-        k: float(np.sum(dr.grad(leaf).numpy().astype(float) * tangents[k])) for k, leaf in leaves.items()
-    }
+    slopes = {key: dr.grad(leaf).numpy().astype(float) for key, leaf in leaves.items()}
+    reverse = {key: float(np.sum(slope * tangents[key])) for key, slope in slopes.items()}
 
     for keys in [*([key] for key in values), list(values)]:
         leaves, image = rendered()

@@ -159,9 +159,7 @@ propagate.when = { start = 0, until = 2_601, every = 650 }
 """Few of these numbers are whole, or multiples of each other, once a preset has scaled them."""
 
 
-def test_every_preset_has_the_same_events_in_the_same_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_preset_has_the_same_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a trainer does over the whole fit, its steps left out."""
     path = tmp_path / "many.toml"
     path.write_text(MANY_EVENTS)

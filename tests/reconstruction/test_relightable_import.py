@@ -110,9 +110,7 @@ def test_preset_chooses_the_size_of_the_views(
     assert seen == [{(side, side)}] and not (tmp_path / "run").exists()
 
 
-def test_views_of_given_cameras(
-    ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_given_cameras(ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every eighth is a test view; their sizes and lenses are theirs."""
     shots = shots_around(mi_refgs.import_splats(ball).trained.surfels, {"train": 10})
     poses = [shot.camera.pose() for shot in shots]

@@ -56,9 +56,7 @@ def test_flipped_bit_anywhere_is_found(state: State, rng: np.random.Generator) -
     checkpoint.decode(bytes(data))
 
 
-def test_another_version_and_an_unknown_attribute_are_named(
-    state: State, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_version_and_unknown_attribute_are_named(state: State, monkeypatch: pytest.MonkeyPatch) -> None:
     odd = checkpoint.encode(state | {"params/colour": state["params/albedo"]})
     with pytest.raises(UnknownNameError, match="surfels: 'colour' is unknown"):
         checkpoint.decode(odd)
@@ -89,9 +87,7 @@ def test_resume_goes_on_from_checkpoint_before_and_says_so(
     assert checkpoint.read(newest)["iteration"] == 6 and run.checkpoints() == [before, newest]
 
 
-def test_fit_is_not_begun_anew_when_every_checkpoint_is_damaged(
-    finished: Path, data: Path, tmp_path: Path
-) -> None:
+def test_no_fit_begins_anew_over_damaged_checkpoints(finished: Path, data: Path, tmp_path: Path) -> None:
     run = Run(copytree(finished, tmp_path / "run"))
     for path in run.checkpoints():
         damage(path, "half")

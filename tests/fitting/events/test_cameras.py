@@ -52,9 +52,7 @@ def world_motion(trainer: Trainer, index: int) -> np.ndarray:
     return np.asarray(trainer.camera(index).pose() @ np.linalg.inv(old))
 
 
-def test_corrections_are_motions_about_focus_without_their_mean(
-    method: Method, rng: np.random.Generator
-) -> None:
+def test_corrections_are_motions_about_focus_without_their_mean(method: Method) -> None:
     """A motion that all cameras have in common is none; others are rotations about the focus."""
     trainer = Trainer(method, ball())
     axes = np.stack([view.to_world[:3, :3] for view in trainer.data.views])
@@ -108,9 +106,7 @@ def opposed(trainer: Trainer, rows: np.ndarray, index: int, i: int, change: floa
 
 
 @pytest.mark.parametrize("stop", [AFTER - 1, AFTER + 3])
-def test_fit_with_corrections_resumes_bit_for_bit(
-    stop: int, method: Method, tmp_path: Path, one_thread: None
-) -> None:
+def test_fit_resumes_bit_for_bit(stop: int, method: Method, tmp_path: Path, one_thread: None) -> None:
     """Stopped before or after cameras begin to learn; recorded poses are those of the fit."""
     straight = step_to(Trainer(method, ball()), AFTER + 6)
     run = run_folder(tmp_path / "run", method)

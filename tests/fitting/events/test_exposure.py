@@ -66,9 +66,7 @@ def test_gain_is_found_beside_clipped_pixels(linear: bool, has_alpha: bool, pict
 
 
 @pytest.mark.parametrize("linear", [False, True])
-def test_exposure_of_step_and_its_derivative(
-    linear: bool, picture: Picture, rng: np.random.Generator
-) -> None:
+def test_exposure_and_its_derivative(linear: bool, picture: Picture, rng: np.random.Generator) -> None:
     """Value, both modes, against differences of the float64 definition; the prior is part of it."""
     radiance, alpha = (x.astype(np.float32).astype(np.float64) for x in picture)
     goal = shown(rng.uniform(0.01, 0.5, radiance.shape) * alpha[..., None], alpha, linear)
@@ -152,9 +150,7 @@ def perfect(data: Dataset) -> Any:
     return frame
 
 
-def test_gains_begin_as_those_of_the_images(
-    method: Method, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gains_of_images(method: Method, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Up to the mean of all views, less the dead zone; images of one exposure have none."""
     log, said = rng.uniform(-0.5, 0.3, (12, 3)), list[str]()
     monkeypatch.setattr(Trainer, "view", perfect(ball(views=12)))

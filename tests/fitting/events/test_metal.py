@@ -59,9 +59,7 @@ def judged(
 
 
 @pytest.mark.parametrize("better", ["dielectric", "metal"])
-def test_the_gain_of_metal_decides(
-    better: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gain_decides(better: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Metal has to gain enough; metallic is held during the trial and learns afterwards."""
     held = event.METAL if better == "metal" else event.DIELECTRIC
     gain = event.METAL_GAIN * (1.01 if better == "metal" else 0.99)
@@ -77,9 +75,7 @@ def test_the_gain_of_metal_decides(
     assert trainer.iteration == 6 and np.abs(found - held).max() > 1e-4 and np.abs(found - held).mean() < 0.1
 
 
-def test_each_region_starts_as_what_explains_it_better(
-    views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_region_has_its_start(views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All images are better as metal in their upper half, so the upper half of the ball starts as metal."""
     upper = (np.arange(SIZE) < SIZE // 2)[:, None]
     judged(monkeypatch, np.where(upper, 0.02, 0.01), np.where(upper, 0.01, 0.02))
