@@ -85,8 +85,7 @@ def region_of_interest(solved: Solved) -> Region:
     """A sphere around the point at which most cameras look, above what supports the object. Its radius is
     that of `region_radius`, smaller or larger if points that half of the cameras see say so."""
     focus = focus_of(solved)
-    distance = np.linalg.norm(solved.origin - focus, axis=1)
-    radius = region_radius(distance, solved.half_angle)
+    radius = region_radius(np.linalg.norm(solved.origin - focus, axis=1), solved.half_angle)
     if not radius > 0:
         what, remedy = "a camera is at the point at which all look", "walk around an object"
         raise InputError(what, "photographs", remedy=remedy)

@@ -83,8 +83,7 @@ def capture(
     if not (last.is_file() and read_json(last).get("key") == key):
         for stale in (*folder.glob(f"{SPARSE}/*.bin"), last):  # without them the folder is no data set
             stale.unlink(missing_ok=True)
-        placed = [copies[name] for name in solved.names]
-        output.write_images(placed, straight, mask_files, folder)
+        output.write_images([copies[name] for name in solved.names], straight, mask_files, folder)
         output.write_model(model, copies, straight, similarity, folder / SPARSE)
     write_region(folder, found)
     draw(folder / PLOT, world, found)

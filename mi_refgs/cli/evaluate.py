@@ -27,8 +27,7 @@ class Eval:
         from mi_refgs.evaluation.evaluate import SHEET, evaluate
         from mi_refgs.runs.run import Run
 
-        folder = Run(self.run_folder)
-        result = evaluate(folder, self.data, progress=True, samples=self.samples)
+        result = evaluate(Run(self.run_folder), self.data, progress=True, samples=self.samples)
         return Result(result, f"{table(result)}\nsheet: {self.run_folder / SHEET}")
 
 

@@ -48,8 +48,7 @@ class Export:
             option = f"--{next(iter(options)).replace('_', '-')}"
             raise InputError("belongs to a format", option, remedy="name it with --to")
         if names and self.output is None:
-            remedy = "say with -o which file or folder to write"
-            raise InputError("names no file", "--to", remedy=remedy)
+            raise InputError("names no file", "--to", remedy="say with -o which file or folder to write")
         folder = Run(self.run_folder)
         method = folder.method()
         state = folder.load_checkpoint()

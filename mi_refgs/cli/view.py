@@ -48,5 +48,4 @@ class View:
         finally:
             page.close()
         shown = page.loop.delivered
-        data = {"url": page.url, "images": shown}
-        return Result(data, f"{shown} images displayed")
+        return Result({"url": page.url, "images": shown}, f"{shown} images displayed")

@@ -109,8 +109,7 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
     alive = np.arange(resolution**3)
     middle = (low + high) / 2
     for view in views:
-        points = low + (centres[alive] + 0.5) * voxel
-        row, column, seen = view.project(points)
+        row, column, seen = view.project(low + (centres[alive] + 0.5) * voxel)
         # The blur is limited to that of a camera one voxel from the centre.
         distance = max(float(np.linalg.norm(middle - view.to_world[:3, 3])), float(voxel.max()))
         blur = 0.5 * float(voxel.max()) * view.fx / distance

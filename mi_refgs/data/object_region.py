@@ -176,8 +176,7 @@ def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatt
     points = np.random.default_rng(0).permutation(points)[: 2 * MOST_POINTS]
     points, link = points[seen(points) >= SEEN_SHARE], scatter.link * region.radius
     if len(points):
-        number = KDTree(points).query_ball_point(points, link, return_length=True)
-        points = points[number >= LINK_COUNT]
+        points = points[KDTree(points).query_ball_point(points, link, return_length=True) >= LINK_COUNT]
     if not len(points):
         return points
     pairs = KDTree(points).query_pairs(link, output_type="ndarray")

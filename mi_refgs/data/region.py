@@ -50,8 +50,7 @@ class Region:
             plane = _numbers(row, 4)
             length = 0.0 if plane is None else float(np.linalg.norm(plane[:3]))
             if plane is None or not length >= 1 / MAX_NUMBER:
-                what = "not [a, b, c, d] of a x + b y + c z ≥ d each"
-                raise InputError(what, source, "planes", remedy)
+                raise InputError("not [a, b, c, d] of a x + b y + c z ≥ d each", source, "planes", remedy)
             a, b, c, d = (number / length for number in plane)
             planes.append((a, b, c, d))
         x, y, z = centre

@@ -235,8 +235,7 @@ def _sample_view(
 ) -> tuple[Float, list[Float]]:
     """Return a view's weight at points (P,), and the weighted COLUMNS: bilinear, of pixels at their depth."""
     # Interleaved rows of pixels: COLUMNS, alpha, depth.
-    normal = safe_normalize(frame.normal)
-    table = dr.ravel(mi.ArrayXf([*materials, *normal, frame.alpha, frame.depth]))
+    table = dr.ravel(mi.ArrayXf([*materials, *safe_normalize(frame.normal), frame.alpha, frame.depth]))
     # Raster positions of the points, and the cosines at which the view sees them.
     local = camera.to_camera(points)
     before = local.z > camera.near

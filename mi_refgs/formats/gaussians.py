@@ -192,8 +192,7 @@ class _ColourFit:
         out = self.ridge[:, :, None] * coefficients
         for camera in self.cameras:
             basis = self._basis(camera)
-            colour = np.einsum("nk,nkc->cn", basis, coefficients)
-            view = _BlendedView.of(self.table, [*colour], camera)
+            view = _BlendedView.of(self.table, [*np.einsum("nk,nkc->cn", basis, coefficients)], camera)
             *sums, _ = view.weighted_sums([dr.detach(plane) for plane in view.planes[:3]])
             out += basis[:, :, None] * np.stack(sums, axis=1)[:, None]
         return out

@@ -34,8 +34,7 @@ def shots_around(
     middle = _middle(position, weight)
     deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)
     far = np.linalg.norm(position - middle, axis=1) + SIGMAS * deviation
-    reach = weighted_quantile(far, weight, INSIDE)
-    radius = max(reach, 1e-6) * 1.1
+    radius = max(weighted_quantile(far, weight, INSIDE), 1e-6) * 1.1
     distance = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     focal = size / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     shots = []

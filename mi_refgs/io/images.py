@@ -50,8 +50,7 @@ def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     if factor == 1:
         return image
     height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
-    whole = image[: height * factor, : width * factor]
-    blocks = whole.reshape(height, factor, width, factor, channels)
+    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, channels)
     return blocks.mean(axis=(1, 3), dtype=np.float64).astype(image.dtype)
 
 
@@ -184,5 +183,4 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
     `replace_file`."""
     from PIL import Image
 
-    pixels = to_8_bits(image)
-    replace_file(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG"))
+    replace_file(path, lambda temporary: Image.fromarray(to_8_bits(image)).save(temporary, format="PNG"))

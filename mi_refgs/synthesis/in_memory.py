@@ -60,8 +60,7 @@ def traced(
         view = replace(view, name=f"r_{len(views):03d}", pixels=compose(image, WHITE), normal=normal)
         depth = None if depth is None else depth[..., 0]
         views.append(replace(view, depth=depth, materials=found, is_linear_radiance=True))
-    background = np.full(3, WHITE, np.float32)
-    data = Dataset(path, split, tuple(views), background, True, None, region=region)
+    data = Dataset(path, split, tuple(views), np.full(3, WHITE, np.float32), True, None, region=region)
     near = NEAR_EXTENTS * data.scene_extent
     return replace(data, views=tuple(replace(view, near=near) for view in views))
 

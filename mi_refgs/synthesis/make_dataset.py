@@ -73,8 +73,7 @@ def make_dataset(
     if not (out / SURFACE).exists():
         voxel = 2 * cameras.radius / SURFACE_VOXELS
         write_mesh(out / SURFACE, Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel))
-    tracer = Tracer(loaded, cameras)
-    write_views(out, ("train", "test"), tracer, MAPS, progress)
+    write_views(out, ("train", "test"), Tracer(loaded, cameras), MAPS, progress)
     for other, scene_there in zip(others, relit, strict=True):
         alone = Tracer(scene_there, replace(cameras, objects=()))
         write_views(out / RELIGHT / other.name, ("test",), alone, {}, progress)

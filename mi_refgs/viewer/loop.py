@@ -145,8 +145,7 @@ class RenderLoop:
         # One sample per pixel, added to those before.
         width, height = resolution.size_of(side, resolution.shape_of(*window))
         offset = resolution.offset_of(progress - LARGE) if progress >= LARGE else (0.0, 0.0)
-        camera = pose.camera(width, height, offset)
-        planes = self.scene.draw(camera, look, progress >= LARGE)
+        planes = self.scene.draw(pose.camera(width, height, offset), look, progress >= LARGE)
         sums = [a + b for a, b in zip(sums, planes, strict=True)] if sums else planes
         dr.eval(sums)
         shown = None  # the mean as an image

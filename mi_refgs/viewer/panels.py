@@ -193,8 +193,7 @@ def write_view(
         shown = straight_srgb(values * np.array([2.0**look.exposure] * 3 + [1], np.float32))
     else:
         shown = image_array(displayed_planes(planes, look, scene.depths(pose)), height, width)
-        alpha = image_array(planes[-1], height, width)[..., None]
-        values = np.concatenate([values, alpha], axis=-1)
+        values = np.concatenate([values, image_array(planes[-1], height, width)[..., None]], axis=-1)
     make_folder(folder)
     stems = (f"view_{number:03d}" for number in itertools.count())
     stem = next(stem for stem in stems if not any(folder.glob(f"{stem}.*")))

@@ -58,8 +58,7 @@ def splits_of(run: Run, data: Path | None, tell: Tell) -> dict[str, Dataset]:
     if data is not None or (run.path / DATASET).is_file():
         for split in ("train", "test"):
             try:
-                views = views_of_run(run, method, split, data)
-                found[split] = with_poses(views, run.cameras())
+                found[split] = with_poses(views_of_run(run, method, split, data), run.cameras())
             except InputError as error:
                 if data is not None:
                     raise

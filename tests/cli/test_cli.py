@@ -93,8 +93,7 @@ def test_train_writes_a_run_folder(finished: Path) -> None:
     assert load_resolved(finished / "config.toml").name == "tiny"
     lines = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4, 6]
-    left_over = [path.name for path in finished.rglob("*") if path.name.startswith(".")]
-    assert left_over == [MARK]
+    assert [path.name for path in finished.rglob("*") if path.name.startswith(".")] == [MARK]
 
 
 def test_train_warns_about_few_views(
@@ -216,8 +215,7 @@ def test_demo_writes_contact_sheet_once(
     command = ["demo", "-o", str(tmp_path / "demo"), "--json", "--set", *settings]
     assert main(command) == 0
     first = json.loads(capsys.readouterr().out)
-    sheet = Path(first["contact_sheet"])
-    assert sheet.is_file() and first["metrics"]["iterations"] == 2
+    assert Path(first["contact_sheet"]).is_file() and first["metrics"]["iterations"] == 2
     written = {path: path.stat().st_mtime_ns for path in (tmp_path / "demo").rglob("*.[ep]*")}
     assert main(command) == 0
     assert json.loads(capsys.readouterr().out) == first

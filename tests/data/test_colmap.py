@@ -72,8 +72,7 @@ def test_every_lens_model_is_undistorted(model: str, kind: str, tmp_path: Path) 
 def test_unsupported_lens_models_are_refused(kind: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, kind, SHOTS[:2], camera="FOV", values=(*VALUES, 0.01))
     refused(lambda: read_dataset(data, "train"), f"cameras.{kind}: camera 7: the lens model", "undistort")
-    rational = (*VALUES, 0.1, 0, 0, 0, 0, 0.2, 0, 0)
-    WRITERS[kind](data / "sparse/0", SHOTS[:2], "FULL_OPENCV", rational)
+    WRITERS[kind](data / "sparse/0", SHOTS[:2], "FULL_OPENCV", (*VALUES, 0.1, 0, 0, 0, 0, 0.2, 0, 0))
     refused(lambda: read_dataset(data, "train"), "b.png: camera 7: k4, k5, k6:", "undistort")
 
 

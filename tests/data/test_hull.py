@@ -42,8 +42,7 @@ def test_visual_hull_of_sphere_masks_is_the_sphere(rng: np.random.Generator) -> 
     bounds = hull.camera_bounds(views)
     np.testing.assert_allclose(bounds.mean(axis=0), centre, atol=1e-6)
     assert bounds[1, 0] - bounds[0, 0] == pytest.approx(2 * 4 / 1.6 / 2)
-    shape = hull.visual_hull(views, bounds, resolution=40)
-    points, normals = shape.surface_points(4000, rng)
+    points, normals = hull.visual_hull(views, bounds, resolution=40).surface_points(4000, rng)
     assert points.shape == normals.shape == (4000, 3)
     # Half a voxel off in each axis would be 0.054; the mean of 4000 points scatters by 0.013.
     assert np.linalg.norm(points.mean(axis=0) - centre) < 0.035

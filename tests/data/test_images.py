@@ -69,8 +69,7 @@ def test_jpeg_decoder_shrinks_like_averaging(downscale: int, factor: int, tmp_pa
 
 
 def test_image_of_many_bands_equals_whole_image(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).random((3 * BAND + 5, 9, 4))
-    write_png(tmp_path / "a.png", pixels)
+    write_png(tmp_path / "a.png", np.random.default_rng(0).random((3 * BAND + 5, 9, 4)))
     straight = read_png(tmp_path / "a.png")
     straight[..., :3] *= straight[..., 3:]
     for downscale in (1, 2, 7):
@@ -264,8 +263,7 @@ def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPat
 
 def test_crop_of_a_target_is_that_part_of_its_view() -> None:
     """Pixels, masks and rays are those of the whole image; a linear one has no clipped pixels."""
-    data = ball(24, 1)
-    whole = Targets(data, DataOptions())[0]
+    whole = Targets(ball(24, 1), DataOptions())[0]
     part = whole.cropped(8, 16, 10, 5)
     rows = (slice(16, 21), slice(8, 18))
     assert whole.alpha is not None and part.alpha is not None and whole.clipped is not None

@@ -37,8 +37,7 @@ def test_nerfstudio_intrinsics_per_frame(fisheye: bool, tmp_path: Path) -> None:
     shots = [replace(SHOTS[i], lens=lens, focal=f, centre=c) for i, (f, c) in enumerate(frames)]
     model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
     data = write_nerfstudio(tmp_path, shots, camera_model=model, k1=0.05, k2=-0.02, p1=0.0, p2=0.0)
-    views = read_dataset(data, "train").views
-    for view, shot in zip(views, shots[1:], strict=True):
+    for view, shot in zip(read_dataset(data, "train").views, shots[1:], strict=True):
         check(view, shot, tolerance=0.06)
 
 

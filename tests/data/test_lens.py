@@ -73,8 +73,7 @@ def centroid(image: np.ndarray, u: float, v: float) -> tuple[float, float]:
 @pytest.mark.parametrize("name", LENSES)
 def test_undistorted_points_are_those_of_a_pinhole(tmp_path: Path, name: str) -> None:
     """Points of a straight line therefore land on one."""
-    data = read_dataset(dataset(tmp_path, LENSES[name]), "train", images="exr")
-    view = data.views[0].load()
+    view = read_dataset(dataset(tmp_path, LENSES[name]), "train", images="exr").views[0].load()
     assert (view.width, view.height, view.cx, view.cy) == (WIDTH, HEIGHT, PINHOLE["cx"], PINHOLE["cy"])
     assert view.fx / PINHOLE["fl_x"] == pytest.approx(view.fy / PINHOLE["fl_y"])
     image, measured = view.image[..., 0], 0

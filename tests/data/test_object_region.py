@@ -80,8 +80,7 @@ def test_tall_object_is_whole(rng: np.random.Generator) -> None:
     region = object_region(sphere, origins, points, seen)
     assert region.contains(item[item[:, 2] > TABLE + 0.12]).all() and region.estimated
     assert shown_whole(views, region, points)
-    close = views_around((0, 0, 0.3), focal=300.0)
-    assert not shown_whole(close, region, points)
+    assert not shown_whole(views_around((0, 0, 0.3), focal=300.0), region, points)
     few = np.concatenate([table(rng), item[:20]])
     assert object_region(sphere, origins, few, seen).radius == sphere.radius
 

@@ -43,8 +43,7 @@ def test_region_pixels_are_those_whose_rays_hit_it(planes: tuple[Plane, ...]) ->
         found = region_pixels(view, region).ravel()
         assert np.all(found[sure.contains(steps).any(axis=0)])
         assert not np.any(found[~never.contains(steps).any(axis=0)]) and found.any()
-    behind = Region((6.0, 3.0, 1.5), 0.4)
-    assert not region_pixels(view_from(np.array([2.0, 1.0, 0.5])), behind).any()
+    assert not region_pixels(view_from(np.array([2.0, 1.0, 0.5])), Region((6.0, 3.0, 1.5), 0.4)).any()
 
 
 def test_planes_cut_region() -> None:

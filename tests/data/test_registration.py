@@ -61,8 +61,7 @@ def test_a_true_pose_stays_if_renders_lack_detail(view: View) -> None:
     """Renders of half the resolution, as of a blurred fit, are best where the image is."""
 
     def blurred(moved: View) -> np.ndarray:
-        image = box_downscale(render(moved), 2)
-        return image.repeat(2, axis=0).repeat(2, axis=1)
+        return box_downscale(render(moved), 2).repeat(2, axis=0).repeat(2, axis=1)
 
     degrees, moved = errors(registered(view, blurred, DISTANCE).to_world)
     assert degrees < 0.1 and moved < 2e-3

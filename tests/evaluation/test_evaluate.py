@@ -126,8 +126,7 @@ def test_evaluate_measures_the_scene_files(run: Run) -> None:
     fitted = TrainedScene.read(run.path)
     opacity = fitted.surfels.to_numpy() | {"opacity": np.full((fitted.surfels.count, 1), -20.0)}
     write_ply(run.path / "surfels.ply", type(fitted.surfels).from_numpy(opacity))
-    empty = evaluate(run)
-    assert empty["psnr"] < before["psnr"]
+    assert evaluate(run)["psnr"] < before["psnr"]
     note = json.loads((run.path / "model.json").read_text())
     (run.path / "model.json").write_text(json.dumps(note | {"iteration": 3}))
     assert evaluate(run)["psnr"] == pytest.approx(before["psnr"], abs=1e-6)
@@ -135,8 +134,7 @@ def test_evaluate_measures_the_scene_files(run: Run) -> None:
 
 def test_panels_show_every_map_next_to_the_ground_truth(trainer: Trainer, views: Dataset) -> None:
     view = views.views[0].load()
-    shot = images.RenderedView.of(trainer.view(view.camera()), views, view)
-    panels = images.panels(shot, view)
+    panels = images.panels(images.RenderedView.of(trainer.view(view.camera()), views, view), view)
     pairs = ("image: fitted | ground truth", "normals: fitted | ground truth")
     names = [f"{name}: fitted" for name in ("albedo", "metallic", "roughness", "visibility")]
     assert list(panels) == [*pairs, *names]

@@ -47,8 +47,7 @@ def around(count: int = 8) -> list[View]:
 
 
 def ball(radius: float, centre: tuple[float, ...] = (0, 0, 0)) -> Any:
-    shape = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    return shape.apply_translation(centre)
+    return trimesh.creation.icosphere(subdivisions=4, radius=radius).apply_translation(centre)
 
 
 @pytest.mark.parametrize(("radius", "percent"), [(1, 0), (1.1, 5)])

@@ -266,6 +266,5 @@ def test_incomplete_runs_are_refused(
     if "surfels" in change:
         raw = exported.trained.surfels.raw.items()
         change = {"surfels": Surfels({k: v for k, v in raw if k not in ("albedo", "metallic")})}
-    shading = Shading(diffuse="irradiance", occlusion=False)
-    scene = replace(exported.trained, shading=shading, **change)
+    scene = replace(exported.trained, shading=Shading(diffuse="irradiance", occlusion=False), **change)
     assert refused(lambda: write(scene, ["mitsuba"], tmp_path, exported.shots)).startswith(message)

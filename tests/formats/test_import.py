@@ -77,8 +77,7 @@ def their_image(raw: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[np.n
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     coefficients = np.concatenate([raw["dc"][:, :, None], raw["rest"]], axis=2)
     columns = coefficients.transpose(0, 2, 1).reshape(COUNT, -1).astype(np.float64)
-    colour = np.maximum(0, harmonics(columns, towards) + 0.5)
-    maps = oracle.splat(table, colour, camera)
+    maps = oracle.splat(table, np.maximum(0, harmonics(columns, towards) + 0.5), camera)
     return maps.features + (1 - maps.alpha[..., None]) * BACKGROUND, maps.band
 
 

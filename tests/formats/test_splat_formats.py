@@ -119,8 +119,7 @@ def test_unseen_gaussians_get_the_colour_of_neighbours(scene: TrainedScene, shot
     camera = replace(shots[0].camera, width=SIZE // 2)
     table = gaussians(scene, [Shot("only", "train", camera)], 0, False).to_numpy()
     place = camera.to_camera(scene.surfels.position())
-    column = (camera.fx * place.x / place.z + camera.cx).numpy()
-    beside = column > camera.width + 8
+    beside = (camera.fx * place.x / place.z + camera.cx).numpy() > camera.width + 8
     assert beside.sum() > 50 and np.abs(table["radiance_sh"][beside]).max(axis=1).min() > 1e-3
 
 
@@ -191,8 +190,7 @@ def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tm
     q = table.rotation()
     np.testing.assert_allclose(rotation, np.stack([q.x, q.y, q.z, q.w], axis=1), atol=1e-6)
     # SH coefficients by degree and order give the colour of the table in any direction.
-    toward = mi.Vector3f(0.48, -0.6, 0.64)
-    basis = [float(f[0]) for f in sh_basis(toward, 2)]
+    basis = [float(f[0]) for f in sh_basis(mi.Vector3f(0.48, -0.6, 0.64), 2)]
     names = [f"{prefix}:SH_DEGREE_{k}_COEF_{n}" for k in range(3) for n in range(2 * k + 1)]
     colour = sum(column(name) * y for name, y in zip(names, basis, strict=True))
     coefficients = raw["radiance_sh"].reshape(COUNT, 9, 3)

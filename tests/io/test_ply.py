@@ -89,8 +89,7 @@ def test_3dgs_file_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     order += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     columns = {name: rng.normal(size=4).astype(np.float32) for name in order}
     columns |= {name: np.zeros(4, np.float32) for name in ("nx", "ny", "nz")}
-    path = write_file(tmp_path / "3dgs.ply", columns)
-    gaussians = read_ply(path)
+    gaussians = read_ply(write_file(tmp_path / "3dgs.ply", columns))
     assert gaussians.primitive.name == "gaussian" and gaussians.sh_degree() == 3
     np.testing.assert_array_equal(gaussians.to_numpy()["scale"][:, 2], columns["scale_2"])
     write_ply(tmp_path / "again.ply", gaussians)

@@ -56,8 +56,7 @@ def test_commands_exist(page: Path) -> None:
     """Every `refgs` line parses: its command and options are known."""
     from mi_refgs.cli import parse
 
-    text = "\n".join(blocks(page, "sh")).replace("\\\n", " ")
-    for line in text.splitlines():
+    for line in "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines():
         if line.startswith("refgs "):
             parse(shlex.split(line, comments=True)[1:])
 

@@ -88,8 +88,7 @@ def test_unmarked_numbers_are_found() -> None:
 def test_fits_exist() -> None:
     """Scenes and methods; no two fits share a folder; markers name planned fits."""
     for fit in {fit for fits_of in GROUPS.values() for fit in fits_of}:
-        source = SOURCES[fit.source]
-        assert source.folder or (ROOT / "scenes" / f"{fit.source}.xml").is_file()
+        assert SOURCES[fit.source].folder or (ROOT / "scenes" / f"{fit.source}.xml").is_file()
         assert (ROOT / "variants" / f"{fit.method}.toml").is_file()
     for group, planned in GROUPS.items():
         names = {f"{fit.source}_{fit.method}_{key}" for fit in planned for key in tables.NUMBERS}

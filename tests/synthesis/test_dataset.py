@@ -51,8 +51,7 @@ def test_depth_and_normals_are_those_of_the_sphere(made: Path) -> None:
     for split in ("train", "test"):
         for view in read_loaded(made, split).views:
             assert view.depth is not None and view.normal is not None and view.alpha is not None
-            rays = np.array(view.camera().rays()).T
-            points = view.to_world[:3, 3] + rays * view.depth.reshape(-1, 1)
+            points = view.to_world[:3, 3] + np.array(view.camera().rays()).T * view.depth.reshape(-1, 1)
             hit = view.depth.ravel() > 0
             assert 0.6 < hit.mean() < 0.8  # π/4 · 0.95²
             expected = (points[hit] - CENTRE) / RADIUS
@@ -105,8 +104,7 @@ def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
     turn = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 50)
     light = {"type": "envmap", "bitmap": mi.Bitmap(sky(64)), "to_world": turn}
     scene = mi.load_dict({"type": "scene", "e": light})
-    image = environment_image(scene, 64)
-    copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
+    copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(environment_image(scene, 64))})
     directions = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(2000, 3))])
     si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
     si.wi = -mi.Vector3f((directions / np.linalg.norm(directions, axis=1, keepdims=True)).T)

@@ -202,8 +202,7 @@ def test_surface_mesh_is_that_of_the_shapes(made: Path) -> None:
 
 def test_unsupported_shape_is_named(tmp_path: Path) -> None:
     """Before anything is written."""
-    curve = "0 0 0 0.1\n0.3 0 0 0.1\n0.6 0.1 0 0.1\n0.8 0.1 0.2 0.1\n"
-    (tmp_path / "curve.txt").write_text(curve)
+    (tmp_path / "curve.txt").write_text("0 0 0 0.1\n0.3 0 0 0.1\n0.6 0.1 0 0.1\n0.8 0.1 0.2 0.1\n")
     shape = '<shape type="bsplinecurve" id="odd"><string name="filename" value="curve.txt"/></shape>'
     scene = f'<scene version="3.0.0"><emitter type="constant"/>{shape}</scene>'
     (tmp_path / "odd.xml").write_text(scene)

@@ -34,8 +34,7 @@ def test_the_border_is_that_of_the_region(planes: tuple[tuple[float, float, floa
     region = replace(FITTED, planes=planes)
     mesh = border(region)
     assert mesh.is_watertight and np.abs(depth_outside(np.array(mesh.vertices), region)).max() < 0.02
-    inside = mesh.sample(2000) * 0.98 + 0.02 * mesh.centroid
-    assert region.contains(inside).all()
+    assert region.contains(mesh.sample(2000) * 0.98 + 0.02 * mesh.centroid).all()
 
 
 def test_a_box_follows_the_sphere_and_the_table_stays(rng: np.random.Generator) -> None:
@@ -53,8 +52,7 @@ def test_a_box_follows_the_sphere_and_the_table_stays(rng: np.random.Generator) 
 
 def test_a_saved_region_is_that_of_the_next_fit(data: Dataset) -> None:
     """Also far from the origin, where positions are relative to an offset."""
-    file = data.path / "region.json"
-    file.unlink()
+    (data.path / "region.json").unlink()
     far = replace(data, offset=(1000.0, 0.0, 0.0))
     assert f"refgs train {data.path} -o RUN" in save_region(replace(FITTED, estimated=True), far)
     found = read_region(data.path)

@@ -416,8 +416,7 @@ def test_a_saved_image_has_sixteen_samples_per_pixel_and_its_backdrop(
     assert alone[..., 3].min() == 0 and alone[..., 3].max() > 0.9
     draw = replace(photographed, surroundings=None).renderer(aovs=False, samples=16)
     frame = draw(front(1.6).camera(32, 20))
-    wanted = image_array([*frame.radiance, frame.alpha], 20, 32)
-    assert np.abs(alone - wanted).max() < 1e-5
+    assert np.abs(alone - image_array([*frame.radiance, frame.alpha], 20, 32)).max() < 1e-5
 
 
 def test_views_are_numbered_and_saved_with_their_camera(scene: TrainedScene, tmp_path: Path) -> None:
