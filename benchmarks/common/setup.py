@@ -27,14 +27,7 @@ def path_tracer(depth: int) -> Any:
 class Setup:
     """A shape (a dictionary of Mitsuba's) under a light; `settings`: size, timing_size, lattice, batches."""
 
-    def __init__(
-        self,
-        name: str,
-        shape: dict[str, Any],
-        light: Light,
-        look: Look,
-        settings: Any,
-    ) -> None:
+    def __init__(self, name: str, shape: dict[str, Any], light: Light, look: Look, settings: Any) -> None:
         self.name, self.settings, self.albedo = name, settings, np.array(ALBEDO)
         colour = {"type": "rgb", "value": list(ALBEDO)}
         bsdf = {"type": "refgs_bsdf", "albedo": colour, "metallic": 0.5, "roughness": 0.3}

@@ -93,10 +93,7 @@ DECIDED = [Fit(name, preset="quick", samples=16) for name in DECIDED_SCENES]
 TIMED = DECIDED[0]  # the fit of which frames and the viewer are timed
 
 GROUPS: dict[str, list[Fit]] = {
-    "front": [
-        RING,
-        *(Fit(RING.source, method) for method in ("base_3dgs_dr", "base_2dgs", "relighting")),
-    ],
+    "front": [RING, *(Fit(RING.source, method) for method in ("base_3dgs_dr", "base_2dgs", "relighting"))],
     "decisions": DECIDED,
     "images": [fit for own in DECIDED for fit in (own, Fit(own.source, "base_2dgs", "quick"))],
     "relighting": [Fit(name, "relighting", "quick") for name in SHINY],

@@ -107,7 +107,8 @@ def write_images(
         from PIL import Image
 
         camera, image = straight[photograph.copy], folder / IMAGES / photograph.name
-        if camera.undo is None and photograph.as_displayed:
+        turned = photograph.orientation != 1 or photograph.lying
+        if camera.undo is None and photograph.plain and not turned:
             replace_file(image, partial(shutil.copyfile, photograph.path))
         else:
             jpeg = photograph.path.suffix.lower() in (".jpg", ".jpeg")

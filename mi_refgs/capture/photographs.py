@@ -52,11 +52,6 @@ class Photograph:
         return self.size[::-1] if self.orientation in SIDEWAYS else self.size
 
     @property
-    def as_displayed(self) -> bool:
-        """Whether the file can be copied: its pixels are oriented as in the data set, and opaque."""
-        return self.orientation == 1 and not self.lying and self.plain
-
-    @property
     def kept_size(self) -> tuple[int, int]:
         """Width and height in the data set, before undistortion."""
         return self.size[::-1] if self.lying else self.size

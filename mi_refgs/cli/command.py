@@ -43,7 +43,6 @@ _METHOD_HELP = f"method (default: auto, what the scene needs of the full method)
 MethodName = Annotated[str | None, optional("NAME|FILE.toml", help=_METHOD_HELP)]
 _PRESET_HELP = f"length of the fit, or its ITERATIONS:SURFELS (default: {DEFAULT_PRESET})"
 Preset = Annotated[str | None, optional("{quick,standard,paper}|N:N", help=_PRESET_HELP)]
-Words = Annotated[tuple[str, ...], optional("NAME …")]  # a list, separated by spaces or commas
 
 
 def separated(values: Iterable[str]) -> list[str]:

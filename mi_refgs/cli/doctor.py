@@ -17,12 +17,7 @@ from mi_refgs.cli.command import Common, Result, optional
 
 PROBE_TIMEOUT = 60.0  # time limit of the trial kernel in seconds; it usually takes half a second
 
-EXTRAS = {
-    "lpips": "lpips",
-    "capture": "pycolmap",
-    "view": "viser",
-    "export": "xatlas",
-}
+EXTRAS = {"lpips": "lpips", "capture": "pycolmap", "view": "viser", "export": "xatlas"}
 """Extra of pyproject.toml that a command requires → a distribution that it installs."""
 
 # Runs in a separate process, because an LLVM that cannot compile this kernel aborts instead of raising.

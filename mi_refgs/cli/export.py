@@ -5,16 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, make_dataclass
 from typing import Annotated, Any
 
-from mi_refgs.cli.command import (
-    OptionalOutput,
-    OtherData,
-    Rendering,
-    Result,
-    RunFolder,
-    Words,
-    optional,
-    separated,
-)
+from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result, RunFolder, optional, separated
 from mi_refgs.errors import InputError, SceneError
 from mi_refgs.io.progress import say
 
@@ -28,7 +19,7 @@ class Export:
     run_folder: RunFolder
     output: OptionalOutput = None
     """folder (default: RUN itself); with --to the file, or the folder of several"""
-    to: Words = ()
+    to: tuple[str, ...] = ()
     data: OtherData = None
     format: Any = None
     common: Rendering = Rendering()

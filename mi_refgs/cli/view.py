@@ -10,10 +10,6 @@ from tyro.conf import arg
 from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result, RunFolder
 from mi_refgs.io.progress import say
 
-HOST = "127.0.0.1"
-Port = Annotated[int, arg(metavar="P", help="port of the page")]
-PORT = 8080
-
 
 @dataclass(frozen=True, kw_only=True)
 class View:
@@ -26,8 +22,9 @@ class View:
     run_folder: RunFolder
     output: OptionalOutput = None
     """folder of saved views (default: RUN/views)"""
-    port: Port = PORT
-    host: Annotated[str, arg(metavar="ADDRESS")] = HOST
+    port: Annotated[int, arg(metavar="P")] = 8080
+    """port of the page"""
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
     """address to listen at; 0.0.0.0 makes the page available to other machines, too"""
     data: OtherData = None
     common: Rendering = Rendering()

@@ -275,19 +275,9 @@ def read_dataset(
         points = None if points is None else replace(points, position=points.position - offset)
         position = f"({x:.12g}, {y:.12g}, {z:.12g})"
         notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
-    return Dataset(
-        path,
-        split,
-        views,
-        np.full(3, BACKGROUNDS[background], dtype=np.float32),
-        images == "exr",
-        found.environment,
-        points,
-        region,
-        notes,
-        (x, y, z),
-        downscale=options.downscale,
-    )
+    colour, about = np.full(3, options.background, dtype=np.float32), (points, region, notes, (x, y, z))
+    known = (colour, images == "exr", found.environment, *about)
+    return Dataset(path, split, views, *known, downscale=options.downscale)
 
 
 def require_no_data(path: Path) -> None:

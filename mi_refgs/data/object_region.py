@@ -148,8 +148,7 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
 
 
 def _ball_beside_cameras(group: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) in a group (N, 3) around which a ball free of cameras has most of it; radius for all of
-    it."""
+    """Centre (3,) in a group (N, 3) around which a ball free of cameras has most; radius for all of it."""
     middle = group.mean(axis=0)
     outwards = group[evenly_spread(len(group), BALL_CENTRES)] - middle
     centres = np.concatenate([middle + share * outwards for share in BALL_SHARES])

@@ -300,10 +300,7 @@ def _beside(image: Path, ending: str) -> Path | None:
 
 
 def _shiny_blender_maps(
-    image: Path,
-    shape: tuple[int, int],  # of the image file
-    downscale: int,
-    straight: Undistortion | None,
+    image: Path, shape: tuple[int, int], downscale: int, straight: Undistortion | None
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """World normals n (h, w, 3) in 8 bits as (n + 1) / 2, and depths z (h, w, 1) as 1 / (1 + z), 0 off the
     object, beside an image of Shiny Blender; None without a file. [Ref-NeRF, Verbin et al. 2022]"""

@@ -64,13 +64,9 @@ class TrueSurface:
         return (visibility.reshape(view.depth.shape) < CONCAVE_BELOW) & (view.depth > 0)
 
 
-def ambient_visibility(
-    occluder: Occluder,
-    point: Point3f,  # (P,)
-    normal: Vector3f,  # (P,) unit
-    active: Bool = True,  # (P,)
-) -> Float:
-    """Return the fraction (P,) of cosine-weighted rays that the mesh does not block; 1 if not `active`."""
+def ambient_visibility(occluder: Occluder, point: Point3f, normal: Vector3f, active: Bool = True) -> Float:
+    """Return the fraction of cosine-weighted rays around unit normals that the mesh does not block; 1 if not
+    `active`; all (P,)."""
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     count = dr.opaque(mi.UInt32, OPEN_RAYS)
     active = mi.Bool(active) & (dr.squared_norm(normal) > 0)

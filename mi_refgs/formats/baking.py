@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,7 @@ from scipy import ndimage
 
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError, SceneError
-from mi_refgs.formats.format import Shot, import_extra, remember_last
+from mi_refgs.formats.format import Shot, import_extra
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
 from mi_refgs.occlusion.mesh import Mesh, clean
@@ -56,8 +57,8 @@ class TexturedMesh:
     light: EnvironmentLight
 
 
-@remember_last
-def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int) -> TexturedMesh:
+@lru_cache(maxsize=1)  # for the next format of the same scene
+def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: int) -> TexturedMesh:
     """Bake the object to a mesh of at most about `faces` triangles with textures of texture² texels.
     Background Gaussians are left out (`runs.relightable` says which materials the object gets). Raises
     InputError for a scene without mesh, light or materials, numbers out of range, and missing packages."""
@@ -95,16 +96,8 @@ def bake(trained: TrainedScene, shots: Sequence[Shot], faces: int, texture: int)
         found = _mean_of_views(pairs, points, start, OFFSET_VOXELS * mesh.voxel)
     count = len(mesh.vertices)
     maps = _padded(covered, found[count:, :5])
-    return TexturedMesh(
-        vertices=mesh.vertices[vertex],
-        normals=found[:count, 5:][vertex],
-        uv=uv.astype(np.float32),
-        faces=cut_faces,
-        albedo=maps[..., :3],
-        metallic=maps[..., 3],
-        roughness=maps[..., 4],
-        light=scene.light,
-    )
+    shape = (mesh.vertices[vertex], found[:count, 5:][vertex], uv.astype(np.float32), cut_faces)
+    return TexturedMesh(*shape, maps[..., :3], maps[..., 3], maps[..., 4], scene.light)
 
 
 def simplified(mesh: Mesh, faces: int) -> Mesh:

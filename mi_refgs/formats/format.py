@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
-from weakref import WeakKeyDictionary
+from typing import TYPE_CHECKING, Any, cast
 
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import make_folder
@@ -85,21 +83,6 @@ def import_extra(name: str) -> Any:
     except ImportError:
         remedy = 'pip install "mi_refgs[export]"'
         raise InputError(f"{name} is not installed", "--to", remedy=remedy) from None
-
-
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def remember_last(function: F) -> F:
-    """Keep the last result of a function per scene, as long as the scene exists, for the next format."""
-    results: WeakKeyDictionary[TrainedScene, tuple[Any, Any]] = WeakKeyDictionary()
-
-    def cached(scene: TrainedScene, *args: Any) -> Any:
-        if scene not in results or results[scene][0] != args:
-            results[scene] = args, function(scene, *args)
-        return results[scene][1]
-
-    return cast(F, functools.wraps(function)(cached))
 
 
 def write(

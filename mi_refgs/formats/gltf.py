@@ -33,7 +33,7 @@ def write_mesh(
     trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int, texture: int
 ) -> list[Path]:
     """glTF 2.0 in one file, metres, +y up: (x, y, z) becomes (x, z, −y); without an environment light."""
-    made = bake(trained, shots, faces, texture)
+    made = bake(trained, tuple(shots), faces, texture)
     # By the specification, roughness is green and metallic is blue.
     surface = np.stack([np.zeros_like(made.roughness), made.roughness, made.metallic], axis=-1)
     material = PBRMaterial(

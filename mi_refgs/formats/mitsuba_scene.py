@@ -39,7 +39,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     The parameters of `principled` are those of a run: its specular 0.5 reflects 0.04 at normal incidence.
     Only the base colour of dielectrics is lower by 4 to 8 %, because `principled` has another diffuse base.
     """
-    made = bake(trained, shots, faces, texture)
+    made = bake(trained, tuple(shots), faces, texture)
     make_folder(target)
     mesh = trimesh.Trimesh(made.vertices, made.faces, vertex_normals=made.normals, process=False)
     mesh.vertex_attributes.update({"s": made.uv[:, 0], "t": 1 - made.uv[:, 1]})  # v: from the first row

@@ -21,7 +21,9 @@ from mi_refgs.io.files import require_file
 optional = partial(arg, help_behavior_hint="")
 Count = Annotated[int, arg(metavar="N")]
 Range = tuple[float, float]
-OPTIONS = {"spp": "--samples", "test_views": "--test-views", "resolution": "--size"}  # of `refgs dataset`
+OPTIONS = {"spp": "--samples", "test_views": "--test-views", "resolution": "--size", "height": "--size"}
+OPTIONS |= {"objects": "--object", "scene": "the scene file", "scene_sha256": "the scene file"}
+"""Options of `refgs dataset` that set a field, or the scene file."""
 WHOLE = (lambda n: n >= 1 and n % 1 == 0, "give a whole number of at least 1")
 RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("views", "spp", "max_depth", "test_views"), WHOLE),

@@ -16,7 +16,7 @@ from mi_refgs.io.exr import mitsuba_exr
 from mi_refgs.io.files import make_folder, read_json, write_json
 from mi_refgs.shade.light.latlong import Z_UP
 from mi_refgs.shade.light.light_file import read_radiance
-from mi_refgs.synthesis.options import LightFile
+from mi_refgs.synthesis.options import OPTIONS, LightFile
 from mi_refgs.types import Scene
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
@@ -89,7 +89,8 @@ def prepare_folder(
     if not found and out.is_dir() and any(out.iterdir()):
         raise InputError("not empty, and no data set of this command", out, "output", "choose another folder")
     # Files that do not match the settings or a light, and the options that say so.
-    changed = [*dict.fromkeys(_option(name) for name in wanted if found and found.get(name) != wanted[name])]
+    other = [name for name in wanted if found and found.get(name) != wanted[name]]
+    changed = [*dict.fromkeys(OPTIONS.get(name) or f"--{name.replace('_', '-')}" for name in other)]
     stale = [*FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in FILES)] if changed else []
     lights = {} if changed else recorded_lights(record)
     for light in relight:
@@ -105,13 +106,6 @@ def prepare_folder(
     for folder in (out / "train", out / "test", *(out / RELIGHT / name / "test" for name in lights)):
         make_folder(folder)
     write_json(record, wanted | {RELIGHT: lights})
-
-
-def _option(field: str) -> str:
-    """The option of `refgs dataset` that sets a field, or the scene file."""
-    names = {"scene": "the scene file", "scene_sha256": "the scene file", "height": "--size"}
-    names |= {"objects": "--object", "spp": "--samples"}
-    return names.get(field) or f"--{field.replace('_', '-')}"
 
 
 def recorded_lights(record: Path) -> dict[str, str]:

@@ -20,8 +20,9 @@ from mi_refgs.render.display import image_array
 from mi_refgs.types import Float
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.pose import Pose
+from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
-from mi_refgs.viewer.viewer_scene import DisplayOptions, ViewerScene, displayed_planes
+from mi_refgs.viewer.viewer_scene import DisplayOptions, displayed_planes
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class Client:
 class RenderLoop:
     """Draws a scene for clients; `step` and `run` belong to the render thread, the rest to any thread."""
 
-    def __init__(self, scene: ViewerScene, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, scene: ReconstructionView, clock: Callable[[], float] = time.monotonic) -> None:
         self.scene, self.clock = scene, clock
         self.clients: dict[int, Client] = {}  # changed by any thread
         self.look = DisplayOptions(backdrop=scene.backdrops[0])

@@ -20,8 +20,8 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
+from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, COARSEST, DONE
-from mi_refgs.viewer.viewer_scene import ViewerScene
 
 MOVING_JPEG, STILL_JPEG = 70, 92
 """JPEG qualities during motion, and at rest until the supersampled image, a PNG."""
@@ -59,7 +59,7 @@ class Page:
 
     def __init__(
         self,
-        scene: ViewerScene,
+        scene: ReconstructionView,
         data: Mapping[str, Dataset],  # the available splits: "train", "test"
         title: str,
         address: tuple[str, int],  # host and port

@@ -25,8 +25,10 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float
+from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import SAMPLES
-from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, ViewerScene, backdrops_of
+from mi_refgs.viewer.viewer_scene import BACKDROPS, BACKGROUND, ENVIRONMENT, IMAGE, DisplayOptions, planes_of
 
 Change = Callable[[TrainedScene], TrainedScene]
 """An edit of a scene that keeps number and order of its surfels."""
@@ -51,8 +53,9 @@ def variables_of(surfels: Surfels, shading: Shading) -> tuple[str, ...]:
     return (IMAGE, *maps, "normal", "depth", "alpha", *traced, *terms)
 
 
-class ReconstructionView(ViewerScene):
-    """A `TrainedScene` of which parts change; only what depends on a change is computed again."""
+class ReconstructionView:
+    """A `TrainedScene` that a page displays and of which parts change: only what depends on a change is
+    computed again. The methods are called on the render thread."""
 
     def __init__(self, scene: TrainedScene, region: Region | None = None) -> None:
         """Display a scene, whose data set may have a region of interest."""
@@ -60,7 +63,9 @@ class ReconstructionView(ViewerScene):
         self.centre, self.radius = bounds_of(scene.surfels, region)
         self.can_turn = scene.light is not None and scene.shading.model.light != "none"  # its environment map
         self.variables = variables_of(scene.surfels, scene.shading)
-        self.backdrops = backdrops_of(scene.surroundings is not None, self.can_turn)
+        background = (BACKGROUND,) if scene.surroundings is not None else ()
+        # The first is the initial one.
+        self.backdrops = (*background, *BACKDROPS, *((ENVIRONMENT,) if self.can_turn else ()))
         self.materials = tuple(name for name in ("roughness", "metallic") if scene.surfels.has(name))
         self.can_relight = not lacking(scene)
         self.turn = 0.0  # rotation of the light about z, degrees, counter-clockwise seen from above
@@ -102,7 +107,7 @@ class ReconstructionView(ViewerScene):
         self._stale = True  # caches of the occluder
 
     @property
-    def light(self) -> Light | None:  # type: ignore[override]
+    def light(self) -> Light | None:
         """The rotated light. The angle is opaque, so that no kernel depends on it."""
         if self._filtered is None:
             return None
@@ -111,7 +116,8 @@ class ReconstructionView(ViewerScene):
         return RotatedLight(self._filtered, mi.Matrix3f([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
 
     def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
-        """See `ViewerScene`; with ambient shadows that may be outdated unless it is `settled`."""
+        """Render one sample per pixel, with ambient shadows that may be outdated unless it is `settled`:
+        nothing has moved for a while, so it may take longer."""
         light, scene = self.light, self.scene
         with dr.suspend_grad():
             shading, occluder = scene.shading, self._occluder
@@ -126,6 +132,16 @@ class ReconstructionView(ViewerScene):
             given = (light, occluder, background, scene.near if own else None)
             rendered = SurfelScene(scene.surfels, shading, *given)
             return render(rendered, camera, Request(look.aovs, forward_only=True))
+
+    def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Float]:
+        """Render planes of `planes_of`."""
+        with dr.suspend_grad():
+            return planes_of(self.frame(camera, look, settled), camera, look, self.light)
+
+    def depths(self, pose: Pose) -> tuple[float, float]:
+        """Return the distances of the object's front and back, which are displayed as white and as black."""
+        distance = float(np.linalg.norm(pose.position - self.centre))
+        return max(distance - self.radius, 0.0), distance + self.radius
 
     def fine(self, camera: Camera, look: DisplayOptions, samples: int = SAMPLES) -> Frame:
         """Render an image to save as `refgs render` does, in passes that fit into memory."""

@@ -27,7 +27,6 @@ from mi_refgs.io.images import to_8_bits
 from mi_refgs.methods.read import load
 from mi_refgs.render import passes
 from mi_refgs.render.display import image_array
-from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -39,7 +38,7 @@ from mi_refgs.viewer.panels import light_of, write_view
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE
-from mi_refgs.viewer.viewer_scene import DisplayOptions, ViewerScene, displayed_planes
+from mi_refgs.viewer.viewer_scene import DisplayOptions, displayed_planes
 from tests.helpers import ROOT, refused
 from tests.scenes.known import with_background
 
@@ -124,7 +123,7 @@ def test_oblong_pixels_cover_the_field_of_view_of_square_ones_and_samples_are_of
         assert shift == pytest.approx(offset, abs=1e-5)
 
 
-class Plain(ViewerScene):
+class Plain(ReconstructionView):
     """A grey scene that records the requests."""
 
     variables, backdrops = ("image",), ("white",)
@@ -135,9 +134,6 @@ class Plain(ViewerScene):
         self.settled: list[bool] = []
         self.grey = 0.25
         self.during: Callable[[], None] = lambda: None  # called in each draw
-
-    def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
-        raise AssertionError("`draw` of this scene renders no frame")
 
     def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Any]:
         self.cameras.append(camera)
@@ -309,7 +305,7 @@ def test_the_client_with_least_progress_goes_first_and_closed_pages_are_forgotte
     assert (len(loop.seen), other[-1].progress) == (1, DONE)
 
 
-def shown(scene: ViewerScene | TrainedScene, what: str = "image", **options: Any) -> np.ndarray:
+def shown(scene: ReconstructionView | TrainedScene, what: str = "image", **options: Any) -> np.ndarray:
     """An image (40, 40, 3) of a scene from the front."""
     view = ReconstructionView(scene) if isinstance(scene, TrainedScene) else scene
     look = DisplayOptions(what, **options)
