@@ -22,8 +22,7 @@ class Capture:
 
     photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
     """folder with JPEG or PNG files of one scene"""
-    output: Output
-    """folder of the data set; an interrupted run is continued"""
+    output: Output  # folder of the data set; an interrupted run is continued
     masks: Annotated[Path | None, optional("FOLDER")] = None
     """masks NAME.png, one per photograph, white where the object is"""
     camera_model: Annotated[str | None, optional("MODEL")] = None

@@ -1,6 +1,6 @@
 """What commands share: options, results, and the set-up of Mitsuba. A command is a frozen dataclass whose
-fields are its options (tyro reads names, types, defaults and the strings below them; one is `common`, a
-`Common`), with a method `run` that returns a `Result`."""
+fields are its options (tyro reads names, types, defaults, and comments beside them or strings below; one is
+`common`, a `Common`), with a method `run` that returns a `Result`."""
 
 from __future__ import annotations
 
@@ -59,8 +59,7 @@ def joined(values: Iterable[tuple[str, ...]]) -> list[str]:
 class Common:
     """Options of every command."""
 
-    json: Flag = False
-    """print one JSON object on standard output and nothing else there"""
+    json: Flag = False  # print one JSON object on standard output and nothing else there
     plugin: Annotated[UseAppendAction[tuple[Path, ...]], optional("FILE.py")] = ()
     """run a Python file that registers models, losses and the like; may be repeated"""
 
@@ -73,8 +72,7 @@ class Common:
 class Rendering(Common):
     """Options of commands that run kernels."""
 
-    mitsuba_variant: Annotated[str, arg(metavar="NAME")] = "llvm_ad_rgb"
-    """Mitsuba variant"""
+    mitsuba_variant: Annotated[str, arg(metavar="NAME")] = "llvm_ad_rgb"  # Mitsuba variant
     threads: Annotated[int | None, optional("N", "(default: all cores)")] = None
     """worker threads; with 1, training is reproducible bit for bit"""
 

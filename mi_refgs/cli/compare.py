@@ -39,13 +39,10 @@ class Compare:
       refgs compare data/glossy --methods ref_gaussian base_2dgs --seeds 0 1 -o runs/compare
     """
 
-    data: Annotated[Positional[tuple[Path, ...]], optional("DATA …")] = ()
-    """data sets"""
-    output: Output
-    """folder of the comparison"""
+    data: Annotated[Positional[tuple[Path, ...]], optional("DATA …")] = ()  # data sets
+    output: Output  # folder of the comparison
     methods: Annotated[tuple[str, ...], optional("NAME|FILE.toml …", help=f"{METHODS}, or files")] = ()
-    seeds: Annotated[tuple[str, ...], optional("K …")] = ()
-    """seeds of the fits (default: 0)"""
+    seeds: Annotated[tuple[str, ...], optional("K …")] = ()  # seeds of the fits (default: 0)
     preset: Preset = None
     set: Settings = ()
     workers: Annotated[int | None, optional("N", "(default: 1)")] = None

@@ -23,14 +23,11 @@ class Dataset:
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.xml")]
     """Mitsuba scene with an environment emitter, or lamps"""
-    output: Output
-    """folder of the data set; an interrupted run is continued"""
-    size: Annotated[str, arg(metavar="S|WxH")] = "160"
-    """pixels per side, or width and height"""
+    output: Output  # folder of the data set; an interrupted run is continued
+    size: Annotated[str, arg(metavar="S|WxH")] = "160"  # pixels per side, or width and height
     relight: Annotated[tuple[Path, ...], optional("ENV …")] = ()
     """trace the test views under these maps, too, into relight/NAME; may be added later"""
-    overwrite: Flag = False
-    """replace a data set that was made with other settings"""
+    overwrite: Flag = False  # replace a data set that was made with other settings
     image: DatasetOptions = DatasetOptions()
     common: Rendering = Rendering()
 

@@ -22,8 +22,7 @@ class Demo:
       refgs demo -o runs/demo
     """
 
-    output: Output
-    """folder of the data set and the run"""
+    output: Output  # folder of the data set and the run
     preset: Preset = "quick"
     set: Settings = ()
     common: Rendering = Rendering()

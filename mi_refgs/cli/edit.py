@@ -19,8 +19,7 @@ class Edit:
     """
 
     run_folder: RunFolder
-    output: Output
-    """new run folder"""
+    output: Output  # new run folder
     selection: Selection = Selection()
     change: Change = Change()
     common: Rendering = Rendering()

@@ -26,15 +26,12 @@ class Import:
       refgs import point_cloud.ply -o runs/vase --relightable --preset quick
     """
 
-    file: Annotated[Positional[Path], arg(metavar="FILE.ply")]
-    """3D Gaussians or surfels of any SH degree"""
-    output: Output
-    """new run folder"""
+    file: Annotated[Positional[Path], arg(metavar="FILE.ply")]  # 3D Gaussians or surfels of any SH degree
+    output: Output  # new run folder
     camera: Cameras = None
     """cameras of scene.xml, with --relightable of the views, in the form of transforms.json (default: around
     the object, z up)"""
-    linear: Flag = False
-    """colours are linear radiance, as fitted by this program (default: display-encoded)"""
+    linear: Flag = False  # colours are linear radiance, as fitted by this program (default: display-encoded)
     box: Annotated[Sequence[float] | None, optional("X0 Y0 Z0 X1 Y1 Z1", constructor=Six)] = None
     """import only what has its centre in this axis-aligned box"""
     relightable: Flag = False

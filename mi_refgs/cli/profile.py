@@ -20,8 +20,7 @@ class Profile:
     """
 
     run_folder: RunFolder
-    steps: Annotated[int, arg(metavar="N")] = 15
-    """steps to measure"""
+    steps: Annotated[int, arg(metavar="N")] = 15  # steps to measure
     data: OtherData = None
     common: Rendering = Rendering()
 

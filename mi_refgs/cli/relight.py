@@ -22,12 +22,9 @@ class Relight:
     """
 
     run_folder: RunFolder
-    envmap: Annotated[Path, arg(metavar="FILE")]
-    """lat-long map (EXR, HDR), first row towards +z"""
-    output: OptionalOutput = None
-    """folder of the result (default: RUN/relight/NAME)"""
-    world: Flag = False
-    """the map has world directions already, such as an environment.exr or envmap.exr"""
+    envmap: Annotated[Path, arg(metavar="FILE")]  # lat-long map (EXR, HDR), first row towards +z
+    output: OptionalOutput = None  # folder of the result (default: RUN/relight/NAME)
+    world: Flag = False  # the map has world directions already, such as an environment.exr or envmap.exr
     azimuth: Annotated[float, arg(metavar="DEG")] = 0.0
     """rotation of the map about +z, counter-clockwise seen from above"""
     exposure: Annotated[float, arg(metavar="EV")] = 0.0

@@ -22,16 +22,12 @@ class Render:
       refgs render runs/glossy -o glossy.exr --aov albedo normal
     """
 
-    scene: Annotated[Positional[Path], arg(metavar="RUN|SCENE.xml")]
-    """run folder, or Mitsuba scene"""
-    output: Output
-    """image: .exr (linear, premultiplied alpha) or .png (sRGB, straight alpha)"""
+    scene: Annotated[Positional[Path], arg(metavar="RUN|SCENE.xml")]  # run folder, or Mitsuba scene
+    output: Output  # image: .exr (linear, premultiplied alpha) or .png (sRGB, straight alpha)
     sensor: Annotated[int, arg(metavar="I")] = 0
     """number of the sensor of the scene, or of the camera in --camera"""
-    camera: Cameras = None
-    """cameras in the form of transforms.json, such as the page of `refgs view` saves"""
-    object: Flag = False
-    """render the object without its background, on transparency"""
+    camera: Cameras = None  # cameras in the form of transforms.json, such as the page of `refgs view` saves
+    object: Flag = False  # render the object without its background, on transparency
     samples: Annotated[int | None, optional("N")] = None
     """samples per pixel (default: those of the scene's sampler)"""
     aov: Annotated[tuple[str, ...], optional("NAME …", help=f"more channels of the EXR: {AOVS}")] = ()

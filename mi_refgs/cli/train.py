@@ -30,21 +30,17 @@ class Train:
       refgs train data/glossy -o runs/glossy --preset quick --set loss.alpha=0.1
     """
 
-    data: Annotated[Positional[Path], arg(metavar="DATA")]
-    """data set: a folder of images with cameras"""
-    output: Output
-    """run folder"""
+    data: Annotated[Positional[Path], arg(metavar="DATA")]  # data set: a folder of images with cameras
+    output: Output  # run folder
     method: MethodName = None
     purpose: Annotated[str | None, optional("{photographs,relighting}", name="for")] = None
     """choose the method by a purpose"""
     preset: Preset = None
     light: Annotated[Path | None, optional("FILE")] = None
     """start with this lat-long map (EXR, HDR) as the light; its first row is straight up, +z"""
-    light_fixed: Flag = False
-    """do not change the map of --light"""
+    light_fixed: Flag = False  # do not change the map of --light
     set: Settings = ()
-    resume: Flag = False
-    """continue the run from its newest checkpoint"""
+    resume: Flag = False  # continue the run from its newest checkpoint
     common: Rendering = Rendering()
 
     def run(self) -> Result:

@@ -20,10 +20,8 @@ class View:
     """
 
     run_folder: RunFolder
-    output: OptionalOutput = None
-    """folder of saved views (default: RUN/views)"""
-    port: Annotated[int, arg(metavar="P")] = 8080
-    """port of the page"""
+    output: OptionalOutput = None  # folder of saved views (default: RUN/views)
+    port: Annotated[int, arg(metavar="P")] = 8080  # port of the page
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
     """address to listen at; 0.0.0.0 makes the page available to other machines, too"""
     data: OtherData = None

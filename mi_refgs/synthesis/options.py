@@ -45,12 +45,10 @@ RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
 class DatasetOptions:
     """What determines the pixels of a data set, beside its scene."""
 
-    views: Count = 80
-    """training views"""
+    views: Count = 80  # training views
     test_views: Annotated[int | None, optional(metavar="N")] = None
     """test views (default: a quarter of --views)"""
-    size: Annotated[int | tuple[int, int], Suppress] = 160
-    """pixels per side, or width and height"""
+    size: Annotated[int | tuple[int, int], Suppress] = 160  # pixels per side, or width and height
     spp: Annotated[int, arg(metavar="N", name="samples")] = 128
     """samples per pixel; path tracing is noisy, so that the default is larger than that of other commands"""
     objects: Annotated[tuple[str, ...], optional(metavar="ID …", name="object")] = ()
@@ -58,18 +56,13 @@ class DatasetOptions:
     lamps; all but floors, walls and domes much larger than the rest, if there are any)"""
     distance: Annotated[Range | None, optional(metavar="NEAR FAR")] = None
     """distance of cameras from the object's centre, scene units (default: the object fills the image)"""
-    elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)
-    """elevation of cameras, degrees"""
+    elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)  # elevation of cameras, degrees
     azimuth: Annotated[Range, arg(metavar="LOW HIGH")] = (0.0, 360.0)
     """azimuth of cameras, degrees from +x, counter-clockwise seen from above; less than 360° before a wall"""
-    fov: Annotated[float, arg(metavar="DEG")] = 40.0
-    """field of view of the shorter side"""
-    seed: Count = 0
-    """seed of cameras and paths"""
-    max_depth: Count = 6
-    """largest path depth"""
-    environment_height: Annotated[int, Suppress] = 256
-    """rows of environment.exr; 0 writes none"""
+    fov: Annotated[float, arg(metavar="DEG")] = 40.0  # field of view of the shorter side
+    seed: Count = 0  # seed of cameras and paths
+    max_depth: Count = 6  # largest path depth
+    environment_height: Annotated[int, Suppress] = 256  # rows of environment.exr; 0 writes none
 
     @property
     def resolution(self) -> tuple[int, int]:

@@ -15,9 +15,7 @@ from benchmarks.common import view as common
 from benchmarks.common.errors import Step
 from benchmarks.common.report import where
 from benchmarks.splitsum import budget
-from mi_refgs.reference.light import lobe_average
 from mi_refgs.reference.lobe import split_sum_entry
-from mi_refgs.shade.light import lobe_matrices
 
 BENCHMARK = "splitsum"
 LIGHTS = ("constant", "gradient", "checker", "sunsky")
@@ -88,27 +86,6 @@ def test_integrals_of_a_constant_light_are_the_table(roughness: float) -> None:
         estimate = mc.estimate(batches)
         error = np.abs(estimate.mean[:, 0] - wanted[:, k])
         assert (error < 6 * estimate.error[:, 0] + 1e-4).all() and error.max() < 2e-3
-
-
-def test_lobe_average_is_the_reference_one() -> None:
-    scene, points = sphere(6)
-    roughness, α = 0.6, dr.opaque(mi.Float, 0.36)
-    lobe = mc.integrate(
-        lambda p: mc.prefilter_lobe(p, roughness, α), points, scene.environment(), samples=987
-    )
-    estimate = mc.estimate(lobe[0])
-    normal, towards = (np.array(v, np.float64).T for v in (points.normal, points.view))
-    mirror = 2 * np.sum(normal * towards, -1, keepdims=True) * normal - towards
-    radiance = common.make_light("gradient", 32).radiance.astype(np.float64)
-    for k in range(0, points.count, 5):
-        wanted = lobe_average(radiance, mirror[k], roughness, rings=200, spokes=200)
-        assert (np.abs(estimate.mean[k] - wanted) < 6 * estimate.error[k] + 2e-3 * wanted).all()
-
-
-def test_lights_have_a_mean_of_one() -> None:
-    for light in (common.make_light(name, 64) for name in common.BUILT_IN):
-        mean = np.average(light.radiance.mean((1, 2)), weights=lobe_matrices.row_areas(64))
-        assert mean == pytest.approx(1, rel=2e-3)
 
 
 def test_errors_report_their_noise_floor() -> None:

@@ -134,9 +134,7 @@ def test_second_capture_computes_nothing(captured: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.slow
 @needs_colmap
-def test_interrupted_capture_is_continued(
-    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_capture_goes_on(captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Features and matches that are there are not made again, and the result is that of one run."""
     data = tmp_path / "data"
     command = ["capture", str(captured / "photographs"), "-o", str(data)]
@@ -244,9 +242,7 @@ def _one_place(i: int) -> np.ndarray:
     ],
     ids=["flat", "unrelated", "one place"],
 )
-def test_failed_reconstruction_names_a_remedy(
-    make: Callable[[int], np.ndarray], words: str, tmp_path: Path
-) -> None:
+def test_failed_capture_names_a_remedy(make: Callable[[int], np.ndarray], words: str, tmp_path: Path) -> None:
     for i in range(5):
         scene.save(tmp_path / "photographs" / f"{i}.png", make(i))
     refused(["capture", tmp_path / "photographs", "-o", tmp_path / "data"], words)

@@ -35,9 +35,7 @@ def test_unusable_llvm_is_a_problem_without_cuda(monkeypatch: pytest.MonkeyPatch
     ("code", "words"),
     [("import os; os.abort()", "trial kernel failed"), ("import time; time.sleep(60)", "took longer")],
 )
-def test_failing_or_hanging_kernel_is_a_problem(
-    code: str, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failing_kernel_is_a_problem(code: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_PROBE", code)
     if "sleep" in code:
         monkeypatch.setattr(doctor, "PROBE_TIMEOUT", 0.2)

@@ -26,12 +26,9 @@ class Count:
       refgs count notes.txt -o count.txt
     """
 
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """text file"""
-    output: Output
-    """file of the number"""
-    words: Flag = False
-    """count words instead"""
+    file: Annotated[Positional[Path], arg(metavar="FILE")]  # text file
+    output: Output  # file of the number
+    words: Flag = False  # count words instead
     common: Common = Common()
 
     def run(self) -> Result:

@@ -34,9 +34,7 @@ def tree(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_a_fit_resumes_with_its_own_options_only(
-    finished: Path, data: Path, method: Path, tmp_path: Path
-) -> None:
+def test_a_fit_resumes_with_its_own_options(finished: Path, data: Path, method: Path, tmp_path: Path) -> None:
     """Options that say what a run was started with are no others, in other words too."""
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     argv = [*train_command(data, run, method, "--resume"), "data.downscale=1"]

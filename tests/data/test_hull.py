@@ -15,9 +15,7 @@ from tests.helpers import refused, with_pixels
 BLACK = np.zeros(3)
 
 
-def sphere_views(
-    count: int, size: int, centre: np.ndarray, radius: float, rng: np.random.Generator
-) -> list[View]:
+def spheres(count: int, size: int, centre: np.ndarray, radius: float, rng: np.random.Generator) -> list[View]:
     """Exact masks of a sphere from cameras at distance 4 around it; the image shows the view's number."""
     views = []
     focal = 1.6 * size
@@ -38,7 +36,7 @@ def sphere_views(
 def test_visual_hull_of_sphere_masks_is_the_sphere(rng: np.random.Generator) -> None:
     """Off-centre sphere: points within a voxel of its surface, normals outward within 12° on average."""
     centre = np.array([0.4, -0.3, 0.2])
-    views = sphere_views(40, 64, centre, 0.8, rng)
+    views = spheres(40, 64, centre, 0.8, rng)
     bounds = hull.camera_bounds(views)
     np.testing.assert_allclose(bounds.mean(axis=0), centre, atol=1e-6)
     assert bounds[1, 0] - bounds[0, 0] == pytest.approx(2 * 4 / 1.6 / 2)
@@ -78,7 +76,7 @@ def test_inner_points_are_uniform_across_voxels(rng: np.random.Generator) -> Non
 
 
 def test_empty_hull_and_parallel_cameras_are_refused(rng: np.random.Generator) -> None:
-    views = sphere_views(4, 16, np.zeros(3), 0.8, rng)
+    views = spheres(4, 16, np.zeros(3), 0.8, rng)
     nothing = [with_pixels(view, alpha=np.zeros((16, 16), np.float32)) for view in views]
     refused(lambda: hull.visual_hull(nothing, hull.camera_bounds(views), resolution=8), "inside every mask")
     refused(lambda: hull.camera_bounds(views[:1]), "do not look at one point")

@@ -207,9 +207,7 @@ def test_cached_image_equals_decoded_image(budget: int, tmp_path: Path, rng: np.
     assert cache.bytes <= budget
 
 
-def test_cache_keeps_most_recently_used_images(
-    tmp_path: Path, rng: np.random.Generator, decoded: list[str]
-) -> None:
+def test_cache_keeps_images_used_last(tmp_path: Path, rng: np.random.Generator, decoded: list[str]) -> None:
     for name in "abc":
         write_png(tmp_path / f"{name}.png", rng.random((10, 10, 4)))
     cache = ImageCache(2 * 400)

@@ -104,9 +104,7 @@ def test_other_pixels_are_the_rest(data: Dataset, found: Stereo) -> None:
     assert 0.02 < np.mean(sky) < 1
 
 
-def test_fit_starts_from_stereo(
-    data: Dataset, found: Stereo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fit_of_stereo(data: Dataset, found: Stereo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside the points of the data set; images without texture have those only."""
     monkeypatch.setattr("mi_refgs.fitting.runner.stereo", lambda *_: found)
     method = load("photographs", "8:400", ["data.downscale=1"])

@@ -107,9 +107,7 @@ def test_environment_weighs_by_solid_angle() -> None:
     assert metrics.environment(pole, truth)["env_mae"] < 0.15 * metrics.environment(equator, truth)["env_mae"]
 
 
-def test_missing_extras_say_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
-) -> None:
+def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     for module in ("torch", "lpips"):
         monkeypatch.setitem(sys.modules, module, None)
     image = rng.random((16, 16, 3))

@@ -51,9 +51,7 @@ class SleepyClock(phases.PhaseClock):
 
 
 @pytest.mark.parametrize("place", ["project", "splat forward", "optimiser"])
-def test_time_counts_for_innermost_phase(
-    place: str, trainer: Trainer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_time_is_of_innermost_phase(place: str, trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each is inside `rest`."""
     monkeypatch.setattr(phases, "WARM_UP", 1)
     monkeypatch.setattr(phases, "PhaseClock", lambda: SleepyClock(place))

@@ -121,9 +121,7 @@ def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_imported_gaussians_are_exported_unchanged(
-    name: str, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_imported_gaussians_are_exported_as_is(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
     """Encoded colours are not fitted anew; Gaussians come back bit for bit."""
     theirs, again = tmp_path / "theirs.ply", tmp_path / "again.ply"
     theirs.write_bytes(their_bytes(raw_of(*LAYOUTS[name], rng)))
@@ -181,9 +179,7 @@ def broken(kind: str, whole: bytes) -> bytes:
         ("text", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
     ],
 )
-def test_other_ply_files_are_refused(
-    kind: str, message: str, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_other_files_are_refused(kind: str, message: str, tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / "file.ply"
     path.write_bytes(broken(kind, their_bytes(raw_of(3, 3, rng))))
     refused(["import", path, "-o", tmp_path / "run"], path, message)

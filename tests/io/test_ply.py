@@ -71,9 +71,7 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
-def test_ply_of_other_programs_is_read(
-    kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_ply_of_others_is_read(kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator) -> None:
     """Other formats, other order, unknown properties; absent groups give absent channels."""
     columns = {"confidence": np.ones(4), **dict(reversed(geometry(rng).items()))}
     surfels = read_ply(write_file(tmp_path / "a.ply", columns, kind, dtype))

@@ -70,12 +70,8 @@ def test_a_fit_takes_a_data_set_in_memory(tmp_path: Path) -> None:
     train, test = (Dataset.from_mitsuba(scene(), 3, split=split, **OPTIONS) for split in ("train", "test"))
     options: dict[str, Any] = {"preset": "quick", "settings": SETTINGS, "progress": mi_refgs.Progress()}
     run = mi_refgs.fit(train, write_method(tmp_path), output=tmp_path / "run", **options)
-    assert (
-        mi_refgs.fit(
-            train, output=tmp_path / "run", resume=True, progress=mi_refgs.Progress()
-        ).trained.iteration
-        == 6
-    )
+    again = mi_refgs.fit(train, output=tmp_path / "run", resume=True, progress=mi_refgs.Progress())
+    assert again.trained.iteration == 6
     assert run.render(0, size=8).shape == (8, 8, 4)
     assert run.evaluate(test)["test_views"] == 3
     refused(run.evaluate, "the run records no data set; name one with --data")

@@ -272,9 +272,7 @@ def test_the_last_task_of_a_key_runs_once_and_bad_input_is_reported(loop: Loop) 
     assert progress(loop.seen) == [COARSE, COARSE]  # the first task changed the scene
 
 
-def test_a_failure_is_reported_and_other_clients_continue(
-    loop: Loop, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failure_is_reported_and_others_continue(loop: Loop, capsys: pytest.CaptureFixture[str]) -> None:
     """Failures of a task and of an image; a failed image is drawn again only after a change."""
     loop.submit("a", broken)
     loop.submit("b", loop.move)
