@@ -106,12 +106,8 @@ def _run(argv: list[str]) -> int:
     from mi_refgs.cli.command import UnusableError, finite
     from mi_refgs.runs.interrupt import TerminatedError
 
-    codes: dict[type[BaseException], int] = {
-        InputError: 2,
-        UnusableError: 1,
-        TerminatedError: 143,
-        KeyboardInterrupt: 130,
-    }
+    codes: dict[type[BaseException], int] = {InputError: 2, UnusableError: 1}
+    codes |= {TerminatedError: 143, KeyboardInterrupt: 130}
     try:
         command = parse(argv)
         with _standard_output_to_error():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -71,25 +71,13 @@ class Import:
         from mi_refgs import methods
         from mi_refgs.reconstruction.relightable_import import import_relightable
 
-        found = import_relightable(
-            self.file,
-            self.output,
-            linear=self.linear,
-            box=self.box,
-            cameras=cameras,
-            method=None if self.purpose is None else methods.for_purpose(self.purpose),
-            preset=self.preset,
-        )
+        given: dict[str, Any] = {"linear": self.linear, "box": self.box, "preset": self.preset}
+        given["method"] = None if self.purpose is None else methods.for_purpose(self.purpose)
+        found = import_relightable(self.file, self.output, cameras=cameras, **given)
         trained, dataset = found.trained, str(found.provenance.data)
-        data = {
-            "run": str(self.output),
-            "dataset": dataset,
-            "method": found.method.name,
-            "preset": found.method.preset,
-            "iterations": trained.iteration,
-            "seconds": round(trained.seconds, 3),
-            "surfels": trained.surfels.count,
-        }
+        data: dict[str, Any] = {"run": str(self.output), "dataset": dataset, "method": found.method.name}
+        data |= {"preset": found.method.preset, "iterations": trained.iteration}
+        data |= {"seconds": round(trained.seconds, 3), "surfels": trained.surfels.count}
         text = (
             f"{self.output}: {trained.iteration} iterations in {trained.seconds:.0f} s, "
             f"{trained.surfels.count} surfels, fitted to views in {dataset}; "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
@@ -41,15 +41,9 @@ class Relight:
         from mi_refgs.reconstruction.relight import relight
         from mi_refgs.runs.run import Run
 
-        result = relight(
-            Run(self.run_folder),
-            NewLight(self.envmap, self.world, self.azimuth, self.exposure),
-            self.output,
-            turntable=self.turntable,
-            data=self.data,
-            samples=self.samples,
-            progress=True,
-        )
+        light = NewLight(self.envmap, self.world, self.azimuth, self.exposure)
+        given: dict[str, Any] = {"turntable": self.turntable, "data": self.data, "samples": self.samples}
+        result = relight(Run(self.run_folder), light, self.output, progress=True, **given)
         if result["warning"]:
             warn(f"{self.run_folder}: {result['warning']}")
         lines = [f"{len(result['images'])} images, scene.xml and {result['sheet']} in {result['output']}"]

@@ -55,16 +55,10 @@ class Train:
         fit(self.data, self.method, progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None
-        data: dict[str, Any] = {
-            "run": str(self.output),
-            "method": trainer.method.name,
-            "preset": trainer.method.preset,
-            "iterations": trainer.iteration,
-            "seconds": round(trainer.fit.seconds, 3),
-            "total_seconds": round(taken, 3),
-            "surfels": trainer.surfels.count,
-            "loss": trainer.statistics()["loss"],
-        }
+        data: dict[str, Any] = {"run": str(self.output), "method": trainer.method.name}
+        data |= {"preset": trainer.method.preset, "iterations": trainer.iteration}
+        data |= {"seconds": round(trainer.fit.seconds, 3), "total_seconds": round(taken, 3)}
+        data |= {"surfels": trainer.surfels.count, "loss": trainer.statistics()["loss"]}
         around = trainer.fit.surroundings
         beside = "" if around is None else f" and {around.surfels.count} of the background"
         text = (

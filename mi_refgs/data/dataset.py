@@ -239,9 +239,13 @@ def read_dataset(
         raise InputError(f"{downscale} is out of range", path, "downscale", "give a whole number from 1")
     reader = reader_of(path)
     found = reader.read(path, split, options)
-    if downscale is None and (factor := _fitting(found.views[0], pixels)) > 1:
-        options = replace(options, downscale=factor)
-        found = reader.read(path, split, options)
+    if downscale is None:
+        size = found.views[0].file or found.views[0]
+        most = min(size.width, size.height)
+        fitting = (k for k in range(1, most) if (size.width // k) * (size.height // k) <= pixels)
+        if (factor := next(fitting, most)) > 1:
+            options = replace(options, downscale=factor)
+            found = reader.read(path, split, options)
     views, notes, points = found.views, found.notes, found.points
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
@@ -286,13 +290,6 @@ def require_no_data(path: Path) -> None:
     if any(reader.recognises(folder) for folder in folders for reader in READERS.values()):
         what = "belongs to a data set, which is never overwritten"
         raise InputError(what, path, "output", "choose another output")
-
-
-def _fitting(view: View, pixels: int) -> int:
-    """The smallest `downscale` for which the file of a view has at most so many pixels."""
-    size = view.file or view
-    most = min(size.width, size.height)
-    return next((k for k in range(1, most) if (size.width // k) * (size.height // k) <= pixels), most)
 
 
 def _own_alpha(view: View) -> bool:

@@ -120,9 +120,8 @@ def region_of(views: Sequence[View]) -> Region:
     half_angle = np.array([np.arctan(min(v.width / v.fx, v.height / v.fy) / 2) for v in views])
     radius = region_radius(distance, half_angle)
     if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):
-        raise InputError(
-            "they do not look at one point in front of them", "views", "cameras", "give a region.json"
-        )
+        what = "they do not look at one point in front of them"
+        raise InputError(what, "views", "cameras", "give a region.json")
     x, y, z = (float(c) for c in focus)
     return Region((x, y, z), radius, estimated=True)
 

@@ -1,5 +1,4 @@
-"""Images for display: rendered views, maps as colours, contact sheets, environment maps. All NumPy. An image
-is (H, W, 3), display-encoded, in [0, 1]."""
+"""Images (H, W, 3) for display, encoded, in [0, 1]: views, maps as colours, contact sheets, environments."""
 
 from __future__ import annotations
 

@@ -65,8 +65,7 @@ class TrueSurface:
 
 
 def ambient_visibility(occluder: Occluder, point: Point3f, normal: Vector3f, active: Bool = True) -> Float:
-    """Return the fraction of cosine-weighted rays around unit normals that the mesh does not block; 1 if not
-    `active`; all (P,)."""
+    """Return the fraction (P,) of cosine-weighted rays that the mesh does not block; 1 if not `active`."""
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     count = dr.opaque(mi.UInt32, OPEN_RAYS)
     active = mi.Bool(active) & (dr.squared_norm(normal) > 0)

@@ -1,8 +1,7 @@
 """PLY files of 3D Gaussian Splatting and 2DGS: read as a scene, and written.
 
 Colours of other programs are blended display-encoded (`shade.reflectance.radiance`). Two differences to 2DGS:
-its screen filter has a variance of 1/2 pixel², ours 1/12; and it sorts surfels by the depth of their
-centres."""
+its screen filter has a variance of 1/2 pixel², ours 1/12; and it sorts surfels by their centres."""
 
 from __future__ import annotations
 
@@ -31,8 +30,7 @@ def write(
 
         x y z  nx ny nz  f_dc_0..2  f_rest_0..  opacity  scale_0..2  rot_0..3      little-endian float32
 
-    Logits, logarithms and display-encoded colours, as in `surfels.ply`. The colours are fitted to renders of
-    the training views."""
+    Logits, logarithms and display-encoded colours, as in `surfels.ply`. The colours are fitted to renders."""
     write_ply(target, gaussians(trained, shots, degree, object))
     return [target]
 

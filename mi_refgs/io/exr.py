@@ -50,8 +50,7 @@ def exr_has_alpha(path: Path) -> bool:
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of an EXR file's data window; raises InputError for a file that `read_exr` refuses
-    too."""
+    """Width and height of an EXR file's data window; raises InputError as `read_exr`."""
     require_file(path)
     header = _header(path)
     (left, top), (right, bottom) = header["dataWindow"]

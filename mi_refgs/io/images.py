@@ -179,8 +179,7 @@ def to_8_bits(image: np.ndarray) -> np.ndarray:
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write an (H, W) or (H, W, 3 or 4) image, sRGB encoded in [0, 1], as 8-bit PNG; raises as
-    `replace_file`."""
+    """Write an (H, W) or (H, W, 3 or 4) image, sRGB encoded, as 8-bit PNG; raises as `replace_file`."""
     from PIL import Image
 
     replace_file(path, lambda temporary: Image.fromarray(to_8_bits(image)).save(temporary, format="PNG"))

@@ -55,8 +55,7 @@ def make_dataset(
     over the band of elevations. `options`: those of `DatasetOptions`, such as `views`, `size`, `spp`.
     `relight`: maps (or one) under which the test views are traced again, each in a folder of its name.
     `overwrite`: remove the views in the folder; else one that the same settings left unfinished is continued.
-    A Dr.Jit variant must be set. Raises InputError for options, scenes and lights that cannot be used, and
-    for foreign files."""
+    A Dr.Jit variant must be set. Raises InputError for unusable options, scenes, lights and files."""
     # Settings.
     scene, out = Path(scene), Path(out)
     given = options_of("make_dataset", scene, options)

@@ -38,8 +38,7 @@ def bounding_sphere(shapes: Sequence[Any]) -> tuple[np.ndarray, float]:
 
 
 def reach(shapes: Sequence[Any], centre: np.ndarray) -> float:
-    """The radius around a centre (3,) that contains every surface of the shapes. Raises InputError as
-    `surface_mesh` does."""
+    """The radius around a centre (3,) that contains every surface of shapes; raises as `surface_mesh`."""
     return max(float(np.linalg.norm(triangles(shape)[0] - centre, axis=1).max()) for shape in shapes)
 
 
