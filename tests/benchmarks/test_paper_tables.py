@@ -39,9 +39,8 @@ def test_paper_figures_are_consistent() -> None:
 
     def mean(metric: str, system: str, data_set: str) -> float:
         values = first.metrics[metric][system]
-        return float(
-            np.mean([v for v, c in zip(values, first.columns, strict=True) if c.data_set == data_set])
-        )
+        of = [v for v, c in zip(values, first.columns, strict=True) if c.data_set == data_set]
+        return float(np.mean(of))
 
     for metric, data_set, value, tolerance in (
         ("psnr", "Shiny Blender", 35.04, 0.006),

@@ -17,15 +17,11 @@ def test_light_panels_have_one_exposure(rng: np.random.Generator) -> None:
     assert np.all(images.light_panels(np.zeros((8, 16, 3)))["fitted environment"] == 0)
 
 
+POLES = [((0, 0, 1), 0, None), ((0, 0, -1), -1, None)]
+
+
 @pytest.mark.parametrize(
-    ("world", "row", "column"),
-    [
-        ((0, 0, 1), 0, None),
-        ((0, 0, -1), -1, None),
-        ((0, 1, 0), 31, 0),
-        ((1, 0, 0), 31, 15),
-        ((0, -1, 0), 31, 31),
-    ],
+    ("world", "row", "column"), [*POLES, ((0, 1, 0), 31, 0), ((1, 0, 0), 31, 15), ((0, -1, 0), 31, 31)]
 )
 def test_maps_are_drawn_with_z_at_the_top(world: tuple[int, int, int], row: int, column: int | None) -> None:
     """A lobe around a direction is brightest where a map with +z at the top shows it."""

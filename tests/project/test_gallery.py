@@ -20,14 +20,9 @@ sys.path.insert(0, str(ROOT / "docs"))
 maker: Any = importlib.import_module("gallery_maker")
 
 SIZE, SCENE = 24, "plastic_hollows"
-SETTINGS: dict[str, Any] = {
-    "views": 4,
-    "size": SIZE,
-    "set": tuple(
-        "iterations=6 surfels.count=80 surfels.max_count=100 light.height=8 event.mesh.resolution=16".split()
-    ),
-    "lights": (ROOT / "scenes" / "lights" / "studio.exr",),
-}
+SET = "iterations=6 surfels.count=80 surfels.max_count=100 light.height=8 event.mesh.resolution=16"
+SETTINGS: dict[str, Any] = {"views": 4, "size": SIZE, "set": tuple(SET.split())}
+SETTINGS["lights"] = (ROOT / "scenes" / "lights" / "studio.exr",)
 TURN, TEST_VIEWS = 4, 4  # frames of a turntable, and test views, of the small gallery
 COMMITTED = ROOT / "docs" / "gallery"
 LIMIT = 5_000_000  # bytes of the gallery in the repository

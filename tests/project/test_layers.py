@@ -100,9 +100,8 @@ def test_no_code_names_a_method() -> None:
 
     The purposes that methods say they are for are what code may ask for.
     """
-    about = {
-        path.stem: tomllib.loads(path.read_text())["about"] for path in (ROOT / "variants").glob("*.toml")
-    }
+    variants = (ROOT / "variants").glob("*.toml")
+    about = {path.stem: tomllib.loads(path.read_text())["about"] for path in variants}
     purposes = {one.get("purpose") for one in about.values()}
     names = {*about, *(one["name"] for one in about.values() if "name" in one)} - purposes
     for module, tree in TREES.items():

@@ -132,16 +132,7 @@ def test_cameras_stay_within_their_azimuths(made: Path, tmp_path: Path) -> None:
         assert around if high == 180 else low < azimuth[0] < low + 15 and high - 15 < azimuth[-1] < high
 
 
-@pytest.mark.parametrize(
-    ("more", "around"),
-    [
-        ("", ["table", "wall"]),
-        (
-            '<shape type="sphere" id="dome"><float name="radius" value="40"/></shape>',
-            ["dome", "table", "wall"],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("more", "around"), [("", ["table", "wall"]), (DOME, ["dome", "table", "wall"])])
 def test_object_is_chosen_among_lamps_and_backdrops(more: str, around: list[str]) -> None:
     scene = mi.load_string(ROOM.replace("</scene>", f"{more}</scene>"), optimize=False)
     chosen, others = object_of(scene.shapes(), DatasetOptions())

@@ -174,9 +174,8 @@ def tab(chromium: Any, scene: TrainedScene, tmp_path: Path) -> Iterator[Tab]:
     data, run = write_open_data(tmp_path / "data"), Run(tmp_path / "run")
     run.create(load("ref_gaussian", "quick"), str(data))
     export(with_background(scene, 0.2), run.path, Pose(np.eye(4), 0.7, 1.0).camera(8, 8))
-    running = Server(
-        tmp_path / "log", "view", run.path, "--data", data, "--port", "0", "-o", tmp_path / "saved"
-    )
+    arguments = ("view", run.path, "--data", data, "--port", "0", "-o", tmp_path / "saved")
+    running = Server(tmp_path / "log", *arguments)
     page = chromium.new_page(viewport=WINDOW)
     try:
         opened = Tab(page, running.url)
