@@ -19,9 +19,9 @@ ALBEDO = (0.9, 0.6, 0.3)
 OPACITY = 0.99  # opacity of surfels that cover a solid surface
 
 
-def path_tracer(depth: int) -> Any:
+def path_tracer(depth: int, type: str = "path", hide: bool = False) -> Any:
     """Mitsuba's, without Russian roulette: images of two depths differ by their reflections alone."""
-    return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
+    return mi.load_dict({"type": type, "max_depth": depth, "rr_depth": 1000, "hide_emitters": hide})
 
 
 class Setup:

@@ -53,7 +53,10 @@ class LossInputs:
         photographed: PhotographedLight | None = None,
     ) -> LossInputs:
         """Display a frame as its target is, with highlights clipped where those of the target are."""
-        gain = None if log_gain is None else [dr.exp(value) for value in log_gain]
+        gain = None
+        if log_gain is not None:  # one per pixel: the sum of its derivatives then needs no kernels of its own
+            every = dr.zeros(mi.UInt32, dr.width(frame.alpha))
+            gain = [dr.gather(mi.Float, dr.exp(value), every) for value in log_gain]
         image = displayed(frame, data.background, data.is_linear_radiance, gain)
         if target.clipped is not None:
             image = losses.clip_highlights(image, target.image, target.clipped)

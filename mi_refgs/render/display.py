@@ -48,16 +48,14 @@ def displayed(
 ) -> list[Any]:
     """Display-encoded planes of a frame, whose own background replaces `background` (linear); `gain` per
     channel. Images with alpha are composited after encoding, linear data before it."""
-    radiance = list(frame.radiance)
-    behind = [float(x) for x in background] if frame.background is None else list(frame.background)
-    if gain is not None:
-        radiance = [plane * factor for plane, factor in zip(radiance, gain, strict=True)]
-    if gain is not None and frame.background is not None:
-        behind = [plane * factor for plane, factor in zip(behind, gain, strict=True)]
-    if not linear and frame.background is None:
+    gain = [1.0] * 3 if gain is None else gain
+    if frame.background is not None:
+        return [srgb_from_linear(x * factor) for x, factor in zip(composited(frame)[0], gain, strict=True)]
+    radiance = [plane * factor for plane, factor in zip(frame.radiance, gain, strict=True)]
+    behind = [float(x) for x in background]
+    if not linear:
         return display_image(radiance, frame.alpha, behind)
-    through = 1 - frame.alpha
-    return [srgb_from_linear(x + through * y) for x, y in zip(radiance, behind, strict=True)]
+    return [srgb_from_linear(x + (1 - frame.alpha) * y) for x, y in zip(radiance, behind, strict=True)]
 
 
 def image_array(array: Array, height: int, width: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from mi_refgs.surfels.attributes import attribute, logit
 from mi_refgs.surfels.init import even_points, from_points
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.synthesis.ground_truth import materials_at, surface_mesh
+from mi_refgs.synthesis.settings import scene_of
 
 NO_HOLES = 0.7  # `scale_factor` of evenly spread points from which alpha is above 0.95 everywhere inside
 ABOVE = 1e-3  # extents of the mesh above a point from which its BSDF is looked up: tessellations are inside
@@ -47,7 +48,7 @@ def _on_shapes(
     points, normals = even_points(*surface_mesh(shapes), count, rng)
     above = points + ABOVE * float(np.ptp(points, axis=0).max()) * normals
     origin, towards = (np.ascontiguousarray(x.T, np.float32) for x in (above, -normals))
-    scene = mi.load_dict({"type": "scene"} | {f"shape_{i}": shape for i, shape in enumerate(shapes)})
+    scene = scene_of(shapes)
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(towards)))
     hit = np.array(si.is_valid())[:, None]
     points, normals = np.where(hit, si.p.numpy().T, points), np.where(hit, si.sh_frame.n.numpy().T, normals)

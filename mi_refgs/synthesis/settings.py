@@ -54,12 +54,12 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
         if "data" in params and "to_world" in params:
             turned = mi.ScalarTransform4f(np.array(params["to_world"].matrix, np.float64).reshape(4, 4))
     environment = {"type": "envmap", "bitmap": mi.Bitmap(read_radiance(light)), "to_world": turned}
-    return _scene_of([*(objects or _all_but(scene, ())), mi.load_dict(environment)])
+    return scene_of([*(objects or _all_but(scene, ())), mi.load_dict(environment)])
 
 
 def without(scene: Scene, objects: Sequence[Any]) -> Any:
     environment = scene.environment()
-    return _scene_of([*_all_but(scene, objects), *([] if environment is None else [environment])])
+    return scene_of([*_all_but(scene, objects), *([] if environment is None else [environment])])
 
 
 def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
@@ -70,8 +70,13 @@ def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
     return [*shapes, *lamps]
 
 
-def _scene_of(parts: Sequence[Any]) -> Any:
-    return mi.load_dict({"type": "scene"} | {f"part_{i}": part for i, part in enumerate(parts)})
+def scene_of(parts: Sequence[Any]) -> Any:
+    """A scene of loaded objects, which keep their ids; `load_dict` alone renames the parameters of theirs."""
+    ids = [part.id() for part in parts]
+    scene = mi.load_dict({"type": "scene"} | {f"part_{i}": part for i, part in enumerate(parts)})
+    for part, name in zip(parts, ids, strict=True):
+        part.set_id(name)
+    return scene
 
 
 def prepare_folder(

@@ -60,6 +60,7 @@ def test_normals_and_materials_are_those_of_the_shape() -> None:
         right = np.abs(sigmoid(raw["albedo"]) - expected).max(axis=1) < 1e-3
         assert right.mean() > 0.98 and np.allclose(sigmoid(raw["roughness"]), 0.3, atol=1e-4)
         assert sigmoid(raw["metallic"]).min() > 0.99 and np.allclose(sigmoid(raw["opacity"]), 0.9, atol=1e-5)
+    assert "s.bsdf.roughness.value" in mi.traverse(scene)  # still has its names
     fewer = mi_refgs.surfels_from_mesh(scene, 50, attributes=["albedo"], albedo=0.5)
     assert "metallic" not in fewer.raw and np.allclose(fewer.raw["albedo"].numpy(), 0, atol=0.15)
 
