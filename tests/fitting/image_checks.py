@@ -41,9 +41,8 @@ def view_of(image: np.ndarray, alpha: np.ndarray | None, linear: bool) -> View:
 
 
 def stack(planes_: list[Any]) -> np.ndarray:
-    return np.stack([np.array(dr.grad(p), dtype=np.float64) for p in planes_], axis=-1).reshape(
-        HEIGHT, WIDTH, -1
-    )
+    slopes = [np.array(dr.grad(p), dtype=np.float64) for p in planes_]
+    return np.stack(slopes, axis=-1).reshape(HEIGHT, WIDTH, -1)
 
 
 def gradient(

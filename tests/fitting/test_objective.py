@@ -64,9 +64,8 @@ def test_losses_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
     weights = {"l1": LossWeight(0.7), "ssim": LossWeight(0.3), "alpha": LossWeight(0.4)}
     loss, error = objective(LossInputs.of(frame_of(radiance, alpha), target, data), weights, 1)
-    shown, goal = (
-        reference.srgb(x + (1 - a[..., None]) * BACKGROUND) for x, a in ((radiance, alpha), picture)
-    )
+    pair = (radiance, alpha), picture
+    shown, goal = (reference.srgb(x + (1 - a[..., None]) * BACKGROUND) for x, a in pair)
     expected = 0.7 * reference.l1(shown, goal) + 0.3 * (1 - reference.ssim(shown, goal))
     expected += 0.4 * reference.l1(alpha, picture[1])
     assert float(loss[0]) == pytest.approx(expected, abs=2e-5)
@@ -77,9 +76,8 @@ def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     data, target = made(True, *picture)
     radiance, alpha = picture
     maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}
-    frame = replace(
-        frame_of(radiance, alpha), maps={name: upload(x.astype(np.float32)) for name, x in maps.items()}
-    )
+    uploaded = {name: upload(x.astype(np.float32)) for name, x in maps.items()}
+    frame = replace(frame_of(radiance, alpha), maps=uploaded)
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
 
     def loss(iteration: int = 1, **weights: LossWeight) -> float:
@@ -90,9 +88,8 @@ def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     assert loss(half_metal=LossWeight(0.3)) - rest == pytest.approx(0.3 * half, rel=1e-3)
     rising = LossWeight(0.3, start=10, rise=100)
     for iteration, share in ((10, 0), (11, 0.01), (60, 0.5), (500, 1)):
-        assert loss(iteration, half_metal=rising) - rest == pytest.approx(
-            share * 0.3 * half, rel=1e-2, abs=1e-6
-        )
+        added = loss(iteration, half_metal=rising) - rest
+        assert added == pytest.approx(share * 0.3 * half, rel=1e-2, abs=1e-6)
     smooth = np.stack([alpha * maps["roughness"], alpha * maps["metallic"]], axis=-1)
     guide = np.stack([np.array(plane).reshape(alpha.shape) for plane in target.image], axis=-1)
     expected = 0.2 * reference.smoothness(smooth, guide, 10.0)

@@ -16,9 +16,8 @@ def scene_of(surfels: mi_refgs.Surfels, light: Any) -> Any:
     pose = mi.ScalarTransform4f().look_at([4, 0, 1], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 24, "height": 24, "pixel_format": "rgba"}
     camera = {"type": "perspective", "fov": 34, "to_world": pose, "film": film}
-    return mi.load_dict(
-        {"type": "scene", "refgs": {"type": "refgs", **surfels.raw, "light": light}, "c": camera}
-    )
+    integrator = {"type": "refgs", **surfels.raw, "light": light}
+    return mi.load_dict({"type": "scene", "refgs": integrator, "c": camera})
 
 
 def test_a_loop_over_the_parameters_of_a_scene(rng: np.random.Generator) -> None:

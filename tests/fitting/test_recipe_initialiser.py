@@ -57,9 +57,8 @@ def test_a_registered_initialiser_places_the_surfels(file: str, data: Dataset) -
 
 
 def test_others_are_refused_or_not_used(file: str, data: Dataset) -> None:
-    refused(
-        lambda: methods.load(file, "quick", ["surfels.start=['mush']"]), "surfels.start: 'mush' is unknown"
-    )
+    unknown = ["surfels.start=['mush']"]
+    refused(lambda: methods.load(file, "quick", unknown), "surfels.start: 'mush' is unknown")
     hull_first = methods.load(file, "quick", ["surfels.count=50", "surfels.start=['points', 'hull', 'mesh']"])
     position = initial_surfels(hull_first, data, np.random.default_rng(0)).raw["position"].numpy()
     assert np.linalg.norm(position, axis=1).std() > 0.01  # on the hull of three views

@@ -64,31 +64,21 @@ def _traceable(shading: str) -> bool:
     return visibility == "own" or (visibility == "mirror" and "/pixel" in shading)
 
 
+def _blurs_surfels(shading: str, accuracy: str) -> bool:
+    return accuracy == "antialias" and "/pixel" not in shading
+
+
 RULES = [
     # What is refused.
-    Rule(
-        ("shading", "occlusion"),
-        lambda shading, occlusion: occlusion and not _traceable(shading),
-        "shading: occlusion: needs shading at pixel and reflectance = split_sum",
-    ),
-    Rule(
-        ("shading", "accuracy"),
-        lambda shading, accuracy: accuracy == "antialias" and "/pixel" not in shading,
-        "shading: antialias: needs shading at pixel",
-    ),
-    Rule(
-        ("shading", "accuracy"),
-        lambda shading, accuracy: (
-            accuracy not in ("none", *_model(shading).honoured)
-            and not (accuracy == "antialias" and "/pixel" not in shading)
-        ),
-        "shading: [a-z_]+: needs reflectance = ",
-    ),
-    Rule(
-        ("emitter", "map"),
-        lambda emitter, map_: emitter == "tensor" and map_ == "9 x 14",
-        "EnvironmentLight: raw: shape",
-    ),
+    Rule(("shading", "occlusion"), lambda shading, occlusion: occlusion and not _traceable(shading),
+         "shading: occlusion: needs shading at pixel and reflectance = split_sum"),
+    Rule(("shading", "accuracy"), _blurs_surfels, "shading: antialias: needs shading at pixel"),
+    Rule(("shading", "accuracy"),
+         lambda shading, accuracy: (accuracy not in ("none", *_model(shading).honoured)
+                                    and not _blurs_surfels(shading, accuracy)),
+         "shading: [a-z_]+: needs reflectance = "),
+    Rule(("emitter", "map"), lambda emitter, map_: emitter == "tensor" and map_ == "9 x 14",
+         "EnvironmentLight: raw: shape"),
     # What no input can say: an emitter's rotation, tensors in a file, options that runs do not have.
     Rule(("emitter", "rotated"), lambda emitter, rotated: emitter == "tensor" and rotated),
     Rule(("map", "rotated"), lambda map_, rotated: map_ == "constant" and rotated),
@@ -96,10 +86,8 @@ RULES = [
     Rule(("input", "emitter"), lambda input_, emitter: input_ == "run" and emitter != "tensor"),
     Rule(("input", "map"), lambda input_, map_: input_ == "run" and map_ == "9 x 14"),
     Rule(("input", "background"), lambda input_, background: input_ == "run" and background == "constant"),
-    Rule(
-        ("input", "background", "surroundings"),
-        lambda input_, background, around: input_ == "run" and background == "map" and not around,
-    ),
+    Rule(("input", "background", "surroundings"),
+         lambda input_, background, around: input_ == "run" and background == "map" and not around),
 ]  # fmt: skip
 
 

@@ -42,13 +42,9 @@ def test_draws_follow_seed_iteration_and_operation() -> None:
 
 def test_every_operation_of_an_iteration_draws_on_its_own() -> None:
     """Read off the package: `rng` is called with another name in each place."""
-    package = Path(fitting.__file__).parent
-    calls = [
-        call.args[1]
-        for path in package.rglob("*.py")
-        for call in ast.walk(ast.parse(path.read_text()))
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr == "rng"
-    ]
+    trees = (ast.parse(path.read_text()) for path in Path(fitting.__file__).parent.rglob("*.py"))
+    made = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call))
+    calls = [x.args[1] for x in made if isinstance(x.func, ast.Attribute) and x.func.attr == "rng"]
     names = [name.value for name in calls if isinstance(name, ast.Constant)]
     assert len(names) == len(calls) == len(set(names)) >= 6
 

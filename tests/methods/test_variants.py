@@ -70,8 +70,10 @@ def test_every_method_fits_and_evaluates(variant: str, data: Path, tmp_path: Pat
     """A few steps in every stage, with a mesh where the method has one."""
     run = tmp_path / "run"
     method = methods.load(variant, "quick")
-    settings = [*SETTINGS]
-    settings += [f"stage.{name}.until={2 * i + 2}" for i, (name, _) in enumerate(method.stages())]
+    settings = [
+        *SETTINGS,
+        *(f"stage.{name}.until={2 * i + 2}" for i, (name, _) in enumerate(method.stages())),
+    ]
     if method.light is not None:
         settings.append("light.height=8")
     if method.has_mesh:

@@ -47,11 +47,8 @@ def test_round_trip_keeps_the_image(balls: Reconstruction, known: Path, tmp_path
 
 def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) -> None:
     """A rotated environment, of the integrator or of the scene, becomes a map without rotation."""
-    turned = {
-        "type": "envmap",
-        "bitmap": mi.Bitmap(sky(16)),
-        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 70),
-    }
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], 70)
+    turned = {"type": "envmap", "bitmap": mi.Bitmap(sky(16)), "to_world": turn}
     camera = balls.camera(0, 24)
     sensor = balls.scene(camera).sensors()[0]
     for inside in (True, False):
@@ -65,8 +62,7 @@ def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) 
 
 
 def test_other_states_are_refused(balls: Reconstruction) -> None:
-    arrays = balls.trained.surfels.to_numpy()
-    make = Reconstruction.from_params
+    arrays, make = balls.trained.surfels.to_numpy(), Reconstruction.from_params
     refused(lambda: make(mi.load_dict({"type": "sphere"})), "no `refgs` integrator")
     refused(lambda: make(arrays | {"hue": arrays["opacity"]}), "hue")
     refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
