@@ -112,8 +112,28 @@ def stability_cases(result: Result, path: Path) -> Path:
     return figures.save(figure, axes, path)
 
 
+def endtoend_frames(result: Result, path: Path) -> Path:
+    """Error over time of whole frames, one panel per scene."""
+    scenes = list(dict.fromkeys(row["scene"] for row in result["rows"]))
+    label = "error against the converged path tracer"
+    figure, axes = figures.grid(scenes, 3, 3.4, 3.0, "ms per frame", label)
+    for ax, scene in zip(axes, scenes, strict=True):
+        rows = where(result["rows"], scene=scene)
+        for k, spp in enumerate(result["settings"]["refgs_spp"]):
+            found = where(rows, renderer="refgs", spp=spp)
+            x, y = ([row[key] for row in found] for key in ("ms", "error"))
+            figures.series(ax, x, y, "s-", f"refgs, {spp} samples per pixel", color=BLUES[1 + 2 * k])
+        found = where(rows, renderer="path")
+        x, y = ([row[key] for row in found] for key in ("ms", "error"))
+        figures.series(ax, x, y, "o-", "Mitsuba path", color="#c0392b")
+        shading = where(rows, renderer="refgs")[0]["shading"]
+        ax.axhline(shading, color="k", lw=0.8, ls=":", label="refgs, shading alone")
+    return figures.save(figure, axes, path)
+
+
 PLOTS: dict[str, Callable[[Result, Path], Path]] = {
-    f.__name__: f for f in (splatting_time, splitsum_pareto, visibility_time, stability_cases)
+    f.__name__: f
+    for f in (splatting_time, splitsum_pareto, visibility_time, stability_cases, endtoend_frames)
 }
 """Name of an image → what draws it; its first word is the data file."""
 

@@ -409,6 +409,27 @@ def stability(result: Result) -> Values:
     }
 
 
+def endtoend(result: Result) -> Values:
+    """Time and errors of frames and gradients, by scene and renderer."""
+
+    def name(row: Row) -> str:
+        tracer = "`path`, `prb`" if row["renderer"] == "path" else f"`refgs`, {row['surfels']:,} surfels"
+        return f"{tracer}, {row['spp']} spp"
+
+    columns: dict[str, str | Callable[[Row], Any]] = {
+        "scene": "{scene}",
+        "renderer": name,
+        "frame, ms": "{ms:n2}",
+        "error": lambda row: percent(row["error"]),
+        "of shading": lambda row: percent(row["shading"]) if "shading" in row else "",
+        "of geometry and sampling": lambda row: percent(row["geometry"]) if "geometry" in row else "",
+        "gradient, ms": "{gradient_ms:n2}",
+        "error by light": lambda row: percent(row["gradient_error"]),
+        "by material": lambda row: percent(row["material_gradient_error"]),
+    }
+    return {"frames": row_table(result["rows"], columns)}
+
+
 def worst_gradient(row: Row) -> float:
     """Return the largest gradient error of the parameter classes of a case."""
     return max((x for key, x in row.items() if key.startswith("gradient_") and x is not None), default=0.0)
@@ -423,5 +444,6 @@ PAGES: dict[str, Callable[[Result], Values]] = {
     "splitsum": splitsum,
     "visibility": visibility,
     "stability": stability,
+    "endtoend": endtoend,
 }
 """Benchmarks that write their data file themselves."""
