@@ -50,9 +50,7 @@ def test_overview_lists_commands_and_exit_codes(capsys: pytest.CaptureFixture[st
         assert "exit codes:" in text and "bad input" in text
 
 
-def test_json_output_contains_nothing_else(
-    run: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_json_is_alone(run: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither Python's nor C++'s chatter on standard output gets between a pipe and the object."""
     original = Trainer.__init__
 
@@ -89,17 +87,13 @@ def test_train_writes_a_run_folder(finished: Path) -> None:
     assert [path.name for path in finished.rglob("*") if path.name.startswith(".")] == [MARK]
 
 
-def test_train_warns_about_few_views(
-    data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_few_views(data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*train_command(data, tmp_path / "run", method), "iterations=1", "--threads", "1"]) == 0
     assert "only 3 training views" in capsys.readouterr().err
     assert (tmp_path / "run" / "checkpoints" / "0000001.npz").is_file()  # though none was due
 
 
-def test_large_images_are_downscaled_unless_set(
-    data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_large_images(data: Path, method: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The size is chosen once: config.toml records it, and evaluation reads the same."""
     run = tmp_path / "run"
     with pytest.MonkeyPatch.context() as patch:
@@ -163,9 +157,7 @@ def test_render_writes_an_image(finished: Path, tmp_path: Path, capsys: pytest.C
     assert seen.any() and np.abs(pixels[..., 1] - shown)[seen].max() < 0.51 / 255
 
 
-def test_aovs_are_appended_to_those_of_the_scene(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_aovs_are_appended(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What the scene has already is not repeated; a name of two types is refused."""
     scene, out = finished / "with_aovs.xml", str(tmp_path / "view.exr")
     text = (finished / "scene.xml").read_text()
@@ -197,9 +189,7 @@ def test_render_uses_newest_checkpoint(finished: Path, run: Path, tmp_path: Path
     assert json.loads((run / "model.json").read_text()) == note
 
 
-def test_demo_writes_contact_sheet_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("VIEWS", 3), ("TEST_VIEWS", 1), ("SIZE", 16), ("SAMPLES", 1)):
         monkeypatch.setattr(demo, name, value)
     settings = ["iterations=2", "surfels.count=60", "surfels.max_count=60", "light.height=8"]

@@ -103,9 +103,7 @@ def test_a_format_refuses_a_foreign_folder(name: str, place: Path, out: Path) ->
 
 
 @pytest.mark.parametrize("command", [["render", "run"], ["export", "run", "--to", "3dgs-ply"]], ids=str)
-def test_a_file_that_the_user_names_is_replaced_unless_a_run_has_it(
-    command: list[str], place: Path, tmp_path: Path
-) -> None:
+def test_a_file_is_replaced_unless_a_run_has_it(command: list[str], place: Path, tmp_path: Path) -> None:
     suffix = ".exr" if command[0] == "render" else ".ply"
     (tmp_path / f"own{suffix}").write_bytes(FOREIGN)
     command = [command[0], str(place / "run"), *command[2:]]

@@ -79,10 +79,7 @@ def test_image_of_many_bands_equals_whole_image(tmp_path: Path) -> None:
 
 
 def test_mask_becomes_alpha(tmp_path: Path) -> None:
-    """Colour outside of the mask does not bleed in when pixels are averaged; own alpha multiplies.
-
-    Colour of an EXR file is premultiplied by its own alpha, but not by the mask.
-    """
+    """Colour outside of the mask does not bleed in; own alpha, which premultiplies EXR files, multiplies."""
     covered = np.zeros((8, 8))
     covered[:, 3:] = 1
     colour = np.where(covered[..., None] > 0, [0.2, 0.4, 0.6], [1.0, 0.0, 1.0])

@@ -1,8 +1,4 @@
-"""CONTRIBUTING's recipe "add a reader", followed: a layout of this test's own, from the folder to a fit.
-
-One class and one `register` are all that is added: cameras in a table of text, images without alpha beside
-it, and points to start from.
-"""
+"""CONTRIBUTING's recipe "add a reader", followed: a layout of this test's own, from the folder to a fit."""
 
 from __future__ import annotations
 

@@ -70,9 +70,7 @@ def trainer(run: Run, folder: Path) -> Trainer:
     return Trainer(run.method(), read_dataset(folder / "ball", "train"), run)
 
 
-def test_metrics_equal_those_of_the_trainer(
-    run: Run, trainer: Trainer, views: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trainer_metrics(run: Run, trainer: Trainer, views: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exported, read back and measured: every metric, view by view, of frames with AOVs and timed without."""
     asked: list[bool] = []
 

@@ -44,8 +44,7 @@ def test_psnr(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("size", [(16, 21), (7, 30), (1, 1)])
 def test_ssim_equals_reference_and_loss(size: tuple[int, int], rng: np.random.Generator) -> None:
-    """By scikit-image with padding, by the brute-force definition and by the Dr.Jit loss; smaller than the
-    window too."""
+    """By scikit-image, by definition and by the Dr.Jit loss; of images smaller than the window, too."""
     height, width = size
     truth = rng.random((height, width, 3)).astype(np.float32)
     image = np.clip(truth + 0.2 * rng.normal(size=truth.shape), 0, 1).astype(np.float32)

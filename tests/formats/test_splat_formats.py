@@ -134,9 +134,7 @@ def test_empty_views_do_not_change_colours(scene: TrainedScene, shots: list[Shot
     refused(lambda: gaussians(scene, shots, 4, False), "--degree: 4 is out of range")
 
 
-def test_background_gaussians_are_exported_unless_object_only(
-    scene: TrainedScene, shots: list[Shot], rng: np.random.Generator
-) -> None:
+def test_background_gaussians(scene: TrainedScene, shots: list[Shot], rng: np.random.Generator) -> None:
     raw = ball(rng, 400)
     around = {name: raw[name] for name in ("rotation", "opacity")}
     around |= {"position": raw["position"] * 0.4 + [0, 0, -1.4], "scale": raw["scale"] + np.log(0.8)}

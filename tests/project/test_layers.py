@@ -96,10 +96,7 @@ def test_reference_imports_neither_drjit_nor_mitsuba_and_only_methods_read_toml(
 
 
 def test_no_code_names_a_method() -> None:
-    """A method is data: no string of the package, but for documentation, is the name of one.
-
-    The purposes that methods say they are for are what code may ask for.
-    """
+    """A method is data: no string of the package but documentation is one's name, unless it is a purpose."""
     variants = (ROOT / "variants").glob("*.toml")
     about = {path.stem: tomllib.loads(path.read_text())["about"] for path in variants}
     purposes = {one.get("purpose") for one in about.values()}

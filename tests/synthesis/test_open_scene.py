@@ -140,9 +140,7 @@ def test_object_is_chosen_among_lamps_and_backdrops(more: str, around: list[str]
     assert sorted(shape.id() for shape in others) == around
 
 
-def test_the_choice_is_said_and_keeps_transparency_without_a_backdrop(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_choice_of_object_is_said(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = OPTIONS | {"objects": (), "views": 1, "test_views": 1, "spp": 1, "progress": True}
     room = read_loaded(make_dataset(made.parent / "room.xml", tmp_path / "out", **options), "train").views[0]
     assert room.alpha is None and read_region(tmp_path / "out") == read_region(made)

@@ -68,9 +68,7 @@ def test_a_region_of_others_is_not_replaced(data: Dataset) -> None:
     assert file.read_text() == before
 
 
-def test_the_region_of_a_page_is_displayed_changed_and_saved(
-    scene: TrainedScene, data: Dataset, tmp_path: Path
-) -> None:
+def test_a_page_changes_and_saves_its_region(scene: TrainedScene, data: Dataset, tmp_path: Path) -> None:
     page = Page(ReconstructionView(scene), {"train": data}, "a page", ("127.0.0.1", 0), tmp_path / "views")
     try:
         panel = RegionPanel(page, data, FITTED)
