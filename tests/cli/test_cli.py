@@ -22,6 +22,7 @@ from mi_refgs.io.images import read_png, srgb_from_linear
 from mi_refgs.io.ownership import MARK
 from mi_refgs.methods.read import PRESETS, load_resolved
 from mi_refgs.runs.views import sized
+from tests.errors import LIST, listed
 from tests.helpers import ROOT, command_names, command_options, refused
 from tests.scenes.tiny import SIZE, train_command
 
@@ -226,3 +227,8 @@ def test_tyro_says_what_is_wrong_with_options(command: str, capsys: pytest.Captu
     assert main(command.split()) == 2
     out, err = capsys.readouterr()
     assert (not out and command.split()[-1] in err) or "DATA" in err
+
+
+def test_errors_are_those_of_the_list() -> None:
+    """`python -m tests.errors` writes it anew."""
+    assert listed().splitlines() == LIST.read_text(encoding="utf-8").splitlines()
