@@ -45,14 +45,6 @@ class Sample:
     jump: Array  # relative distance of ρ to where depth jumps; infinite where it does not
 
 
-def tile_centres(camera: PinholeCamera, pixels: Array, corner: tuple[int, int]) -> tuple[Array, Array]:
-    """Centres x, y (P,) of the tiles of pixels; `corner` is the first pixel's place in its tile."""
-    width, height = c.tile_size(abs(camera.fx))
-    x = (pixels % camera.width + corner[0]) // width * width + width / 2 - corner[0]
-    y = (pixels // camera.width + corner[1]) // height * height + height / 2 - corner[1]
-    return x, y
-
-
 class Surfel:
     """Ray-plane intersection with a low-pass. [2DGS, Huang 2024, §4]"""
 
@@ -91,10 +83,12 @@ class Surfel:
 
     @staticmethod
     def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
-        """The depth of the plane, SORT_REACH σ from the centre at most."""
+        """The depth of the plane at the tiles' centres, SORT_REACH σ from its own at most."""
         p, axes = camera_frame(raw, camera)
         σ = np.exp(raw["scale"])
-        x, y = tile_centres(camera, pixels, corner)
+        width, height = c.tile_size(abs(camera.fx))
+        x = (pixels % camera.width + corner[0]) // width * width + width / 2 - corner[0]
+        y = (pixels // camera.width + corner[1]) // height * height + height / 2 - corner[1]
         ray = ray_slopes(camera, x, y)
         with np.errstate(all="ignore"):
             k = 1 / p[:, 2:]

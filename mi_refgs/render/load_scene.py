@@ -30,8 +30,10 @@ def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) 
                 option = "--aov" if aovs else "--object"
                 raise InputError("the scene has no `refgs` integrator", path, option, f"drop {option}")
             if aovs:
-                own = str(integrators[0].get("aovs", "")).split(",")
-                integrators[0]["aovs"] = ",".join(_pairs([*filter(str.strip, own), *aovs]))
+                every = [*filter(str.strip, str(integrators[0].get("aovs", "")).split(",")), *aovs]
+                parts = [[part.strip() for part in aov.split(":")] for aov in every]
+                named = (":".join(part * 2 if len(part) == 1 else part) for part in parts)
+                integrators[0]["aovs"] = ",".join(dict.fromkeys(named))  # each once
             for name in ("surroundings", "background") if object_only else ():
                 if name in integrators[0]:
                     del integrators[0][name]
@@ -42,12 +44,6 @@ def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) 
     finally:
         mi.set_file_resolver(before)
     return loaded[0] if isinstance(loaded, list) else loaded
-
-
-def _pairs(aovs: Sequence[str]) -> list[str]:
-    """`name:type` pairs in order, each once; a bare type is its own name."""
-    parts = [[part.strip() for part in aov.split(":")] for aov in aovs]
-    return list(dict.fromkeys(":".join(part * 2 if len(part) == 1 else part) for part in parts))
 
 
 def reason(error: BaseException) -> str:

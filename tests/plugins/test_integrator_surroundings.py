@@ -64,15 +64,11 @@ def test_refusals(tmp_path: Path) -> None:
         refused(partial(scenes.scene, **changes), words)
 
 
-def fitted() -> TrainedScene:
-    around = Surroundings(Surfels.from_numpy(scenes.far_channels()), scenes.background_light())
-    light, surfels = EnvironmentLight.from_radiance(scenes.sky()), Surfels.from_numpy(scenes.raw_channels())
-    return TrainedScene(surfels, light, None, Shading(), 7, 1.5, surroundings=around)
-
-
 def test_run_folder_contains_surroundings_and_background_until_removed(tmp_path: Path) -> None:
     """Written, read back, rendered alike by the run and by its scene.xml; what is stale goes."""
-    made = fitted()
+    around = Surroundings(Surfels.from_numpy(scenes.far_channels()), scenes.background_light())
+    light, surfels = EnvironmentLight.from_radiance(scenes.sky()), Surfels.from_numpy(scenes.raw_channels())
+    made = TrainedScene(surfels, light, None, Shading(), 7, 1.5, surroundings=around)
     files = {path.name for path in export(made, tmp_path, camera())}
     assert {AROUND_FILE, BACKGROUND_MAP} <= files
     frame, again = made.renderer()(camera()), TrainedScene.read(tmp_path).renderer()(camera())

@@ -27,10 +27,6 @@ def camera(size: int, focal: float) -> Camera:
     return Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose)
 
 
-def oblong() -> Camera:
-    return replace(camera(WIDTH, 8.0), height=HEIGHT)
-
-
 @pytest.fixture
 def maps(rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Premultiplied normals, alpha with holes, at the border too, and visibility of 0 or 1."""
@@ -54,7 +50,7 @@ def radiance(points: ShadingPoints) -> RadianceTerms:
 def found(
     normal: list[mi.Float], alpha: mi.Float, visibility: mi.Float, interpolate: bool = True
 ) -> mi.Color3f:
-    view = oblong()
+    view = replace(camera(WIDTH, 8.0), height=HEIGHT)
     points = ShadingPoints(mi.Vector3f(*normal), -dr.normalize(view.rays()), visibility=visibility)
     return averaged(radiance, points, alpha, view, None, interpolate).specular
 

@@ -17,7 +17,6 @@ from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import Camera
 from mi_refgs.splat.lanes import CompactedPixels, Grid, Lanes
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import camera_at, image, raw_channels, scattered_discs, scene, sky, two_balls
@@ -32,15 +31,6 @@ def things(gaussians: bool = False) -> Surfels:
     if gaussians:
         raw["scale"] = np.concatenate([raw["scale"], raw["scale"][:, :1]], axis=1)
     return Surfels.from_numpy(raw)
-
-
-def both(
-    surfels: Surfels, view: Camera, shading: Shading, surroundings: Surroundings | None = None
-) -> list[Frame]:
-    """Frames with everything: with derivatives, and without."""
-    light = EnvironmentLight.from_radiance(sky())
-    scene = SurfelScene(surfels, shading, shading.light_of(light), Occluder(two_balls()), surroundings)
-    return [render(scene, view, Request(scene.all_aovs, forward_only)) for forward_only in (False, True)]
 
 
 def values(frame: Frame) -> dict[str, np.ndarray]:
@@ -86,11 +76,13 @@ CASES: dict[str, tuple[Shading, dict[str, Any]]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_forward_only_image_is_the_same(case: str) -> None:
     shading, more = CASES[case]
-    near = scattered_discs()
+    near, light = scattered_discs(), EnvironmentLight.from_radiance(sky())
     far = Surfels.from_numpy(near | {"position": 3 * near["position"]})
-    others = Surroundings(far, EnvironmentLight.from_radiance(sky()))
+    around = Surroundings(far, light) if "around" in more else None
+    surfels, occluder = things("gaussians" in more), Occluder(two_balls())
+    scene = SurfelScene(surfels, shading, shading.light_of(light), occluder, around)
     view = camera_at(more.get("focal", 30.0), more.get("offset", (0, 0)))
-    assert_same(*both(things("gaussians" in more), view, shading, others if "around" in more else None))
+    assert_same(*(render(scene, view, Request(scene.all_aovs, only)) for only in (False, True)))
 
 
 def test_nothing_in_view_is_black() -> None:

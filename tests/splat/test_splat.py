@@ -244,14 +244,6 @@ def test_second_view_compiles_nothing() -> None:
     assert dr.detail.launch_stats()[2] == misses
 
 
-def full_screen(count: int, size: int) -> tuple[Surfels, Camera]:
-    """Large discs, parallel to the image, each on every tile."""
-    none, z = 0 * np.arange(count), np.linspace(2, 3, count)
-    raw = {"position": np.stack([none, none, z], axis=1), "rotation": np.tile([0.0, 0, 0, 1], (count, 1))}
-    raw |= {"scale": np.full((count, 2), 4.0), "opacity": np.zeros((count, 1))}
-    return Surfels.from_numpy(raw), Camera.from_pose(size, size, -500, -500, size / 2, size / 2, np.eye(4))
-
-
 @pytest.mark.parametrize("chunk", [1, 100, 20_000])
 def test_candidates_in_parts_give_the_same_lists(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scenes.make_scene(13)
@@ -269,9 +261,13 @@ def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: 
     """2¹⁶ surfels on 2¹⁶ tiles: counted in 32 bits there are none, and the image is blank."""
     monkeypatch.setattr(tiles, "CHUNK", 1 << 20)
     monkeypatch.setattr(tiles, "MAX_PAIR_BITS", 22)
-    surfels, camera = full_screen(1 << 16, 1024)
+    count = 1 << 16  # large discs, parallel to the image
+    position = np.stack([np.zeros(count), np.zeros(count), np.linspace(2, 3, count)], axis=1)
+    raw = {"position": position, "rotation": np.tile([0.0, 0, 0, 1], (count, 1))}
+    raw |= {"scale": np.full((count, 2), 4.0), "opacity": np.zeros((count, 1))}
+    camera = Camera.from_pose(1024, 1024, -500, -500, 512, 512, np.eye(4))
     with pytest.raises(InputError, match=r"65,536 tiles of 1024 × 1024 pixels; render fewer pixels"):
-        splat(surfels, [], camera)
+        splat(Surfels.from_numpy(raw), [], camera)
 
 
 @pytest.mark.parametrize("opacity", [0.9, 0.3, 0.05])
