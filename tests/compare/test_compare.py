@@ -86,7 +86,12 @@ def test_failed_job_is_a_row_with_its_reason(compared: Path) -> None:
     assert tiny["variant"] == "tiny" and tiny["seeds"] == [0] and list(tiny["failed"]) == ["1"]
     assert "seed1/checkpoints: output: cannot be created" in tiny["failed"]["1"]
     assert other["seeds"] == [0, 1] and not other["failed"]
-    assert f"tiny, seed 1: failed: {tiny['failed']['1']}" in (compared / "table.md").read_text()
+    failed, about = (
+        f"tiny, seed 1: failed: {tiny['failed']['1']}",
+        json.loads((compared / "compare.json").read_text()),
+    )
+    for said in (failed, "a <and> no scene", "llvm_ad_rgb", "jobs at once", about["command"]):
+        assert said in (compared / "table.md").read_text(), said
 
 
 def test_numbers_are_means_over_the_runs(compared: Path) -> None:
@@ -105,7 +110,7 @@ def test_numbers_are_means_over_the_runs(compared: Path) -> None:
     assert (other["numbers"]["lpips"] is None) == unmeasured
 
 
-def test_finished_jobs_are_not_repeated(
+def test_no_job_is_repeated(
     compared: Path, ball: Path, variants: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(execute, "_process", lambda *_: pytest.fail("a finished job was begun again"))
@@ -245,13 +250,6 @@ def test_a_run_refuses_other_settings(compared: Path, ball: Path, variants: Path
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
     (folder / "compare.json").unlink()
     refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
-
-
-def test_table_says_how_it_was_made(compared: Path) -> None:
-    text = (compared / "table.md").read_text()
-    command_line = json.loads((compared / "compare.json").read_text())["command"]
-    for said in ("a <and> no scene", "llvm_ad_rgb", "jobs at once", command_line):
-        assert said in text, said
 
 
 def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:

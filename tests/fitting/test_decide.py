@@ -263,9 +263,7 @@ def test_what_cannot_be_tried_is_said(
     assert len(few.data.views) == 2 and not few.fit.decisions
 
 
-def test_run_keeps_its_decisions(
-    file: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_decisions_last(file: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """On the command line, with real trials: config.toml, decisions.json and the PLY are of one method."""
     run = tmp_path / "run"
     command = train_command(folder, run, Path(file))

@@ -32,8 +32,7 @@ def radiance(view: View, peak: float) -> dict[str, Any]:
     """The ball in linear, premultiplied radiance on white; its highlight reaches `peak`."""
     linear = linear_from_srgb(view.image).astype(np.float32)
     assert view.alpha is not None
-    highlight = (view.alpha > 0) & (view.image.min(axis=-1) > 0.5)
-    linear[highlight] = peak
+    linear[(view.alpha > 0) & (view.image.min(axis=-1) > 0.5)] = peak
     return {"image": linear}
 
 

@@ -57,19 +57,18 @@ def test_normals_and_colours_of_both_kinds(ball: dataset.Dataset) -> None:
     inner, outer = distance < 0.8 * RADIUS, distance > 0.95 * RADIUS
     assert np.median(outward[outer]) > 0.9
     assert abs(outward[inner].mean()) < 0.15 and np.mean(outward[inner] < 0) > 0.4
-    colour = 0.5 + init_colour(table)
+    colour = colour_of(table)
     assert np.all(np.isfinite(colour)) and np.all((colour >= 0) & (colour <= 1))
 
 
-def init_colour(table: dict[str, np.ndarray]) -> np.ndarray:
-    """What a surfel's constant harmonic adds to grey."""
-    return table["radiance_sh"][:, :3] * 0.28209479
+def colour_of(table: dict[str, np.ndarray]) -> np.ndarray:
+    return 0.5 + table["radiance_sh"][:, :3] * 0.28209479
 
 
 def test_albedo_starts_with_hue_of_images(ball: dataset.Dataset) -> None:
     """As bright everywhere as its initial value; without it, it is grey."""
     table = start(ball, 0.5, 0, "surfels.from_images=['albedo']", "surfels.initial.albedo=0.6")
-    albedo, colour = 1 / (1 + np.exp(-table["albedo"])), 0.5 + init_colour(table)
+    albedo, colour = 1 / (1 + np.exp(-table["albedo"])), colour_of(table)
     hue = 0.6 * colour / colour.max(axis=1, keepdims=True)
     # Its own jitter breaks ties, and its ends are cut off.
     assert np.abs(albedo - np.clip(hue, 0.02, 0.9)).max() < 0.026

@@ -161,10 +161,9 @@ after = 1
 """
 
 
-def disturbed_discs(
-    rng: np.random.Generator, views: int = 12, size: int = 64
-) -> tuple[Dataset, Surfels, np.ndarray]:
+def disturbed_discs(rng: np.random.Generator) -> tuple[Dataset, Surfels, np.ndarray]:
     """Images of discs, with poses that are wrong by 0.5° and 0.5 % of the distance; the discs; the poses."""
+    views, size = 12, 64
     raw = {name: x.astype(np.float32) for name, x in discs(300, 5, degree=1).items()}
     raw = {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
     raw["scale"] -= 1.0
