@@ -1,6 +1,6 @@
 """Corrections of inaccurate cameras: from `after` on, a small rigid motion of each learns (`per_view`).
 
-True cameras hardly move: the corrections start at 0, and learn slowly (`schedule.POSE_RATE`).
+True cameras hardly move: the corrections start at 0, and learn slowly (`schedule.LEARNT_BESIDE`).
 """
 
 from __future__ import annotations
