@@ -157,11 +157,11 @@ class FitSetup:
             wanted |= {AROUND + name: (background.columns(name),) for name in around.names}
             wanted[BACKGROUND] = (2 * around.height, 3)
         if light is not None:
+            wanted[LIGHT] = light.start().shape[1:]
             wanted |= {f"{LIGHT}_{name}": (3,) for name in light.placement}
         found = {
             name: values.shape if name in PER_VIEW else values.shape[1:]
             for name, values in part(state, PARAMS).items()
-            if name != LIGHT or light is None  # its kind checks it
         }
         per_view = {GAIN: (len(self.data.views), 3), POSE: (len(self.data.views), 6)}
         wanted |= {name: shape for name, shape in per_view.items() if name in found}
