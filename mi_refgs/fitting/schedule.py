@@ -43,7 +43,7 @@ from mi_refgs.types import Float, TensorXf
 DEFAULT_RATES = Rates()
 LEARNT_BESIDE = {
     GAIN: (1e-3, 1e-4),
-    POSE: (1e-3, 3e-5),
+    POSE: (2e-3, 6e-5),
     LIGHT_ROTATION: (1e-2, 1e-4),
     LIGHT_SCALE: (1e-2, 1e-4),
 }

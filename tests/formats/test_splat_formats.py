@@ -180,7 +180,7 @@ def test_gltf_has_activated_gaussians(scene: TrainedScene, shots: list[Shot], tm
     assert primitive["mode"] == 0 and content["extensionsUsed"] == [prefix]
     extension = primitive["extensions"][prefix]
     assert (extension["kernel"], extension["colorSpace"]) == ("ellipse", "srgb_rec709_display")
-    np.testing.assert_array_equal(column("POSITION"), raw["position"])
+    np.testing.assert_allclose(column("POSITION"), raw["position"], rtol=1e-6)
     np.testing.assert_allclose(column(f"{prefix}:SCALE"), np.exp(raw["scale"]), rtol=1e-5)
     np.testing.assert_allclose(column(f"{prefix}:OPACITY")[:, 0], table.opacity().numpy(), atol=1e-6)
     rotation = column(f"{prefix}:ROTATION")

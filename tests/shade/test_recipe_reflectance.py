@@ -139,7 +139,7 @@ def test_textures_are_baked_and_compared() -> None:
     light, shading = EnvironmentLight.constant(0.5, 8), Shading(reflectance="phong", diffuse="irradiance")
     scene = TrainedScene(Surfels(raw), light, known_mesh(), shading, 1, 0.0)
     camera = Camera.look_at([0.3, -3, 1], size=32)
-    baked = bake(scene, [Shot("a", "train", camera)], 200, 16)
+    baked = bake(scene, (Shot("a", "train", camera),), 200, 16)
     shown = 1 / (1 + np.exp(-raw["shininess"].numpy()))
     assert np.all(baked.metallic == 0)
     assert abs(baked.roughness.mean() - (1 - shown.mean())) < 0.1
