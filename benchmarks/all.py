@@ -64,7 +64,7 @@ PARTS = (
     Part("splatting", 5, "benchmarks.splatting", "--small"),
     Part("splitsum", 9, "benchmarks.splitsum", "--small"),
     Part("visibility", 4, "benchmarks.visibility --mesh {data}/meshes/bob_tri.obj", "--small"),
-    Part("endtoend", 10, "benchmarks.endtoend", "--small"),
+    Part("endtoend", 4, "benchmarks.endtoend", "--small"),
     Part("stability", 15, "benchmarks.stability", "--quick --only light"),
     *_fits(),
     Part("frames", 2, "benchmarks.frames {run}"),
