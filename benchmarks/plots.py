@@ -114,6 +114,8 @@ def stability_cases(result: Result, path: Path) -> Path:
 
 def endtoend_frames(result: Result, path: Path) -> Path:
     """Error over time of whole frames, one panel per scene."""
+    from matplotlib import ticker
+
     scenes = list(dict.fromkeys(row["scene"] for row in result["rows"]))
     label = "error against the converged path tracer"
     figure, axes = figures.grid(scenes, 3, 3.4, 3.0, "ms per frame", label)
@@ -122,12 +124,17 @@ def endtoend_frames(result: Result, path: Path) -> Path:
         for k, spp in enumerate(result["settings"]["refgs_spp"]):
             found = where(rows, renderer="refgs", spp=spp)
             x, y = ([row[key] for row in found] for key in ("ms", "error"))
-            figures.series(ax, x, y, "s-", f"refgs, {spp} samples per pixel", color=BLUES[1 + 2 * k])
+            figures.series(
+                ax, x, y, "s-", f"refgs, {spp} sample{'s' * (spp > 1)} per pixel", color=BLUES[1 + 2 * k]
+            )
         found = where(rows, renderer="path")
         x, y = ([row[key] for row in found] for key in ("ms", "error"))
         figures.series(ax, x, y, "o-", "Mitsuba path", color="#c0392b")
         shading = where(rows, renderer="refgs")[0]["shading"]
         ax.axhline(shading, color="k", lw=0.8, ls=":", label="refgs, shading alone")
+        ax.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+        ax.xaxis.set_minor_formatter(ticker.NullFormatter())
     return figures.save(figure, axes, path)
 
 
