@@ -47,7 +47,7 @@ def object_of(shapes: Sequence[Any], options: DatasetOptions) -> tuple[list[Any]
     times as large, and domes and rooms, in whose bounding boxes its cameras stand. Lamps are neither."""
     solid = [shape for shape in shapes if not shape.is_emitter()]
     flat = [shape for shape in solid if _flat(triangles(shape)[0])]
-    body = sorted(_without(solid, flat), key=lambda shape: bounding_sphere([shape])[1])
+    body = sorted(all_but(solid, flat), key=lambda shape: bounding_sphere([shape])[1])
     around = []
     while len(body) > 1:
         centre, radius = bounding_sphere(body[:-1])
@@ -58,7 +58,7 @@ def object_of(shapes: Sequence[Any], options: DatasetOptions) -> tuple[list[Any]
     if body:
         largest = BACKDROP * bounding_sphere(body)[1]
         around += [shape for shape in flat if bounding_sphere([shape])[1] > largest]
-    return _without(solid, around) or list(shapes), around
+    return all_but(solid, around) or list(shapes), around
 
 
 def _flat(points: np.ndarray) -> bool:
@@ -66,7 +66,8 @@ def _flat(points: np.ndarray) -> bool:
     return bool(spread[2] <= FLAT**2 * spread[0])
 
 
-def _without(shapes: Sequence[Any], others: Sequence[Any]) -> list[Any]:
+def all_but(shapes: Sequence[Any], others: Sequence[Any]) -> list[Any]:
+    """The shapes that are none of the others."""
     return [shape for shape in shapes if not any(shape is other for other in others)]
 
 

@@ -17,6 +17,7 @@ from mi_refgs.io.files import make_folder, read_json, write_json
 from mi_refgs.shade.light.latlong import Z_UP
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.options import OPTIONS, LightFile
+from mi_refgs.synthesis.pathtrace import all_but
 from mi_refgs.types import Scene
 
 RECORD, SURFACE = "dataset.json", "surface.ply"
@@ -54,17 +55,17 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
         if "data" in params and "to_world" in params:
             turned = mi.ScalarTransform4f(np.array(params["to_world"].matrix, np.float64).reshape(4, 4))
     environment = {"type": "envmap", "bitmap": mi.Bitmap(read_radiance(light)), "to_world": turned}
-    return scene_of([*(objects or _all_but(scene, ())), mi.load_dict(environment)])
+    return scene_of([*(objects or _parts_but(scene, ())), mi.load_dict(environment)])
 
 
 def without(scene: Scene, objects: Sequence[Any]) -> Any:
     environment = scene.environment()
-    return scene_of([*_all_but(scene, objects), *([] if environment is None else [environment])])
+    return scene_of([*_parts_but(scene, objects), *([] if environment is None else [environment])])
 
 
-def _all_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
+def _parts_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
     """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
-    shapes = [shape for shape in scene.shapes() if not any(shape is one for one in objects)]
+    shapes = all_but(scene.shapes(), objects)
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
     lamps = [lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)]
     return [*shapes, *lamps]
