@@ -157,7 +157,7 @@ class FitSetup:
             wanted |= {AROUND + name: (background.columns(name),) for name in around.names}
             wanted[BACKGROUND] = (2 * around.height, 3)
         if light is not None:
-            wanted[LIGHT] = light.start().shape[1:]
+            wanted[LIGHT] = light.shape()[1:]
             wanted |= {f"{LIGHT}_{name}": (3,) for name in light.placement}
         found = {
             name: values.shape if name in PER_VIEW else values.shape[1:]

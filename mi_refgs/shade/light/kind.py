@@ -37,6 +37,10 @@ class LightKind:
         """Raw values that a fit begins with; raises InputError if a setting cannot be used."""
         raise NotImplementedError
 
+    def shape(self) -> tuple[int, ...]:
+        """Of the raw values."""
+        return tuple(self.start().shape)
+
     def of(self, raw: TensorXf) -> FittedLight:
         """The light of raw values, under AD; unless it is overridden, an environment map."""
         return EnvironmentLight(raw)

@@ -35,6 +35,9 @@ class Map(LightKind):
     def rows(self) -> int:
         return self.height or LARGEST_HEIGHT
 
+    def shape(self) -> tuple[int, ...]:
+        return self.rows, 2 * self.rows, 3
+
     def sized(self, pixels: int) -> Self:
         """Choose `height`, if it is absent, by the reflections that a mirror ball as large as images of so
         many pixels shows: 128 rows from 161² pixels on, 76 for 96²."""
