@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mi_refgs.editing.options import Assignments
-from mi_refgs.editing.placement import MAJORITY, Owners
 from mi_refgs.editing.selection import COLOUR, SurfelValues, activated
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import Mesh
@@ -18,9 +18,8 @@ from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
 ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(.*)", re.ASCII)
-COLOUR_FLOOR = (
-    1e-3  # below it, a new colour sets a surfel's SH of higher degrees to 0 instead of scaling them
-)
+COLOUR_FLOOR = 1e-3  # below it, a new colour sets the SH of higher degrees to 0 instead of scaling them
+NEIGHBOURS, MAJORITY = 8, 0.5  # surfels that decide about a triangle, by a share of their opacity
 
 
 @dataclass(frozen=True)
@@ -81,18 +80,23 @@ def apply(
 
 
 def _mesh(scene: TrainedScene, chosen: np.ndarray, opacity: np.ndarray, cut: bool) -> Mesh | None:
-    """Return the mesh without the triangles of surfels (N,) bool that are cut, or of such raw opacity now."""
-    mesh, before = scene.mesh, scene.surfels.to_numpy()["opacity"]
-    stays = np.array_equal(before[chosen], opacity) and not cut
+    """Return the mesh without the triangles of surfels (N,) bool that are cut, or of such raw opacity now:
+    those whose opacity around them is mostly of these surfels, and of which no majority is left."""
+    mesh, tables = scene.mesh, [scene.surfels.to_numpy()]
+    stays = np.array_equal(tables[0]["opacity"][chosen], opacity) and not cut
     if mesh is None or not len(mesh.faces) or stays:
         return mesh
-    owners = Owners(scene)
-    theirs = owners.of(chosen)
-    if cut:
-        return mesh.part(~theirs)
-    after = sigmoid(before[:, 0])
-    after[chosen] = sigmoid(opacity[:, 0])
-    return mesh.part(~theirs | (owners.share(after) >= MAJORITY))
+    # The surfels around the middle of each triangle: the object's, then those of the background.
+    if scene.surroundings is not None:
+        tables.append(scene.surroundings.surfels.to_numpy())
+    position, raw = (np.concatenate([table[name] for table in tables]) for name in ("position", "opacity"))
+    near = np.arange(1, min(NEIGHBOURS, len(position)) + 1)
+    around = cKDTree(position).query(mesh.vertices[mesh.faces].mean(axis=1), k=near)[1]
+    before, changed = sigmoid(raw[:, 0]), np.flatnonzero(chosen)
+    theirs, after = np.zeros_like(before), before.copy()
+    theirs[changed], after[changed] = before[changed], 0 if cut else sigmoid(opacity[:, 0])
+    total, part, left = (values[around].sum(axis=1) for values in (before, theirs, after))
+    return mesh.part((part <= MAJORITY * total) | (left >= MAJORITY * total))
 
 
 def _assign(values: SurfelValues, own: dict[str, np.ndarray], assignment: Assignment) -> None:
