@@ -31,18 +31,24 @@ MAX_SEED = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class Job:
+class Shared:
+    """What all jobs of a comparison have in common."""
+
+    preset: str
+    settings: tuple[str, ...] = ()  # KEY=VALUE
+    mitsuba_variant: str = "llvm_ad_rgb"
+    threads: int | None = None  # None: every core
+    plugins: tuple[str, ...] = ()  # absolute paths of files to run before
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(Shared):
     """One fit and its evaluation, in values that can be sent to another process."""
 
     folder: str  # of the run, absolute
     data: str  # folder of the data set, absolute
     variant: str  # the method: a name of the package's, or the absolute path of a .toml
     seed: int
-    preset: str
-    settings: tuple[str, ...]  # key=value
-    mitsuba_variant: str
-    threads: int | None  # None: every core
-    plugins: tuple[str, ...] = ()  # absolute paths of files to run before
 
     @property
     def run(self) -> Run:
@@ -77,17 +83,6 @@ class Job:
             raise InputError(f"not a job ({error})", folder / JOB, remedy="remove the file") from error
 
 
-@dataclass(frozen=True)
-class Shared:
-    """What all jobs of a comparison have in common."""
-
-    preset: str
-    settings: tuple[str, ...] = ()  # KEY=VALUE
-    mitsuba_variant: str = "llvm_ad_rgb"
-    threads: int | None = None  # None: every core
-    plugins: tuple[str, ...] = ()  # absolute paths
-
-
 def plan(
     folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], shared: Shared
 ) -> list[Job]:
@@ -108,9 +103,9 @@ def plan(
         raise InputError("a comparison takes its seeds from --seeds", "--set", "seed", "drop it here")
     jobs = []
     for seed, path, method in itertools.product(seeds, map(absolute, data), methods):
-        run = folder.resolve() / RUNS / path.name / Path(method).stem / f"seed{seed}"
+        run = str(folder.resolve() / RUNS / path.name / Path(method).stem / f"seed{seed}")
         variant = str(Path(method).resolve()) if method.endswith(".toml") else method
-        jobs.append(Job(str(run), str(path), variant, seed, **vars(shared)))
+        jobs.append(Job(folder=run, data=str(path), variant=variant, seed=seed, **vars(shared)))
     require_settings(folder, shared)
     _require_test_views(folder, jobs)
     for job in jobs:

@@ -77,11 +77,16 @@ def evaluate(
     surface = TrueSurface.read(views.path, views.offset)
     errors, budget = Decomposition(), ErrorBudget()
     render, maps_of = fitted.renderer(samples=samples), material_maps(fitted, samples)
-    around = fitted.surroundings is not None
+    plain = fitted.renderer(aovs=False, samples=samples)
+    around, corrected = fitted.surroundings is not None, bool(run.cameras())
     object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
     in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
     scores: list[dict[str, Any]] = []
     shown: list[tuple[RenderedView, View, dict[str, np.ndarray]]] = []  # in the sheet, with more images
+
+    def image_of(view: View) -> np.ndarray:
+        return displayed_image(plain(view.camera()), view, views)
+
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
@@ -90,6 +95,9 @@ def evaluate(
         scores.append(_scores(rendered, view, views, scores[0] if scores else {}))
         gain, gained = with_gain(frame, view, views)
         scores[-1] |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
+        if corrected:
+            moved = registered(view, image_of, views.scene_extent)
+            scores[-1]["psnr_registered"] = metrics.psnr(image_of(moved), moved.displayed)
         # Errors of materials, of concave pixels and per class of pixels.
         concave = None if surface is None else surface.concave(view)
         rendered = replace(rendered, maps=maps_of(view.camera(), rendered))
@@ -103,11 +111,8 @@ def evaluate(
             if object_only is not None:
                 more["object only"] = RenderedView.of(object_only(view.camera()), views, view).image
             shown.append((rendered, view, more))
-    if corrected := bool(run.cameras()):
-        _register(scores, fitted, views, samples, progress)
     light_scores, footer = _light(fitted, views)
-    cameras, timed = [view.camera() for view in views.views], fitted.renderer(aovs=False, samples=samples)
-    size = [views.views[0].width, views.views[0].height]
+    cameras, size = [view.camera() for view in views.views], [views.views[0].width, views.views[0].height]
     result = _means(scores) | light_scores | errors.result() | budget.result()
     result |= surface_scores(fitted.mesh, surface, views.views)
     result |= {
@@ -119,7 +124,7 @@ def evaluate(
         "surfels": fitted.surfels.count,
         "samples": per_pixel,
         "antialias": fitted.shading.antialias,
-        "ms_per_frame": metrics.frame_milliseconds(timed, cameras, views),
+        "ms_per_frame": metrics.frame_milliseconds(plain, cameras, views),
         "method": method.name,
         "preset": method.preset,
         "dataset": str(views.path),
@@ -133,21 +138,6 @@ def evaluate(
     write_png(run.path / SHEET, contact_sheet(rows, footer))
     run.write_json(METRICS, result)
     return result
-
-
-def _register(
-    per_view: list[dict[str, Any]], fitted: TrainedScene, views: Dataset, samples: int, progress: bool
-) -> None:
-    """Add `psnr_registered` to the scores of the test views."""
-    render = fitted.renderer(aovs=False, samples=samples)
-
-    def shown(view: View) -> np.ndarray:
-        return displayed_image(render(view.camera()), view, views)
-
-    pairs = list(zip(per_view, views.views, strict=True))
-    for scores, view in with_bar(pairs, "register", unit="view", disable=not progress):
-        moved = registered(view, shown, views.scene_extent)
-        scores["psnr_registered"] = metrics.psnr(shown(moved), moved.displayed)
 
 
 def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:

@@ -13,20 +13,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.poses import poses_around
 from mi_refgs.errors import InputError
 from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, COARSEST, DONE
 
-MOVING_JPEG, STILL_JPEG = 70, 92
-"""JPEG qualities during motion, and at rest until the supersampled image, a PNG."""
 STATUS_INTERVAL = 0.5  # seconds between updates of the status line
-START_DISTANCE, START_FOV = 2.5, math.radians(40)
+START_DISTANCE, START_FOV = 3.4, math.radians(40)
 """Of the first camera without a data set: in radii of the object, vertical field of view."""
 
 
@@ -97,11 +95,9 @@ class Page:
         """Return the initial pose: the first test view, or one a little from above."""
         if self.views:
             return Pose.of_view(self.views[0])
-        outward, centre = np.array([math.cos(0.6), math.sin(0.6), 0.5]), self.scene.centre
-        distance = START_DISTANCE * self.scene.radius / math.tan(START_FOV / 2) / 2
-        origin = centre + distance * outward / np.linalg.norm(outward)
-        look_at = mi.ScalarTransform4f().look_at(origin, centre, [0, 0, 1])
-        return Pose(np.array(look_at.matrix, np.float64), START_FOV, 1.0)
+        outward = np.array([[0.8, 0.4, 0.2**0.5]])
+        poses = poses_around(outward, self.scene.centre, START_DISTANCE * self.scene.radius)
+        return Pose(poses[0], START_FOV, 1.0)
 
     def go(self, client: Any, pose: Pose) -> None:
         """Move the camera of a page, a client of viser."""
@@ -136,7 +132,7 @@ class Page:
         client.scene.set_background_image(
             shown.image,
             format="png" if shown.progress == DONE else "jpeg",
-            jpeg_quality=MOVING_JPEG if shown.progress == COARSE else STILL_JPEG,
+            jpeg_quality=70 if shown.progress == COARSE else 92,
         )
         client.flush()
         now = time.monotonic()
