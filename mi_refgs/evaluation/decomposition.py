@@ -22,8 +22,7 @@ from mi_refgs.splat import Camera
 
 KNOWN_SHARE = 0.5  # fraction of a pixel that a true material must cover for it to count
 CONCAVE = "_concave"  # suffix of the numbers of concave pixels
-MATERIALS = ("albedo", "roughness", "metallic")
-KEYS = ("albedo_psnr", "roughness_mae", "metallic_mae")
+MATERIALS = {"albedo": "albedo_psnr", "roughness": "roughness_mae", "metallic": "metallic_mae"}  # their keys
 
 
 @dataclass
@@ -95,12 +94,12 @@ class Decomposition:
         for suffix in ("", CONCAVE):
             albedo, roughness, metallic = (self.sums.get(name + suffix, _Sums()) for name in MATERIALS)
             values = (albedo.psnr(self.scale()), roughness.mae(), metallic.mae())
-            found |= {key + suffix: value for key, value in zip(KEYS, values, strict=True)}
+            found |= {key + suffix: value for key, value in zip(MATERIALS.values(), values, strict=True)}
         found["albedo_scale"] = None if found["albedo_psnr"] is None else [float(x) for x in self.scale()]
         found["concave_share"] = None if self.concave is None else self.concave / max(self.foreground, 1)
         found[f"normal_mae_deg{CONCAVE}"], error = _mean(self.angles), _mean(self.squares)
         found[f"psnr{CONCAVE}"] = None if error is None else psnr_of(error)
-        for name, key in zip(MATERIALS, KEYS, strict=True):
+        for name, key in MATERIALS.items():
             reason = f"the data set defines no {name}" if name in self.ours else f"the run has no {name}"
             found[f"{name}_reason"] = reason if found[key] is None else None
         found["concave_reason"] = NO_SURFACE if self.concave is None else None

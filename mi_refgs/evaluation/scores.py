@@ -16,34 +16,33 @@ class Score:
     unit: str = ""
     reason: str = ""  # `REASON_reason` says why the number is missing
     compared: bool = False  # whether it is a column of comparisons
-    higher: bool | None = None  # whether higher is better; None: neither
     concave: bool = False  # whether there is a number of concave pixels, too: `KEY_concave`
 
 
 SCORES = (
     Score("image_size", "image size", "{0[0]} × {0[1]}", " pixels"),
     Score("downscale", "downscaled by", "{}"),
-    Score("psnr", "PSNR", "{:.2f}", " dB", compared=True, higher=True, concave=True),
+    Score("psnr", "PSNR", "{:.2f}", " dB", compared=True, concave=True),
     Score("psnr_gain", "PSNR, exposure fitted", "{:.2f}", " dB"),
     Score("psnr_registered", "PSNR, cameras registered", "{:.2f}", " dB", "registered"),
-    Score("ssim", "SSIM", "{:.4f}", compared=True, higher=True),
+    Score("ssim", "SSIM", "{:.4f}", compared=True),
     Score("psnr_region", "PSNR, region of interest", "{:.2f}", " dB"),
     Score("ssim_region", "SSIM, region of interest", "{:.4f}"),
-    Score("lpips", "LPIPS", "{:.4f}", "", "lpips", compared=True, higher=False),
-    Score("normal_mae_deg", "normal error, foreground", "{:.2f}", "°", "normal", True, False, concave=True),
-    Score("normal_mae_deg_full", "normal error, whole image", "{:.2f}", "°", "normal", True, False),
+    Score("lpips", "LPIPS", "{:.4f}", "", "lpips", compared=True),
+    Score("normal_mae_deg", "normal error, foreground", "{:.2f}", "°", "normal", True, concave=True),
+    Score("normal_mae_deg_full", "normal error, whole image", "{:.2f}", "°", "normal", True),
     Score("albedo_psnr", "albedo, PSNR after scale", "{:.2f}", " dB", "albedo", concave=True),
     Score("roughness_mae", "roughness, mean error", "{:.3f}", "", "roughness", concave=True),
     Score("metallic_mae", "metallic, mean error", "{:.3f}", "", "metallic", concave=True),
     Score("env_psnr", "environment map, PSNR", "{:.2f}", " dB", "env"),
-    Score("env_correlation", "environment correlation", "{:.3f}", "", "env", compared=True, higher=True),
+    Score("env_correlation", "environment correlation", "{:.3f}", "", "env", compared=True),
     Score("surface_distance", "surface distance", "{:.2f}", " % of the size", "surface", concave=True),
     Score("concave_share", "concave pixels", "{:.1%}", " of the foreground", "concave"),
-    Score("train_seconds", "training", "{:.0f}", " s", compared=True, higher=False),
+    Score("train_seconds", "training", "{:.0f}", " s", compared=True),
     Score("surfels", "surfels", "{:.0f}", compared=True),
     Score("iterations", "iterations", "{}"),
     Score("samples", "samples per pixel", "{}"),
-    Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True, higher=False),
+    Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True),
 )
 
 PIXEL_CLASSES = {

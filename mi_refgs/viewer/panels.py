@@ -29,8 +29,6 @@ from mi_refgs.viewer.resolution import FINEST, SAMPLES, SIDES
 from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, displayed_planes, planes_of
 
 STOPS = 6.0  # largest exposure either way
-FRUSTUM, THICKNESS = 0.08, 1.5
-"""Size of a camera's frustum, in radii of the object, and thickness of its lines, pixels."""
 COLOURS = {"train": (90, 160, 255), "test": (255, 160, 60)}  # colours of the frusta by split
 
 
@@ -144,7 +142,7 @@ def add_cameras(page: Page) -> None:
         return
     hint = "Blue: training, orange: test; click one to look from there."
     box, nodes = page.server.gui.add_checkbox("Cameras", False, hint=hint), list[Any]()
-    lines = {"scale": FRUSTUM * page.scene.radius, "thickness": THICKNESS, "thickness_units": "screen"}
+    lines = {"scale": 0.08 * page.scene.radius, "thickness": 1.5, "thickness_units": "screen"}
 
     def add(split: str, index: int, pose: Pose) -> None:
         name, more = f"/cameras/{split}/{index}", {"wxyz": pose.page_rotation, "position": pose.position}

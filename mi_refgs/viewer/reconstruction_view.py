@@ -121,17 +121,17 @@ class ReconstructionView:
         light, scene = self.light, self.scene
         with dr.suspend_grad():
             shading, occluder = scene.shading, self._occluder
-            ambient = bool(shading.ambient_rays) and occluder.ambient is None
-            traced = bool(shading.traced_bounces) and occluder.vertex_surfels is None
-            lacks_caches = not occluder.empty and (ambient or traced)
-            if self._stale and (settled or lacks_caches):
+            lacks_ambient = shading.ambient_rays and occluder.ambient is None
+            lacks_materials = shading.traced_bounces and occluder.vertex_surfels is None
+            if self._stale and (settled or lacks_ambient or lacks_materials):
                 update_occluder_caches(occluder, scene.surfels, light, shading)
                 self._stale = False
-            background = None if look.object_only else scene.surroundings
+            background = scene.surroundings if look.backdrop == BACKGROUND else None
             own = self.environment is self.original.light and not self.turn
             given = (light, occluder, background, scene.near if own else None)
             rendered = SurfelScene(scene.surfels, shading, *given)
-            return render(rendered, camera, Request(look.aovs, forward_only=True))
+            aovs = frozenset({look.what} - {IMAGE, "alpha"})
+            return render(rendered, camera, Request(aovs, forward_only=True))
 
     def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Float]:
         """Render planes of `planes_of`."""

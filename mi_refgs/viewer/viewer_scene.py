@@ -32,16 +32,6 @@ class DisplayOptions:
     backdrop: str = "white"  # one of those of the scene
     largest: int = FINEST  # finest resolution level at rest
 
-    @property
-    def object_only(self) -> bool:
-        """Whether the background is left out."""
-        return self.backdrop != BACKGROUND
-
-    @property
-    def aovs(self) -> frozenset[str]:
-        """The AOVs to render."""
-        return frozenset({self.what} - {IMAGE, "alpha"})
-
 
 def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Float]:
     """Planes (H*W,) to average over samples: premultiplied image with what is behind, or AOV; alpha."""
