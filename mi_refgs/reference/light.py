@@ -1,5 +1,5 @@
 """Environment maps in float64: prefiltered levels, lookups (texels (n, k) of the flat levels, and their
-weights, which may be complex), and the lobe average that a level approximates."""
+weights, which may be complex)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-
-from mi_refgs.reference.lobe import frame
 
 Array = np.ndarray
 
@@ -118,30 +116,6 @@ def table_lookup(table: Array, n_dot_v: Array | float, roughness: Array | float)
     upper = (1 - s) * table[i, j] + s * table[i, j + 1]
     lower = (1 - s) * table[i + 1, j] + s * table[i + 1, j + 1]
     return (1 - t) * upper + t * lower
-
-
-def lobe_average(
-    map_: Array, direction: Array, roughness: float, *, rings: int = 400, spokes: int = 400
-) -> Array:
-    """∫ L W / ∫ W with W = max(L·R, 0) D(R·H), in polar coordinates around R: rings wider in the tail."""
-    α = roughness**2
-    pole = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    side, up, _ = frame(pole)
-    φ = (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
-    around = np.cos(φ)[:, None] * side + np.sin(φ)[:, None] * up
-    total, weights = np.zeros(3), 0.0
-    end = math.asinh(1 / α)  # tan θ_h = 1 puts L on the horizon
-    for n in range(rings):
-        t = end * (n + 0.5) / rings
-        half = math.atan(α * math.sinh(t))
-        d = α**2 / (math.cos(half) ** 2 * (α**2 - 1) + 1) ** 2
-        width = α * math.cosh(t) * math.cos(half) ** 2  # dθ_h / dt
-        # dω_l = 4 cosθ_h dω_h
-        weight = math.cos(2 * half) * d * math.cos(half) * math.sin(half) * width
-        ring = math.cos(2 * half) * pole + math.sin(2 * half) * around
-        total += weight * radiance_of(map_, ring).mean(0)
-        weights += weight
-    return total / weights
 
 
 def clip(x: Array | float, low: float, high: float) -> Array:

@@ -31,18 +31,31 @@ def frame(normal: Array) -> Array:
     return np.stack([side, np.cross(normal, side), normal])
 
 
+def half_vectors(roughness: float, rings: int, spokes: int) -> tuple[Array, Array]:
+    """Half vectors (n, 3) around +z and weights (n,), midpoints of the density D cosθ: rings are even in θ."""
+    y = ((np.arange(rings) + 0.5) / rings)[:, None]
+    s = 1 - y**2
+    n_h = np.sqrt(s**2 / (s**2 + roughness**4 * (1 - s**2)))
+    sin_h = np.sqrt(1 - n_h**2)
+    φ = (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
+    half = np.stack(np.broadcast_arrays(sin_h * np.cos(φ), sin_h * np.sin(φ), n_h), -1).reshape(-1, 3)
+    return half, np.broadcast_to(4 * s * y / (rings * spokes), (rings, spokes)).ravel()
+
+
+def lobe_average(incoming: Incoming, direction: Array, roughness: float, nodes: int = 400) -> Array:
+    """∫ L W / ∫ W with W = max(L·R, 0) D(R·H) of a unit direction R; dω_l = 4 cosθ_h dω_h."""
+    half, share = half_vectors(roughness, nodes, nodes)
+    light = 2 * half[:, 2:] * half - np.array([0, 0, 1])
+    weight = share * np.maximum(light[:, 2], 0)
+    return np.asarray(weight @ incoming(light @ frame(direction)) / weight.sum())
+
+
 def lobe_nodes(
     normal: Array, view: Array, roughness: float, rings: int = 200, spokes: int = 200
 ) -> tuple[Array, Array, Array]:
     """Directions (n, 3), cosines of view and half vector (n,), and weights (n,), with Σ weight F(cosine)
     L(direction) = ∫ f L cosθ dω: midpoints over the half vectors, drawn from D cosθ."""
-    α2 = roughness**4
-    s = ((np.arange(rings) + 0.5) / rings)[:, None]
-    n_h = np.sqrt(s**2 / (s**2 + α2 * (1 - s**2)))
-    sin_h = np.sqrt(1 - n_h**2)
-    φ = (np.arange(spokes) + 0.5) * (2 * math.pi / spokes)
-    half = np.stack(np.broadcast_arrays(sin_h * np.cos(φ), sin_h * np.sin(φ), n_h), -1).reshape(-1, 3)
-    share = np.broadcast_to(2 * s / (rings * spokes), (rings, spokes)).ravel()
+    half, share = half_vectors(roughness, rings, spokes)
     rotation = frame(normal)
     local = rotation @ view
     v_h = half @ local

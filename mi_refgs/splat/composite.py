@@ -22,10 +22,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.kernels.rows import PackedRows
 from mi_refgs.kernels.timing import boundary, phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.lanes import CompactedPixels, Lanes, advance, any_of, walk
-from mi_refgs.splat.rows import PackedRows
 from mi_refgs.splat.tiles import TileLists
 from mi_refgs.surfels.primitives import Footprints
 from mi_refgs.types import Bool, Float, UInt32
@@ -135,24 +135,22 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
 
 
 def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:
-    """Tangents of the maps, per pixel of the lanes, for tangents of the rows."""
+    """Tangents of the maps, per pixel of the lanes, for tangents of the rows: Dr.Jit's, of each step."""
 
     def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row, drow = lists.rows.fetch(surfel, some), drows.fetch(surfel, some)
         after = []
         for pixel, _, _, active_here, transmittance, dtransmittance, dout in lanes.each(active, *state):
-            sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
-            weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-            hit = weight > 0
-            dalpha, dz = lists.primitive.evaluate_forward(row, sample, drow)
-            dweight = dr.select(hit, dtransmittance * sample.alpha + transmittance * dalpha, 0)
-            dvalues = [*drow[lists.primitive.columns :][: lists.features], dz, mi.Float(0)]
-            dout = [
-                total + dweight * value + dr.select(hit, weight * dvalue, 0)
-                for total, value, dvalue in zip(dout, _values(lists, row, sample.z), dvalues, strict=True)
-            ]
-            dafter = dtransmittance * (1 - sample.alpha) - transmittance * dalpha
-            after.append((goes_on, transmittance_after, dr.select(hit, dafter, dtransmittance), dout))
+            with dr.resume_grad():
+                start = dr.copy([*row, transmittance])
+                dr.enable_grad(start)
+                dr.set_grad(start, [*drow, dtransmittance])
+                sample = lists.primitive.evaluate(start, pixel, lists.camera.near)
+                weight, transmittance_after, goes_on = advance(sample, active_here, start[-1])
+                maps = [weight * value for value in _values(lists, start, sample.z)]
+                *dmaps, dafter = dr.forward_to([*maps, transmittance_after])
+            dout = [total + dmap for total, dmap in zip(dout, dmaps, strict=True)]
+            after.append((goes_on, dr.detach(transmittance_after), dafter, dout))
         return after
 
     zeros = [mi.Float(0)] * (lists.features + 2)

@@ -11,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.kernels.rows import PackedRows
 from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.rows import PackedRows
 from mi_refgs.surfels.primitives import Footprints, Primitive
 from mi_refgs.types import Bool, Float, Int32, UInt32, UInt64
 

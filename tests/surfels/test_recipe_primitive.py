@@ -83,12 +83,6 @@ class Ball(Primitive):
     def adjoint(self) -> BallAdjoint:
         return BallAdjoint()
 
-    def evaluate_forward(self, row: Any, sample: BallSample, drow: Any) -> tuple[Any, Any]:
-        along = sample.delta.x * drow[2] + sample.delta.y * drow[3]
-        drho = drow[0] * dr.squared_norm(sample.delta) - 2 * row[0] * along
-        dalpha = drow[4] * sample.gaussian - 0.5 * sample.alpha * drho
-        return dr.select(sample.alpha < ALPHA_MAX, dalpha, 0), drow[1]
-
     def normal(self, surfels: Any) -> Any:
         return dr.normalize(mi.Vector3f(surfels.position()))  # out of a convex thing at the origin
 

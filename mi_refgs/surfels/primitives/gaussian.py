@@ -87,16 +87,6 @@ class Gaussian(base.Oriented):
     def adjoint(self) -> GaussianAdjoint:
         return GaussianAdjoint()
 
-    def evaluate_forward(
-        self, row: list[Float], sample: base.OrientedSample, drow: list[Float]
-    ) -> tuple[Float, Float]:
-        """Apply the chain rule, column by column."""
-        delta, ddelta = sample.delta, mi.Vector2f(-drow[4], -drow[5])
-        du = dot2(drow[0], drow[1], delta) + dot2(row[0], row[1], ddelta)
-        dv = drow[2] * delta.y + row[2] * ddelta.y
-        dalpha = drow[6] * sample.gaussian - sample.alpha * dr.fma(sample.u, du, sample.v * dv)
-        return dr.select(sample.clamped, 0, dalpha), drow[3]
-
     def normal(self, surfels: Surfels) -> Vector3f:
         """The shortest axis, the third of equal ones; which one it is has no derivative. [3DGS-DR, §3.2]"""
         first, second, third = surfels.frame()

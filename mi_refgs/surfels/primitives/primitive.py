@@ -90,10 +90,6 @@ class Primitive(ABC):
         """An empty adjoint of `evaluate`."""
 
     @abstractmethod
-    def evaluate_forward(self, row: list[Float], sample: Any, drow: list[Float]) -> tuple[Float, Float]:
-        """Tangents of α and z for tangents of the columns."""
-
-    @abstractmethod
     def normal(self, surfels: Surfels) -> Vector3f:
         """Unit normals in the world, not yet turned towards a camera."""
 

@@ -106,24 +106,6 @@ class Surfel(base.Oriented):
     def adjoint(self) -> FootprintAdjoint:
         return FootprintAdjoint()
 
-    def evaluate_forward(
-        self, row: list[Float], sample: SurfelSample, drow: list[Float]
-    ) -> tuple[Float, Float]:
-        plane = ~sample.low_pass
-        delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
-        ddelta = mi.Vector2f(-drow[7], -drow[8])
-
-        def tangent(i: int) -> Float:
-            """Tangent of the linear form in columns i and i + 1."""
-            return dot2(drow[i], drow[i + 1], delta) + dot2(row[i], row[i + 1], ddelta)
-
-        dw = dr.select(plane, tangent(4), 0)
-        dz = ratio * (drow[6] - sample.z * dw)
-        du, dv = ratio * (tangent(0) - u * dw), ratio * (tangent(2) - v * dw)
-        drho = dr.select(plane, 2 * (u * du + v * dv), 2 * LOW_PASS_INV_VARIANCE * dr.dot(delta, ddelta))
-        dalpha = drow[9] * sample.gaussian - 0.5 * sample.alpha * drho
-        return dr.select(sample.clamped, 0, dalpha), dz
-
     def normal(self, surfels: Surfels) -> Vector3f:
         return surfels.frame()[2]
 
