@@ -32,7 +32,7 @@ def frame(normal: Array) -> Array:
 
 
 def half_vectors(roughness: float, rings: int, spokes: int) -> tuple[Array, Array]:
-    """Half vectors (n, 3) around +z and weights (n,), midpoints of the density D cosθ: rings are even in θ."""
+    """Half vectors (n, 3) around +z and weights (n,), midpoints of the density D cosθ; rings even in θ."""
     y = ((np.arange(rings) + 0.5) / rings)[:, None]
     s = 1 - y**2
     n_h = np.sqrt(s**2 / (s**2 + roughness**4 * (1 - s**2)))

@@ -59,6 +59,7 @@ class Ball(Primitive):
 
     name = "ball"
     widths = {"position": 3, "radius": 1, "opacity": 1}  # noqa: RUF012
+    adjoint = BallAdjoint
     columns = 5  # 1/σ², p.z, centre.x, centre.y, opacity
     sizes = ("radius",)
 
@@ -79,9 +80,6 @@ class Ball(Primitive):
         gaussian = dr.exp(-0.5 * row[0] * dr.squared_norm(delta))
         alpha = dr.minimum(row[4] * gaussian, ALPHA_MAX)
         return BallSample(alpha, row[1], alpha >= ALPHA_MIN, gaussian, delta)
-
-    def adjoint(self) -> BallAdjoint:
-        return BallAdjoint()
 
     def normal(self, surfels: Any) -> Any:
         return dr.normalize(mi.Vector3f(surfels.position()))  # out of a convex thing at the origin

@@ -35,11 +35,34 @@ def _as_surfel(columns: list[Float]) -> list[Float]:
     return [a_x, a_y, none, b, none, none, *others]
 
 
+class GaussianAdjoint:
+    """Adjoint of `Gaussian.evaluate`: sums over pixels of the adjoints of u = a·δ and v = b δ_y, times δ."""
+
+    def __init__(self) -> None:
+        self.u, self.v = [mi.Float(0)] * 3, [mi.Float(0)] * 2
+        self.depth, self.opacity = mi.Float(0), mi.Float(0)
+
+    def add(self, sample: base.OrientedSample, δalpha: Float, δz: Float) -> None:
+        delta = sample.delta
+        δalpha = dr.select(sample.clamped, 0, δalpha)
+        self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
+        self.depth = self.depth + δz
+        slope = -δalpha * sample.alpha  # α = o exp(-(u² + v²) / 2)
+        δu, δv = sample.u * slope, sample.v * slope
+        self.u = [self.u[0] + δu, dr.fma(δu, delta.x, self.u[1]), dr.fma(δu, delta.y, self.u[2])]
+        self.v = [self.v[0] + δv, dr.fma(δv, delta.y, self.v[1])]
+
+    def columns(self, row: list[Float]) -> list[Float]:
+        (u, *δa), (v, δb) = self.u, self.v
+        return [*δa, δb, self.depth, -u * row[0], -dr.fma(u, row[1], v * row[2]), self.opacity]
+
+
 class Gaussian(base.Oriented):
     """A 3D Gaussian with three standard deviations along the axes of a rotation. [3DGS, §4]"""
 
     name = "gaussian"
     widths = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1}  # noqa: RUF012
+    adjoint = GaussianAdjoint
     columns = 7  # a.x a.y b p.z centre.x centre.y opacity
     rows_as = {"surfel": _as_surfel}  # noqa: RUF012
     first_order = True
@@ -84,9 +107,6 @@ class Gaussian(base.Oriented):
         alpha = dr.select(clamped, ALPHA_MAX, alpha)
         return base.OrientedSample(alpha, row[3], alpha >= ALPHA_MIN, gaussian, clamped, delta, u, v)
 
-    def adjoint(self) -> GaussianAdjoint:
-        return GaussianAdjoint()
-
     def normal(self, surfels: Surfels) -> Vector3f:
         """The shortest axis, the third of equal ones; which one it is has no derivative. [3DGS-DR, §3.2]"""
         first, second, third = surfels.frame()
@@ -125,25 +145,3 @@ def _near_image(slope: Vector2f, camera: Camera) -> Vector2f:
         ends = [(margin * size - middle) / focal for margin in margins]
         limited.append(dr.clip(x, dr.minimum(*ends), dr.maximum(*ends)))
     return mi.Vector2f(*limited)
-
-
-class GaussianAdjoint:
-    """Adjoint of `Gaussian.evaluate`: sums over pixels of the adjoints of u = a·δ and v = b δ_y, times δ."""
-
-    def __init__(self) -> None:
-        self.u, self.v = [mi.Float(0)] * 3, [mi.Float(0)] * 2
-        self.depth, self.opacity = mi.Float(0), mi.Float(0)
-
-    def add(self, sample: base.OrientedSample, δalpha: Float, δz: Float) -> None:
-        delta = sample.delta
-        δalpha = dr.select(sample.clamped, 0, δalpha)
-        self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
-        self.depth = self.depth + δz
-        slope = -δalpha * sample.alpha  # α = o exp(-(u² + v²) / 2)
-        δu, δv = sample.u * slope, sample.v * slope
-        self.u = [self.u[0] + δu, dr.fma(δu, delta.x, self.u[1]), dr.fma(δu, delta.y, self.u[2])]
-        self.v = [self.v[0] + δv, dr.fma(δv, delta.y, self.v[1])]
-
-    def columns(self, row: list[Float]) -> list[Float]:
-        (u, *δa), (v, δb) = self.u, self.v
-        return [*δa, δb, self.depth, -u * row[0], -dr.fma(u, row[1], v * row[2]), self.opacity]

@@ -75,6 +75,7 @@ class Primitive(ABC):
     sizes: tuple[str, ...]  # attributes that are logarithms of standard deviations
     # By the name of another primitive whose rows express its footprints: its columns as such rows, under AD.
     rows_as: Mapping[str, Callable[[list[Float]], list[Float]]] = MappingProxyType({})
+    adjoint: Callable[[], Adjoint]  # of `evaluate`, empty
     first_order: bool = False  # splatted by the derivative of the projection at its centre
 
     @abstractmethod
@@ -84,10 +85,6 @@ class Primitive(ABC):
     @abstractmethod
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> FootprintSample:
         """Evaluate rows at pixel centres."""
-
-    @abstractmethod
-    def adjoint(self) -> Adjoint:
-        """An empty adjoint of `evaluate`."""
 
     @abstractmethod
     def normal(self, surfels: Surfels) -> Vector3f:

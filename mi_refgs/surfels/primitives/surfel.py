@@ -48,11 +48,53 @@ class SurfelSample(base.OrientedSample):
     low_pass: Bool  # the 2D filter decides
 
 
+class FootprintAdjoint:
+    """Adjoint of `Surfel.evaluate`: sums over pixels of adjoints of a·δ, b·δ, c·δ, times 1, δ.x and δ.y."""
+
+    def __init__(self) -> None:
+        self.a, self.b, self.c = ([mi.Float(0)] * 3 for _ in range(3))
+        self.depth, self.opacity = mi.Float(0), mi.Float(0)
+        self.screen = [mi.Float(0)] * 2
+
+    def add(self, sample: SurfelSample, δalpha: Float, δz: Float) -> None:
+        plane = ~sample.low_pass
+        delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
+        # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
+        δalpha = dr.select(sample.clamped, 0, δalpha)
+        self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
+        minus_2δrho = δalpha * sample.alpha
+        # ρ = u² + v²,  u = a·δ / w,  v = b·δ / w
+        by_plane = dr.select(plane, -ratio * minus_2δrho, 0)
+        δa, δb = u * by_plane, v * by_plane  # of a·δ and b·δ
+        self.depth = dr.fma(ratio, δz, self.depth)  # z = p_z / w, or p_z under the low-pass
+        δw = -ratio * dr.fma(sample.z, δz, dr.fma(u, u, v * v) * -minus_2δrho)
+        # In the low-pass, ρ is a multiple of δ·δ.
+        by_screen = dr.select(plane, 0, minus_2δrho)
+        self.screen = [dr.fma(by_screen, d, total) for d, total in zip(delta, self.screen, strict=True)]
+        self.a = _moments(self.a, δa, delta)
+        self.b = _moments(self.b, δb, delta)
+        self.c = _moments(self.c, dr.select(plane, δw, 0), delta)
+
+    def columns(self, row: list[Float]) -> list[Float]:
+        a, b, c = self.a, self.b, self.c
+        # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ
+        δcentre = [
+            dr.fma(LOW_PASS_INV_VARIANCE, screen, -(a[0] * row[i] + b[0] * row[2 + i] + c[0] * row[4 + i]))
+            for i, screen in enumerate(self.screen)
+        ]
+        return [*a[1:], *b[1:], *c[1:], self.depth, *δcentre, self.opacity]
+
+
+def _moments(total: list[Float], x: Float, delta: Vector2f) -> list[Float]:
+    return [total[0] + x, dr.fma(x, delta.x, total[1]), dr.fma(x, delta.y, total[2])]
+
+
 class Surfel(base.Oriented):
     """A flat Gaussian: the point p(u, v) = position + s_u u t_u + s_v v t_v, n = t_u × t_v. [2DGS, §4.1]"""
 
     name = "surfel"
     widths = {"position": 3, "rotation": 4, "scale": 2, "opacity": 1}  # noqa: RUF012
+    adjoint = FootprintAdjoint
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
 
     def project(self, surfels: Surfels, camera: Camera) -> base.Footprints:
@@ -103,9 +145,6 @@ class Surfel(base.Oriented):
         valid = (alpha >= ALPHA_MIN) & (z > near)
         return SurfelSample(alpha, z, valid, gaussian, clamped, delta, u, v, ratio, low_pass)
 
-    def adjoint(self) -> FootprintAdjoint:
-        return FootprintAdjoint()
-
     def normal(self, surfels: Surfels) -> Vector3f:
         return surfels.frame()[2]
 
@@ -148,47 +187,6 @@ class Surfel(base.Oriented):
         u, v = dot2(a_x, a_y, delta), dot2(b_x, b_y, delta)
         inside = dr.minimum(1, SORT_REACH * dr.rsqrt(dr.maximum(dr.fma(u, u, v * v), NORM_FLOOR)))
         return z / dr.maximum(dr.fma(inside, dot2(c_x, c_y, delta), 1), 1 / SORT_DEPTH_RANGE)
-
-
-class FootprintAdjoint:
-    """Adjoint of `Surfel.evaluate`: sums over pixels of adjoints of a·δ, b·δ, c·δ, times 1, δ.x and δ.y."""
-
-    def __init__(self) -> None:
-        self.a, self.b, self.c = ([mi.Float(0)] * 3 for _ in range(3))
-        self.depth, self.opacity = mi.Float(0), mi.Float(0)
-        self.screen = [mi.Float(0)] * 2
-
-    def add(self, sample: SurfelSample, δalpha: Float, δz: Float) -> None:
-        plane = ~sample.low_pass
-        delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
-        # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
-        δalpha = dr.select(sample.clamped, 0, δalpha)
-        self.opacity = dr.fma(δalpha, sample.gaussian, self.opacity)
-        minus_2δrho = δalpha * sample.alpha
-        # ρ = u² + v²,  u = a·δ / w,  v = b·δ / w
-        by_plane = dr.select(plane, -ratio * minus_2δrho, 0)
-        δa, δb = u * by_plane, v * by_plane  # of a·δ and b·δ
-        self.depth = dr.fma(ratio, δz, self.depth)  # z = p_z / w, or p_z under the low-pass
-        δw = -ratio * dr.fma(sample.z, δz, dr.fma(u, u, v * v) * -minus_2δrho)
-        # In the low-pass, ρ is a multiple of δ·δ.
-        by_screen = dr.select(plane, 0, minus_2δrho)
-        self.screen = [dr.fma(by_screen, d, total) for d, total in zip(delta, self.screen, strict=True)]
-        self.a = _moments(self.a, δa, delta)
-        self.b = _moments(self.b, δb, delta)
-        self.c = _moments(self.c, dr.select(plane, δw, 0), delta)
-
-    def columns(self, row: list[Float]) -> list[Float]:
-        a, b, c = self.a, self.b, self.c
-        # δ = pixel - centre enters a·δ, b·δ, c·δ and ρ
-        δcentre = [
-            dr.fma(LOW_PASS_INV_VARIANCE, screen, -(a[0] * row[i] + b[0] * row[2 + i] + c[0] * row[4 + i]))
-            for i, screen in enumerate(self.screen)
-        ]
-        return [*a[1:], *b[1:], *c[1:], self.depth, *δcentre, self.opacity]
-
-
-def _moments(total: list[Float], x: Float, delta: Vector2f) -> list[Float]:
-    return [total[0] + x, dr.fma(x, delta.x, total[1]), dr.fma(x, delta.y, total[2])]
 
 
 def _extent(
