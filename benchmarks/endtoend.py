@@ -15,8 +15,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import drjit as dr
@@ -25,17 +23,11 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import timing
-from benchmarks.common.report import Row, make_parser, write_measured
-from benchmarks.common.setup import Setup, path_tracer
-from benchmarks.common.view import ROOT, make_light, rows
-from benchmarks.visibility.cases import VOXEL, Rule, make_scene
-from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.reflectance import TraceContext
-from mi_refgs.shade.reflectance.split_sum import shade
-from mi_refgs.shade.reflection import reflection
-from mi_refgs.surfels.table import Surfels
+from benchmarks.common.report import Row, benchmark
+from benchmarks.common.setup import path_tracer
+from benchmarks.common.view import ROOT
+from benchmarks.visibility.cases import Rule, make_scene
+from benchmarks.visibility.setup import Setup
 from mi_refgs.synthesis.mesh_surfels import surfels_from_mesh
 
 DEPTH = 8
@@ -95,41 +87,27 @@ SMALL = Settings(PAGE.scenes[:1], 32, (2_000,), (1,), (1, 4), 64, 2, 32, 0.02, 1
 class Case(Setup):
     """A scene: its mesh for Mitsuba, and surfels on the mesh for `refgs`."""
 
-    def __init__(self, scene: Scene, settings: Settings, folder: Path) -> None:
-        file = ROOT / "scenes" / "meshes" / f"{scene.shape}.ply"
+    def __init__(self, scene: Scene, settings: Settings) -> None:
+        file, self.what = ROOT / "scenes" / "meshes" / f"{scene.shape}.ply", scene
         concave = make_scene(str(file) if file.exists() else scene.shape, 1)
-        self.file, self.mesh, self.what = folder / f"{scene.shape}.ply", concave.mesh, scene
-        self.file.write_bytes(concave.mesh.export(file_type="ply", vertex_normal=True))
-        shape, light = (
-            {"type": "ply", "filename": str(self.file)},
-            make_light(scene.light, settings.light_height),
-        )
-        super().__init__(scene.shape, shape, light, concave.look, settings)
-        self.material, self.light = self.set_material(scene.metallic, scene.roughness), light
-        self.filtered, self.origin = light.prefiltered(settings.light_height), mi.Point3f(concave.look.origin)
+        super().__init__(concave, settings, scene.light, scene.metallic, scene.roughness)
         film = {"type": "hdrfilm", "width": settings.edge, "height": settings.edge, "pixel_format": "rgb"}
         pose = mi.ScalarTransform4f().look_at(concave.look.origin, concave.look.target, [0, 1, 0])
         camera = {"type": "perspective", "fov": concave.look.fov, "to_world": pose}
         self.camera = mi.load_dict(camera | {"film": film | {"rfilter": {"type": "box"}}})
 
-    def refgs(self, count: int) -> tuple[Surfels, Any]:
-        """Surfels on the mesh, with its normals and material, and a scene of them under the same light."""
+    def refgs(self, count: int) -> Any:
+        """A scene of surfels on the mesh, with its normals and material, under the same light."""
         surfels = surfels_from_mesh(self.scene, count, attributes=MATERIALS)
-        options = {"diffuse": "irradiance", "traced_bounces": RULE.bounces, "mesh": str(self.file)}
-        refgs = {"type": "refgs"} | options | surfels.raw
-        return surfels, mi.load_dict({"type": "scene", "refgs": refgs, "light": self.light.emitter()})
+        options = {"diffuse": "irradiance", "traced_bounces": RULE.bounces}
+        with self.mesh_file() as path:
+            refgs = {"type": "refgs", "mesh": path} | options | surfels.raw
+            return mi.load_dict({"type": "scene", "refgs": refgs, "light": self.map.emitter()})
 
     def exact(self) -> np.ndarray:
         """The product's shading at the mesh's hits, averaged over each pixel: (H, W, 3)."""
-        vertices = np.asarray(self.mesh.vertices, np.float32)
-        occluder = Occluder(Mesh(vertices, np.asarray(self.mesh.faces, np.uint32), VOXEL))
-        surfels, _ = self.refgs(self.settings.surfels[-1])
-        occluder.set_materials(surfels)
-        context = TraceContext(occluder, surfels, self.filtered, self.origin, -self.points.view)
-        at = ShadingPoints(self.points.normal, self.points.view, **self.material)
-        colours = shade(reflection(at, context, RULE.options()), self.filtered, RULE.options()).total()
         image, edge = np.zeros((self.settings.size**2, 3)), self.settings.edge
-        image[self.points.pixel.numpy()] = rows(colours)
+        image[self.points.pixel.numpy()] = self.image(RULE)
         return image.reshape(edge, SIDE, edge, SIDE, 3).mean((1, 3))
 
     def frame(self, scene: Any, integrator: Any, spp: int, seed: int = 0) -> Any:
@@ -174,7 +152,7 @@ class Case(Setup):
         )
         exact = self.exact()
         found: list[Row] = []
-        scenes = {count: self.refgs(count)[1] for count in settings.surfels}
+        scenes = {count: self.refgs(count) for count in settings.surfels}
         keys = [("refgs", count, spp) for count in settings.surfels for spp in settings.refgs_spp]
         keys += [("path", 0, spp) for spp in settings.path_spp]
         frames, gradients = {}, {}
@@ -207,17 +185,10 @@ def error(values: np.ndarray, reference: np.ndarray) -> float:
 def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
     """Times and errors of every scene."""
     found: list[Row] = []
-    with TemporaryDirectory() as folder:
-        for scene in tqdm(settings.scenes, disable=quiet):
-            found += Case(scene, settings, Path(folder)).measure()
+    for scene in tqdm(settings.scenes, disable=quiet):
+        found += Case(scene, settings).measure()
     return {"settings": asdict(settings), "rows": found}
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure; returns the exit code, 2 for bad input."""
-    options = make_parser("endtoend", __doc__, PAGE, SMALL).parse_args(arguments)
-    return write_measured("endtoend", options, lambda: measure(options.settings, options.quiet))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(benchmark("endtoend", __doc__, measure, PAGE, SMALL))

@@ -6,36 +6,36 @@ python -m benchmarks.frames RUN
 from __future__ import annotations
 
 import json
-import time
+import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from benchmarks.common.report import plain_parser
-from mi_refgs import load
+from benchmarks.common.timing import milliseconds
+from mi_refgs import Camera, load
 
 SIZES = (200, 400, 800)  # pixels along the longer side
-ROUNDS, WARM_UP = 9, 2  # timed images of each size, and those before, which compile kernels
+ROUNDS = 9  # timed images of each size
 
 
 def measure(run: Path, sizes: Sequence[int | tuple[int, int]] = SIZES) -> list[dict[str, float]]:
     """Width, height and median milliseconds for each size: the longer side, or both."""
     found = load(run, write=False)
-    draw, rows = found.trained.renderer(aovs=False), []
-    for size in sizes:
-        camera, times = found.camera(0).resized(size), []
-        for _ in range(WARM_UP + ROUNDS):
-            begin = time.perf_counter()
-            frame = draw(camera)
-            dr.eval(frame.radiance, frame.alpha, frame.background)
-            dr.sync_thread()
-            times.append(1e3 * (time.perf_counter() - begin))
-        ms = float(np.median(times[WARM_UP:]))
-        rows.append({"width": camera.width, "height": camera.height, "frame_ms": ms})
-    return rows
+    draw = found.trained.renderer(aovs=False)
+
+    def image(camera: Camera) -> Any:
+        frame = draw(camera)
+        return frame.radiance, frame.alpha, frame.background
+
+    cameras = [found.camera(0).resized(size) for size in sizes]
+    calls = {(camera.width, camera.height): partial(image, camera) for camera in cameras}
+    times = milliseconds(calls, math.inf, ROUNDS)
+    return [{"width": width, "height": height, "frame_ms": ms} for (width, height), ms in times.items()]
 
 
 if __name__ == "__main__":

@@ -67,10 +67,8 @@ class Figures:
         """Read paper_tables.json."""
         content = read_json(Path(__file__).with_suffix(".json"))
         tables = {}
-        for table in content["tables"]:
-            columns = tuple(Place(*column) for column in table["columns"])
-            number = table["table"]
-            tables[number] = PaperTable(number, table["caption"], columns, table["metrics"])
+        for number, caption, columns, metrics in map(dict.values, content["tables"]):
+            tables[number] = PaperTable(number, caption, tuple(Place(*x) for x in columns), metrics)
         return Figures(content["source"], content["data_sets"], tables)
 
     def places(self, column: Place) -> list[Place]:
@@ -181,13 +179,11 @@ def text(found: Comparison, figures: Figures) -> str:
     heads = [_head(column, table.columns) for column in table.columns]
     for metric, rows in found.lines.items():
         title, form = TITLES[metric]
-        body = [
-            [
-                row.title,
-                *(NOTHING if value is None else format(value, row.sign + form) for value in row.values),
-            ]
-            for row in rows
-        ]
+
+        def cell(value: float | None, sign: str, form: str = form) -> str:
+            return NOTHING if value is None else format(value, sign + form)
+
+        body = [[row.title, *(cell(value, row.sign) for value in row.values)] for row in rows]
         lines += ["", *aligned([title, *heads], body)]
     if found.partial:
         lines += ["", "Averages of ours over a part of the scenes have no difference."]

@@ -69,8 +69,6 @@ def splitsum_pareto(result: Result, path: Path) -> Path:
 
 def visibility_time(result: Result, path: Path) -> Path:
     """Error over the time of a frame by bounces, one panel per scene, at a middling roughness."""
-    from matplotlib import ticker
-
     values = result["settings"]["roughness"]
     roughness = values[len(values) // 2]
     figure, axes = figures.grid(
@@ -87,9 +85,7 @@ def visibility_time(result: Result, path: Path) -> Path:
             figures.series(ax, x, y, "o-", label, color=("#c77b30", *BLUES)[k % 5])
         none = where(rows, rays=0)[0]
         figures.series(ax, [none["frame_ms"]], [none["relmse"]], "kx", "no occlusion")
-        ax.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-        ax.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
-        ax.xaxis.set_minor_formatter(ticker.NullFormatter())
+        figures.plain_times(ax)
     return figures.save(figure, axes, path, 6)
 
 
@@ -114,8 +110,6 @@ def stability_cases(result: Result, path: Path) -> Path:
 
 def endtoend_frames(result: Result, path: Path) -> Path:
     """Error over time of whole frames, one panel per scene."""
-    from matplotlib import ticker
-
     scenes = list(dict.fromkeys(row["scene"] for row in result["rows"]))
     label = "error against the converged path tracer"
     figure, axes = figures.grid(scenes, 3, 3.4, 3.0, "ms per frame", label)
@@ -132,16 +126,12 @@ def endtoend_frames(result: Result, path: Path) -> Path:
         figures.series(ax, x, y, "o-", "Mitsuba path", color="#c0392b")
         shading = where(rows, renderer="refgs")[0]["shading"]
         ax.axhline(shading, color="k", lw=0.8, ls=":", label="refgs, shading alone")
-        ax.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-        ax.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
-        ax.xaxis.set_minor_formatter(ticker.NullFormatter())
+        figures.plain_times(ax)
     return figures.save(figure, axes, path)
 
 
-PLOTS: dict[str, Callable[[Result, Path], Path]] = {
-    f.__name__: f
-    for f in (splatting_time, splitsum_pareto, visibility_time, stability_cases, endtoend_frames)
-}
+DRAWN = (splatting_time, splitsum_pareto, visibility_time, stability_cases, endtoend_frames)
+PLOTS: dict[str, Callable[[Result, Path], Path]] = {function.__name__: function for function in DRAWN}
 """Name of an image → what draws it; its first word is the data file."""
 
 

@@ -45,6 +45,15 @@ def series(ax: Any, x: Sequence[float], y: Sequence[float], style: str, label: s
         ax.set(xscale="log", yscale="log")
 
 
+def plain_times(ax: Any) -> None:
+    """Label a logarithmic axis of times by plain numbers."""
+    from matplotlib import ticker
+
+    ax.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    ax.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    ax.xaxis.set_minor_formatter(ticker.NullFormatter())
+
+
 def save(figure: Any, axes: Any, path: Path, columns: int = 4) -> Path:
     """Add one legend for all panels, and write a PNG atomically."""
     import matplotlib.pyplot as plt

@@ -8,6 +8,7 @@ import re
 import string
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,23 +91,35 @@ def plain_parser(name: str, description: str | None) -> argparse.ArgumentParser:
     )
 
 
-def make_parser(
-    name: str, description: str | None, page: Any = None, small: Any = None
-) -> argparse.ArgumentParser:
-    """Return a parser of every benchmark's options; `options.settings` are `page`, with --small `small`.
-
-    Sets Mitsuba's variant.
-    """
+def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    """Return a parser of the options of every benchmark that writes a data file. Sets Mitsuba's variant."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     parser = plain_parser(name, description)
-    parser.set_defaults(settings=page)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="folder of the data file")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    if small is not None:
-        text = "a coarse instance, below a minute"
-        parser.add_argument("--small", action="store_const", dest="settings", const=small, help=text)
     return parser
+
+
+def benchmark(
+    name: str,
+    description: str | None,
+    measure: Callable[[Any, bool], dict[str, Any]],  # of the settings, and whether quiet
+    page: Any,
+    small: Any,
+    files: tuple[str, str] = ("", ""),  # a repeatable option, and the settings' field to which it adds
+) -> int:
+    """Measure by `page`, with --small by `small`; write the data file. The exit code is 2 for bad input."""
+    parser, (option, field) = make_parser(name, description), files
+    text = "a coarse instance, below a minute"
+    parser.add_argument("--small", action="store_const", const=small, default=page, help=text)
+    if option:
+        parser.add_argument(option, metavar="FILE", action="append", default=[], dest="files")
+    options = parser.parse_args()
+    settings = options.small
+    if option:
+        settings = replace(settings, **{field: (*getattr(settings, field), *options.files)})
+    return write_measured(name, options, lambda: measure(settings, options.quiet))
 
 
 def write_measured(name: str, options: argparse.Namespace, measure: Callable[[], dict[str, Any]]) -> int:

@@ -1,10 +1,7 @@
-"""Times of warm runs, taken in turns, memory of a process, and measurements that require a fresh one."""
+"""Times of warm runs, taken in turns, and memory of a process."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
@@ -12,8 +9,6 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
-
-from benchmarks.common.view import ROOT
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -61,13 +56,3 @@ def peak_bytes() -> int:
     """Largest resident memory of this process since it began; requires Linux."""
     status = Path("/proc/self/status").read_text()
     return 1024 * int(status.partition("VmHWM:")[2].split()[0])
-
-
-def in_fresh_process(module: str, *arguments: Any) -> dict[str, Any]:
-    """Run `python -m module arguments` and return the JSON object of its last line.
-
-    Raises subprocess.CalledProcessError for one that fails.
-    """
-    command = [sys.executable, "-m", module, *map(str, arguments)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT)
-    return dict(json.loads(done.stdout.splitlines()[-1]))

@@ -10,16 +10,9 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks.common.report import make_parser, write_measured
+from benchmarks.common.report import benchmark
 from benchmarks.splatting.cases import PAGE, SMALL
 from benchmarks.splatting.measure import measure
 
-
-def main(arguments: list[str] | None = None) -> int:
-    """Measure; returns the exit code, 2 for bad input."""
-    options = make_parser("splatting", __doc__, PAGE, SMALL).parse_args(arguments)
-    return write_measured("splatting", options, lambda: measure(options.settings, options.quiet))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(benchmark("splatting", __doc__, measure, PAGE, SMALL))

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
+from multiprocessing import get_context
 from typing import Any
 
 import drjit as dr
@@ -21,7 +23,7 @@ from tqdm import tqdm
 
 from benchmarks.common import timing
 from benchmarks.common.fits import make_trainer, sphere_data
-from benchmarks.common.timing import in_fresh_process, once
+from benchmarks.common.timing import once, peak_bytes
 from benchmarks.splatting.cases import COLOUR, FEATURES, Settings, Workload, sphere
 from benchmarks.splatting.counts import Counts
 from benchmarks.splatting.renderers import Ours, Volprim
@@ -124,15 +126,28 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         for count, size in shown(settings.errors, f"errors at {spread:g}")
     ]
     dr.flush_malloc_cache()
+    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:  # whose memory is that of the step
+        large = fresh.submit(large_step, *settings.large_step).result()
     return {
         "settings": asdict(settings),
         "gflops": gflops,
         "rows": rows,
         "cost": plane(rows, "both_ms", COST) if len(rows) > len(COST) + 1 else None,
         "errors": wrong,
-        "large_step": in_fresh_process("benchmarks.splatting.process", *settings.large_step),
+        "large_step": large,
         "step": step_times(*settings.step, settings.steps),
     }
+
+
+def large_step(count: int, size: int, steps: int = 3) -> Row:
+    """Return milliseconds per step of the full method's last stage, and this process's largest memory."""
+    mi.set_variant("llvm_ad_rgb")
+    trainer = make_trainer(count, sphere_data(size, 2, np.random.default_rng(0)))
+    trainer.method.event["mesh"].apply(trainer)
+    trainer.fit.iteration = trainer.method.stages()[-1][1].until - steps - 1
+    times = [1e3 * once(trainer.step) for _ in range(steps + 1)]
+    found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}
+    return found | {"whole_process": peak_bytes()}
 
 
 STEP_SECONDS = 1.0  # for which the splat of a step is timed by itself, at most

@@ -10,21 +10,10 @@ Writes visibility.json; `python -m benchmarks.pages` makes the tables and the pl
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 
-from benchmarks.common.report import make_parser, write_measured
+from benchmarks.common.report import benchmark
 from benchmarks.visibility.cases import PAGE, SMALL
 from benchmarks.visibility.measure import measure
 
-
-def main(arguments: list[str] | None = None) -> int:
-    """Measure; returns the exit code, 2 for bad input."""
-    parser = make_parser("visibility", __doc__, PAGE, SMALL)
-    parser.add_argument("--mesh", metavar="FILE", action="append", default=[], help="a mesh; repeatable")
-    options = parser.parse_args(arguments)
-    settings = replace(options.settings, meshes=tuple(options.mesh))
-    return write_measured("visibility", options, lambda: measure(settings, options.quiet))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(benchmark("visibility", __doc__, measure, PAGE, SMALL, ("--mesh", "meshes")))

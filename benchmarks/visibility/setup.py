@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from benchmarks.common import setup
 from benchmarks.common.view import Points, make_light, rows
-from benchmarks.visibility.cases import METALLIC, VOXEL, Concave, Rule, Settings
+from benchmarks.visibility.cases import METALLIC, VOXEL, Concave, Rule
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import SurfelScene, render
@@ -27,28 +28,40 @@ TIMED_ROUGHNESS = 0.3
 
 
 class Setup(setup.Setup):
-    """One concave scene under the light."""
+    """One scene under a light of that name."""
 
-    def __init__(self, concave: Concave, settings: Settings) -> None:
-        light = make_light("studio", settings.light_height)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "mesh.ply"
-            path.write_bytes(concave.mesh.export(file_type="ply", vertex_normal=True))
-            shape = {"type": "ply", "filename": str(path)}
-            super().__init__(concave.name, shape, light, concave.look, settings)
-        self.light = light.prefiltered(settings.light_height)
+    def __init__(
+        self,
+        concave: Concave,
+        settings: Any,
+        light: str = "studio",
+        metallic: float = METALLIC,
+        roughness: float = TIMED_ROUGHNESS,
+    ) -> None:
+        self.map, self.metallic, mesh = make_light(light, settings.light_height), metallic, concave.mesh
+        self.file = mesh.export(file_type="ply", vertex_normal=True)
+        with self.mesh_file() as path:
+            shape = {"type": "ply", "filename": path}
+            super().__init__(concave.name, shape, self.map, concave.look, settings)
+        self.light = self.map.prefiltered(settings.light_height)
         self.origin = mi.Point3f(concave.look.origin)
-        mesh = concave.mesh
         self.vertices, self.normals = np.asarray(mesh.vertices, np.float32), np.array(mesh.vertex_normals)
         self.occluder = Occluder(Mesh(self.vertices, np.asarray(mesh.faces, np.uint32), VOXEL))
-        self.material(TIMED_ROUGHNESS)
+        self.material(roughness)
         self.occluder.set_materials(self.surfels)
+
+    @contextmanager
+    def mesh_file(self) -> Iterator[str]:
+        """A file of the mesh while a scene that names it is loaded."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "mesh.ply"
+            path.write_bytes(self.file)
+            yield str(path)
 
     def material(self, roughness: float) -> None:
         """Give the scene this roughness; surfels at the mesh's vertices, of the same material."""
-        self.surface = self.set_material(METALLIC, roughness)
-        self.roughness = self.surface["roughness"]
-        given = {"albedo": self.albedo, "metallic": METALLIC, "roughness": roughness}
+        self.surface = self.set_material(self.metallic, roughness)
+        given = {"albedo": self.albedo, "metallic": self.metallic, "roughness": roughness}
         self.surfels = setup.covering(self.vertices, self.normals.astype(np.float32), **given)
 
     def seen(self, points: Points, rule: Rule) -> ShadingPoints:

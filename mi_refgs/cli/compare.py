@@ -70,10 +70,7 @@ class Compare:
                 say(f"{number} after {minutes:.1f} min: {job.title}: {outcome}")
 
             try:
-                if self.cluster is None:
-                    execute.execute_all(wanted, workers, report)
-                else:
-                    execute.run_on_cluster(wanted, self.cluster, report)
+                execute.execute_all(wanted, workers, report, self.cluster)
             except KeyboardInterrupt as error:
                 raise type(error)(f"interrupted; the same command continues, from {self.output}") from None
         else:

@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 
 from mi_refgs.compare.jobs import FAILED, Job
@@ -23,7 +24,6 @@ Report = Callable[[Job, str | None], None]
 LOG = "job.log"  # of a run folder: output of its processes
 RETRIES = 2  # restarts from the checkpoint of a job whose process was killed or crashed
 POLL = 0.2  # seconds between checks of processes and interrupts
-CONNECT = "20s"  # time limit for the connection to a scheduler
 
 
 def execute(job: Job, stop: threading.Event | None = None) -> str | None:
@@ -49,20 +49,52 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
     return reason
 
 
-def execute_all(jobs: Sequence[Job], workers: int, report: Report) -> None:
-    """Run jobs, `workers` at once; after a signal, raise when all processes have saved their state."""
+def execute_all(jobs: Sequence[Job], workers: int, report: Report, cluster: str | None = None) -> None:
+    """Run jobs, `workers` at once, or on the scheduler at the address `cluster`, whose workers see the same
+    paths. After a signal, raise when all processes have saved their state, or the cluster's are cancelled.
+    Raises InputError without dask.distributed and for a scheduler that does not answer."""
     stop = threading.Event()
-    with held_interrupts() as release, ThreadPoolExecutor(workers) as pool:
-        pending = {pool.submit(execute, job, stop): job for job in jobs}
+    local = contextlib.nullcontext(ThreadPoolExecutor(workers))
+    with held_interrupts() as release, local if cluster is None else _cluster(cluster) as pool, pool:
+        run = partial(execute, stop=stop) if cluster is None else execute
+        pending = {pool.submit(run, job): job for job in jobs}
         try:
             while pending:
                 done, _ = wait(pending, timeout=POLL, return_when=FIRST_COMPLETED)
                 for future in done:
-                    report(pending.pop(future), future.result())
+                    job, failure = pending.pop(future), future.exception()
+                    if failure is None or cluster is None:
+                        report(job, future.result())
+                        continue
+                    first = str(failure).splitlines()[0]
+                    reason = f"the cluster gave it up: {type(failure).__name__}: {first}"
+                    job.run.write_json(FAILED, {"reason": reason})
+                    report(job, reason)
                 release()
         except BaseException:
             stop.set()
+            pool.shutdown(wait=False)  # what a scheduler has not begun would outlive us
             raise
+
+
+@contextlib.contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    """The workers of a scheduler. A job whose worker died continues on another one, at most RETRIES times."""
+    try:
+        import dask
+        import distributed
+    except ImportError as error:
+        remedy = "pip install 'mi_refgs[cluster]'"
+        raise InputError("dask.distributed is not installed", "--cluster", remedy=remedy) from error
+    limits = {"distributed.scheduler.allowed-failures": RETRIES, "distributed.comm.timeouts.connect": "20s"}
+    with dask.config.set(limits):
+        try:
+            client = distributed.Client(address)
+        except (OSError, ValueError, TimeoutError) as error:
+            what = f"no scheduler answers there ({error})"
+            raise InputError(what, "--cluster", address, "start one") from error
+        with client:
+            yield client.get_executor(pure=False)
 
 
 def _process(job: Job, stop: threading.Event | None) -> int:
@@ -102,40 +134,3 @@ def threads_each(workers: int, threads: int | None) -> int | None:
     if not 1 <= workers <= 4 * cores:
         raise InputError(f"{workers} is out of range", "--workers", remedy=f"give 1 to {4 * cores}")
     return threads if threads is not None or workers == 1 else max(cores // workers, 1)
-
-
-def run_on_cluster(jobs: Sequence[Job], address: str, report: Report) -> None:
-    """Run jobs on the scheduler at `address`, whose workers see the same paths; a signal cancels them. A job
-    whose worker died continues on another one, at most RETRIES times. Raises InputError without
-    dask.distributed and for a scheduler that does not answer."""
-    try:
-        import dask
-        import distributed
-    except ImportError as error:
-        remedy = "pip install 'mi_refgs[cluster]'"
-        raise InputError("dask.distributed is not installed", "--cluster", remedy=remedy) from error
-    limits = {"distributed.scheduler.allowed-failures": RETRIES, "distributed.comm.timeouts.connect": CONNECT}
-    with dask.config.set(limits), held_interrupts() as release:
-        try:
-            client = distributed.Client(address)
-        except (OSError, ValueError, TimeoutError) as error:
-            what = f"no scheduler answers there ({error})"
-            raise InputError(what, "--cluster", address, "start one") from error
-        with client:
-            pending = {client.submit(execute, job, key=job.folder, pure=False): job for job in jobs}
-            try:
-                while pending:
-                    with contextlib.suppress(TimeoutError):
-                        distributed.wait(list(pending), timeout=POLL, return_when="FIRST_COMPLETED")
-                    for future in [future for future in pending if future.done()]:
-                        job, failure = pending.pop(future), future.exception()
-                        if failure is None:
-                            report(job, future.result())
-                            continue
-                        first = str(failure).splitlines()[0]
-                        reason = f"the cluster gave it up: {type(failure).__name__}: {first}"
-                        job.run.write_json(FAILED, {"reason": reason})
-                        report(job, reason)
-                    release()
-            finally:
-                client.cancel(list(pending))  # what the scheduler has not begun would outlive us

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks import endtoend
-from benchmarks.common.build import read_result
+BENCHMARK = "endtoend"
 
 
 @pytest.mark.slow
-def test_errors_have_parts_and_fall_with_samples(tmp_path: Path) -> None:
-    assert endtoend.main(["--small", "--quiet", "-o", str(tmp_path)]) == 0
-    refgs, coarse, fine = read_result(tmp_path / "endtoend.json")["rows"]
+def test_errors_have_parts_and_fall_with_samples(result: dict[str, Any]) -> None:
+    refgs, coarse, fine = result["rows"]
     assert fine["error"] < coarse["error"] and fine["gradient_error"] < coarse["gradient_error"]
     # Shading at the mesh's hits is the frame without errors of geometry: no part is larger than the sum.
     assert refgs["shading"] < refgs["error"] < refgs["shading"] + refgs["geometry"] < 1

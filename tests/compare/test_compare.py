@@ -179,8 +179,6 @@ def test_worker_ends_with_its_parent() -> None:
 def test_killed_cluster_worker_is_replaced(ball: Path, variants: Paths, tmp_path: Path) -> None:
     """Another worker goes on from the checkpoint; the log has each iteration once."""
     distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
-    from mi_refgs.compare.execute import run_on_cluster
-
     settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
     [job] = jobs.plan(tmp_path, [ball], [str(variants[1])], [0], Shared("quick", settings, threads=1))
     reports, killed = list[tuple[Job, str | None]](), list[int]()
@@ -199,7 +197,7 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: Paths, tmp_path
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         killer = threading.Thread(target=kill, args=[cluster.scheduler_address])
         killer.start()
-        run_on_cluster([job], cluster.scheduler_address, lambda *said: reports.append(said))
+        execute.execute_all([job], 1, lambda *said: reports.append(said), cluster.scheduler_address)
         killer.join()
     assert killed and reports == [(job, None)] and jobs.finished(job)
     lines = (job.run.path / "metrics.jsonl").read_text().splitlines()

@@ -161,7 +161,7 @@ def test_a_command_shows_the_model(name: str, command: str, place: Path, coat: N
 
 
 def test_a_comparison_takes_it_along(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def work(jobs: list[Any], workers: int, report: Any) -> None:
+    def work(jobs: list[Any], *_: object) -> None:
         forget(*NEEDED, *FIT_ONLY)  # a worker is another process
         fit_and_measure(type(jobs[0]).read(Path(jobs[0].folder)))
 
