@@ -25,7 +25,7 @@ from mi_refgs.fitting import decide
 from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.runs.run import Run
 from tests.helpers import refused
-from tests.scenes.tiny import SETTINGS, write_data, write_method
+from tests.scenes.tiny import SETTINGS
 
 Paths = tuple[Path, Path]
 SIX = [setting for setting in SETTINGS if "preview" not in setting]
@@ -38,19 +38,12 @@ def command(data: Path, folder: Path, *variants: Path, more: tuple[str, ...] = (
 
 
 @pytest.fixture(scope="module")
-def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny data set in a folder that is named after a scene of the paper."""
-    return write_data(tmp_path_factory.mktemp("shiny") / "ball")
-
-
-@pytest.fixture(scope="module")
-def variants(tmp_path_factory: pytest.TempPathFactory) -> Paths:
+def variants(method: Path) -> Paths:
     """The tiny method, and one that deviates from it and stands for a row of the paper."""
-    first = write_method(tmp_path_factory.mktemp("variants"))
-    second = first.with_name("other.toml")
+    second = method.with_name("other.toml")
     about = '[about]\nname = "Other"\npaper_row = "2DGS"\ndeviations = ["a <and> no scene", "six steps"]\n'
     second.write_text(f'extends = "tiny.toml"\n{about}[rates]\ndecay = 0.5\n')
-    return first, second
+    return method, second
 
 
 def copied(folder: Path, target: Path) -> Path:
@@ -62,14 +55,14 @@ def copied(folder: Path, target: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def compared(ball: Path, variants: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compared(data: Path, variants: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A comparison in which one of four jobs failed; do not change it."""
     folder = tmp_path_factory.mktemp("compared")
     broken = folder / "runs" / "ball" / "tiny" / "seed1"
     own_folder(folder, "compare")
     own_folder(broken, RUN)
     (broken / "checkpoints").write_text("in the way")
-    assert main(command(ball, folder, *variants, more=("--seeds", "0,1", "--workers", "2"))) == 3
+    assert main(command(data, folder, *variants, more=("--seeds", "0,1", "--workers", "2"))) == 3
     return folder
 
 
@@ -86,21 +79,16 @@ def test_failed_job_is_a_row_with_its_reason(compared: Path) -> None:
     assert tiny["variant"] == "tiny" and tiny["seeds"] == [0] and list(tiny["failed"]) == ["1"]
     assert "seed1/checkpoints: output: cannot be created" in tiny["failed"]["1"]
     assert other["seeds"] == [0, 1] and not other["failed"]
-    failed, about = (
-        f"tiny, seed 1: failed: {tiny['failed']['1']}",
-        json.loads((compared / "compare.json").read_text()),
-    )
+    failed = f"tiny, seed 1: failed: {tiny['failed']['1']}"
+    about = json.loads((compared / "compare.json").read_text())
     for said in (failed, "a <and> no scene", "llvm_ad_rgb", "jobs at once", about["command"]):
         assert said in (compared / "table.md").read_text(), said
 
 
 def test_numbers_are_means_over_the_runs(compared: Path) -> None:
     [scene] = json.loads((compared / "table.json").read_text())["scenes"]
-    other, folders = (
-        scene["rows"][1],
-        (compared / "runs/ball/other/seed0", compared / "runs/ball/other/seed1"),
-    )
-    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in folders]
+    other, runs = scene["rows"][1], compared / "runs/ball/other"
+    metrics = [json.loads((runs / seed / "metrics.json").read_text()) for seed in ("seed0", "seed1")]
     values = [found["psnr"] for found in metrics]
     number = other["numbers"]["psnr"]
     assert number["values"] == values and values[0] != values[1]
@@ -111,13 +99,13 @@ def test_numbers_are_means_over_the_runs(compared: Path) -> None:
 
 
 def test_no_job_is_repeated(
-    compared: Path, ball: Path, variants: Paths, monkeypatch: pytest.MonkeyPatch
+    compared: Path, data: Path, variants: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(execute, "_process", lambda *_: pytest.fail("a finished job was begun again"))
-    assert main(command(ball, compared, variants[1], more=("--seeds", "0,1"))) == 3
+    assert main(command(data, compared, variants[1], more=("--seeds", "0,1"))) == 3
 
 
-def test_an_interrupted_job_resumes(compared: Path, ball: Path, variants: Paths, tmp_path: Path) -> None:
+def test_an_interrupted_job_resumes(compared: Path, data: Path, variants: Paths, tmp_path: Path) -> None:
     """With one thread the resumed run is the straight one; what came after the checkpoint is done again."""
     done = compared / "runs" / "ball" / "other" / "seed0"
     run = tmp_path / "runs" / "ball" / "other" / "seed0"
@@ -126,7 +114,7 @@ def test_an_interrupted_job_resumes(compared: Path, ball: Path, variants: Paths,
     (run / "checkpoints" / "0000006.npz").unlink()
     for name in ("metrics.json", "surfels.ply", "model.json"):
         (run / name).unlink()
-    assert main(command(ball, tmp_path, variants[1])) == 0
+    assert main(command(data, tmp_path, variants[1])) == 0
     for name in ("surfels.ply", "envmap.exr"):
         assert (run / name).read_bytes() == (done / name).read_bytes(), name
 
@@ -147,7 +135,7 @@ def test_job_is_finished_with_metrics_of_last_checkpoint(compared: Path, tmp_pat
 
 
 def test_crash_is_retried_and_becomes_a_row(
-    ball: Path, variants: Paths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: Path, variants: Paths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each worker process dies of a segmentation fault before it does anything."""
     crash = tmp_path / "crash"
@@ -157,7 +145,7 @@ def test_crash_is_retried_and_becomes_a_row(
         f"    open({str(tmp_path / 'began')!r}, 'a').write('x')\n    os.kill(os.getpid(), 11)\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(crash))
-    assert main(command(ball, tmp_path / "out", variants[0])) == 3
+    assert main(command(data, tmp_path / "out", variants[0])) == 3
     [scene] = json.loads((tmp_path / "out" / "table.json").read_text())["scenes"]
     assert "SIGSEGV 3 times" in scene["rows"][0]["failed"]["0"]
     assert (tmp_path / "began").read_text() == "x" * (1 + execute.RETRIES)
@@ -176,11 +164,11 @@ def test_worker_ends_with_its_parent() -> None:
 
 
 @pytest.mark.slow
-def test_killed_cluster_worker_is_replaced(ball: Path, variants: Paths, tmp_path: Path) -> None:
+def test_killed_cluster_worker_is_replaced(data: Path, variants: Paths, tmp_path: Path) -> None:
     """Another worker goes on from the checkpoint; the log has each iteration once."""
     distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
     settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
-    [job] = jobs.plan(tmp_path, [ball], [str(variants[1])], [0], Shared("quick", settings, threads=1))
+    [job] = jobs.plan(tmp_path, [data], [str(variants[1])], [0], Shared("quick", settings, threads=1))
     reports, killed = list[tuple[Job, str | None]](), list[int]()
 
     def kill(address: str) -> None:
@@ -220,34 +208,34 @@ def test_killed_cluster_worker_is_replaced(ball: Path, variants: Paths, tmp_path
     ],
 )
 def test_bad_input_is_refused(
-    arguments: list[str], words: list[str], ball: Path, variants: Paths, tmp_path: Path
+    arguments: list[str], words: list[str], data: Path, variants: Paths, tmp_path: Path
 ) -> None:
     (tmp_path / "twin").mkdir()
-    os.symlink(ball, tmp_path / "twin" / "ball")
-    names = {"data": ball, "twin": tmp_path / "twin" / "ball", "tiny": variants[0], "out": tmp_path / "out"}
+    os.symlink(data, tmp_path / "twin" / "ball")
+    names = {"data": data, "twin": tmp_path / "twin" / "ball", "tiny": variants[0], "out": tmp_path / "out"}
     refused(["compare", *(argument.format(**names) for argument in arguments)], *words)
     assert not (tmp_path / "out").exists()
 
 
-def test_different_sizes_are_refused(compared: Path, ball: Path, variants: Paths, tmp_path: Path) -> None:
+def test_different_sizes_are_refused(compared: Path, data: Path, variants: Paths, tmp_path: Path) -> None:
     """Before anything is fitted: two methods, or one and existing runs; and existing runs."""
     smaller = tmp_path / "smaller.toml"
     smaller.write_text(f'extends = "{variants[0]}"\n[data]\ndownscale = 2\n')
     copy = copied(compared, tmp_path / "copy")
     for folder, chosen in ((tmp_path / "new", (variants[0], smaller)), (copy, (smaller,))):
-        refused(command(ball, folder, *chosen), "20 × 20", "10 × 10", "smaller")
+        refused(command(data, folder, *chosen), "20 × 20", "10 × 10", "smaller")
         assert not (folder / "runs/ball/smaller").exists()
     metrics = copy / "runs/ball/other/seed1/metrics.json"
     metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"image_size": [10, 10]}))
     refused(["compare", "-o", copy], "20 × 20", "10 × 10", "runs/ball/other/seed1")
 
 
-def test_a_run_refuses_other_settings(compared: Path, ball: Path, variants: Paths, tmp_path: Path) -> None:
+def test_a_run_refuses_other_settings(compared: Path, data: Path, variants: Paths, tmp_path: Path) -> None:
     """With compare.json and without it."""
     folder = copied(compared, tmp_path / "copy")
-    refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
+    refused([*command(data, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
     (folder / "compare.json").unlink()
-    refused([*command(ball, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
+    refused([*command(data, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
 
 
 def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:
@@ -257,12 +245,12 @@ def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:
     assert row.seeds == [1] and "future" in row.failed[0]
 
 
-def test_a_decided_run_is_accepted(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_decided_run_is_accepted(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A finished fit that went on with another method is not taken for one of other settings."""
-    job = jobs.plan(tmp_path / "out", [ball], ["auto"], [0], Shared("quick", threads=1))[0]
+    job = jobs.plan(tmp_path / "out", [data], ["auto"], [0], Shared("quick", threads=1))[0]
     rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x")]
     chosen = decide.as_decided(job.method(), rows)
-    job.run.create(chosen, str(ball))
+    job.run.create(chosen, str(data))
     assert chosen.light is None and chosen.surfels.capacity == 2
     state = {"decisions": np.frombuffer(json.dumps(rows).encode(), np.uint8)}
     monkeypatch.setattr(Run, "load_checkpoint", lambda _: state)

@@ -9,11 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
@@ -28,7 +26,7 @@ from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.ply import write_ply
 from tests.scenes.open_pair import CASES, Pair
-from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
+from tests.scenes.tiny import SIZE
 
 KEYS = (
     "psnr ssim lpips lpips_reason normal_mae_deg normal_mae_deg_full normal_reason "
@@ -40,34 +38,25 @@ KEYS = (
 ).split()
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set `ball`, and a run fitted to it that was not exported."""
-    mi.set_variant("llvm_ad_rgb")
-    folder = tmp_path_factory.mktemp("evaluate")
-    data = write_data(folder / "ball")
-    method, run = methods.load(str(write_method(folder)), "quick", SETTINGS), Run(folder / "run")
-    run.create(method, str(data))
-    Trainer(method, read_dataset(data, "train"), run).train()
-    return folder
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Run:
+    """A copy of the run, which was not exported."""
+    run = Run(shutil.copytree(finished, tmp_path / "run"))
+    for file in ("model.json", "surfels.ply"):
+        (run.path / file).unlink()
+    return run
 
 
 @pytest.fixture
-def run(folder: Path, tmp_path: Path) -> Run:
-    """A copy of the run."""
-    return Run(shutil.copytree(folder / "run", tmp_path / "run"))
-
-
-@pytest.fixture
-def views(folder: Path) -> Dataset:
+def views(data: Path) -> Dataset:
     """The test views."""
-    return read_dataset(folder / "ball", "test")
+    return read_dataset(data, "test")
 
 
 @pytest.fixture
-def trainer(run: Run, folder: Path) -> Trainer:
+def trainer(run: Run, data: Path) -> Trainer:
     """The state at the end of the fit."""
-    return Trainer(run.method(), read_dataset(folder / "ball", "train"), run)
+    return Trainer(run.method(), read_dataset(data, "train"), run)
 
 
 def test_trainer_metrics(run: Run, trainer: Trainer, views: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
