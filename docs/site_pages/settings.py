@@ -9,9 +9,8 @@ import re
 import typing
 from typing import Any
 
-from mi_refgs.methods.build import FLAT
+from mi_refgs.methods.fields import FLAT, Window
 from mi_refgs.methods.method import Method
-from mi_refgs.methods.window import Window
 from mi_refgs.shade.options import NOT_A_SETTING
 from site_pages import table
 

@@ -21,7 +21,6 @@ from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, over_colour, panels
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
-from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
 from mi_refgs.fitting.image_error import displayed_image, with_gain
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import write_png
@@ -29,7 +28,7 @@ from mi_refgs.io.progress import with_bar
 from mi_refgs.kernels.device import machine
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import EXPOSURE, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.light_file import read_radiance
@@ -117,7 +116,7 @@ def evaluate(
     result |= surface_scores(fitted.mesh, surface, views.views)
     result |= {
         "caption": caption(size),
-        "exposure": (run.path / EXPOSURE_FILE).is_file(),
+        "exposure": (run.path / EXPOSURE).is_file(),
         "cameras": corrected,
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,16 +16,14 @@ from mi_refgs import methods
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.image_error import displayed_image, psnr
 from mi_refgs.fitting.initial import converted, with_columns
-from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import Event, register
+from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.method import APART, AROUND, LIGHT, Method
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
-from mi_refgs.runs.run import Run
-from mi_refgs.shade.light.maps import Map
+from mi_refgs.runs.run import DECISIONS, Run
 
-DECISIONS = "decisions.json"  # file of a run
 HOLDOUT = 8  # every so many training views validate
+SIZES = ("data.downscale", "light.height")  # that a fit chooses where its method says nothing
 
 
 @dataclass(frozen=True)
@@ -100,26 +98,15 @@ def validates(trainer: Trainer) -> bool:
     return len(trainer.whole.views) >= HOLDOUT and bool(waiting(trainer))
 
 
-def per_view_begins(trainer: Trainer, after: int, parameter: str) -> bool:
-    """Whether a parameter with a row per training view begins to learn: once, when the views are final."""
-    waits = trainer.iteration < after or validates(trainer)
-    return not waits and parameter not in trainer.fit.params
-
-
 def hold_out(trainer: Trainer) -> None:
     """Fit all but the validation views as long as a decision needs them, then all views."""
-    wanted = validates(trainer)
-    if wanted == (trainer.validation is not None):
-        return
-    if wanted:
-        fitted, trainer.validation = trainer.data.held_out(HOLDOUT)
+    held = trainer.validation is not None
+    if validates(trainer) != held:
+        fitted, trainer.validation = (trainer.whole, None) if held else trainer.whole.held_out(HOLDOUT)
         trainer.use(fitted)
-    else:
-        trainer.validation = None
-        trainer.use(trainer.whole)
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class HoldOut(Event[Trainer]):
     """Begins to hold validation views out, in a new or a resumed fit; the last decision ends it."""
@@ -147,14 +134,8 @@ def as_decided(method: Method, decisions: Sequence[Mapping[str, Any]]) -> Method
 
 def differences(run: Run, now: Method) -> dict[str, tuple[Any, Any]]:
     """Keys by which the method of a run differs from another one, with the run's decisions and sizes."""
-    made = run.method()
-    if (state := run.load_checkpoint()) is not None:
-        made, now = (as_decided(method, decisions_of(state)) for method in (made, now))
-    if now.data.downscale is None:
-        now = now.downscaled(made.data.downscale)
-    if isinstance(now.light, Map) and now.light.height is None and isinstance(made.light, Map):
-        now = replace(now, light=replace(now.light, height=made.light.height))
-    return methods.differences(made, now)
+    found = methods.differences(*(as_decided(method, run.decisions()) for method in (run.method(), now)))
+    return {key: pair for key, pair in found.items() if not (key in SIZES and pair[1] is None)}
 
 
 def fork(trainer: Trainer, method: Method) -> Trainer:
@@ -205,4 +186,5 @@ def conclude(trainer: Trainer, row: Row, began: float, verdict: str = "") -> Non
     trainer.fit.seconds += time.perf_counter() - began
     trainer.save()
     if trainer.run is not None:
+        trainer.run.write_json(DECISIONS, trainer.fit.decisions)
         trainer.run.write_method(trainer.method)

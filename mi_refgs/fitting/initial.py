@@ -11,7 +11,7 @@ from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
-from mi_refgs.methods.initialiser import INITIALISERS, Start, Wanted
+from mi_refgs.methods.extensions import INITIALISERS, Start, Wanted
 from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
@@ -116,8 +116,7 @@ def initial_surfels(
     method: Method, data: Dataset, rng: np.random.Generator, open_scene: bool = False
 ) -> Surfels:
     """Surfels where the first initialiser in `surfels.start` that fits the data says; in an `open_scene`
-    inside the region. Raises InputError as initialisers do.
-    """
+    inside the region. Raises InputError as initialisers do."""
     options = method.surfels
     start: dict[str, Any] = dict(options.initial)
     if open_scene:

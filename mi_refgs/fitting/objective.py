@@ -13,7 +13,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.targets import Target
-from mi_refgs.methods.loss import LOSSES, Loss, register
+from mi_refgs.methods.extensions import LOSSES, Loss, register_loss
 from mi_refgs.methods.method import LossWeight
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.display import displayed
@@ -108,18 +108,18 @@ def _photographed(inputs: LossInputs) -> Float | None:
     return None if known is None or light is None else known.difference(light)
 
 
-register(Loss("l1", lambda of: losses.l1(of.image, of.target.image)))
-register(Loss("gain", _gain))
-register(Loss("ssim", _ssim))
-register(Loss("normal", _normal, normals=True))
-register(Loss("smooth", _smooth, normals=True))
-register(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
-register(Loss("materials", _materials, maps=True, attributes=MATERIALS))
-register(
+register_loss(Loss("l1", lambda of: losses.l1(of.image, of.target.image)))
+register_loss(Loss("gain", _gain))
+register_loss(Loss("ssim", _ssim))
+register_loss(Loss("normal", _normal, normals=True))
+register_loss(Loss("smooth", _smooth, normals=True))
+register_loss(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
+register_loss(Loss("materials", _materials, maps=True, attributes=MATERIALS))
+register_loss(
     Loss("light_colour", lambda of: None if of.light is None else losses.light_colour(of.light), light=True)
 )
-register(Loss("photographed", _photographed, light=True))
-register(Loss("alpha", _alpha))
+register_loss(Loss("photographed", _photographed, light=True))
+register_loss(Loss("alpha", _alpha))
 
 
 def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss[LossInputs]]:

@@ -136,19 +136,14 @@ class Skips:
 
 
 class Adam:
-    """Adam over the tensors in `params` that have a group; others are left alone.
-
-    Each step reads `dr.grad` of the tensors and replaces them by new leaves. What changes from step to step
-    is opaque, so a second step of the same kind compiles nothing.
-    """
+    """Adam over the tensors in `params` that have a group; others are left alone. Each step reads `dr.grad`
+    of the tensors and replaces them by new leaves; a second one of the same kind compiles nothing."""
 
     def __init__(
         self, params: MutableMapping[str, TensorXf], groups: Mapping[str, LearningRate | float]
     ) -> None:
-        """Let the tensors named in `groups` learn, at a rate each, raw units per step.
-
-        `params` is changed in place: a dictionary, or `mi.traverse` of a scene, to be updated by its user.
-        """
+        """Let the tensors named in `groups` learn, at a rate each, raw units per step. `params` is changed in
+        place: a dictionary, or `mi.traverse` of a scene, to be updated by its user."""
         self.params = params
         self.groups: dict[str, LearningRate] = {}
         self.factors: dict[str, float] = {}  # of learning rates, by tensor; 0 freezes it
@@ -179,10 +174,8 @@ class Adam:
     @phase("optimiser")
     def step(self, iteration: int, loss: Float = None) -> None:
         """Apply one update with the learning rates of this iteration (0-based), then clear the gradients.
-
         Nothing changes if `loss` (width 1) or a gradient is not finite. Tensors that the loss does not depend
-        on are skipped, as in PyTorch: their moments and step count stay.
-        """
+        on are skipped, as in PyTorch: their moments and step count stay."""
         # Gradients, and whether all are finite.
         gradients = {}
         for name in self.groups:
@@ -265,10 +258,8 @@ class Adam:
         self._skips.marks.clear()
 
     def reset(self, name: str) -> None:
-        """Zero the moments of one tensor, after params[name] was replaced.
-
-        Its step count stays, as in 3DGS: the next update is up to about 3 η long, not η.
-        """
+        """Zero the moments of one tensor, after params[name] was replaced. Its step count stays, as in 3DGS:
+        the next update is up to about 3 η long, not η."""
         size = math.prod(self.params[name].shape)
         for moments in (self._first, self._second):
             # Opaque zeros: a literal would give the first step after a reset a kernel of its own.

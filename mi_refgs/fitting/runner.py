@@ -25,15 +25,14 @@ from mi_refgs.data.region import REGION_FILE, region_pixels
 from mi_refgs.data.stereo import stereo
 from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.decide import DECISIONS, HOLDOUT, as_decided, differences, waiting
-from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
+from mi_refgs.fitting.decide import HOLDOUT, as_decided, differences, waiting
 from mi_refgs.fitting.per_view import camera_of, gains_of
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.method import POSE, Method
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import CAMERAS, Run
+from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import MODEL
 from mi_refgs.runs.views import read_views, sized, with_region
 from mi_refgs.shade.light.placed import PlacedLight
@@ -93,7 +92,6 @@ class Progress:
 
 def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, progress: Progress) -> Trainer:
     """Fit, from the start or from the newest checkpoint, and write the artefacts; a finished run is loaded.
-
     resume: continue the run in the folder; the choice has to be the run's own.
 
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
@@ -253,13 +251,10 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     """Save the state if no checkpoint contains it, and write the artefacts; returns a warning, if any."""
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
         run.save_checkpoint(trainer.iteration, trainer.state())
-    if trainer.fit.decisions:
-        run.write_method(trainer.method)
-        run.write_json(DECISIONS, trainer.fit.decisions)
     setup, params = trainer.setup, trainer.fit.params
     names = [view.name for view in setup.data.views]
     if (gains := gains_of(params)) is not None:
-        run.write_json(EXPOSURE_FILE, {"gain": dict(zip(names, gains.round(5).tolist(), strict=True))})
+        run.write_json(EXPOSURE, {"gain": dict(zip(names, gains.round(5).tolist(), strict=True))})
     if POSE in params:
         poses = [camera_of(setup, params, i).pose().tolist() for i in range(len(names))]
         run.write_json(CAMERAS, {"to_world": dict(zip(names, poses, strict=True))})

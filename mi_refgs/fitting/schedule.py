@@ -18,7 +18,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.events import place
 from mi_refgs.fitting.optim import LearningRate
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.event import EVENTS, Event
+from mi_refgs.methods.extensions import EVENTS, Event
 from mi_refgs.methods.method import (
     AROUND,
     BACKGROUND,

@@ -34,10 +34,8 @@ def window() -> list[float]:
 
 @phase("ssim forward")
 def ssim(x: Sequence[Float], y: Sequence[Float], width: int, height: int) -> Float:
-    """Mean SSIM (width 1) of two images given as planes in [0, 1], with zero padding, as 3DGS trains with.
-
-    The reference image y has no derivative.
-    """
+    """Mean SSIM (width 1) of two images given as planes in [0, 1], with zero padding, as 3DGS trains with;
+    the reference image y has no derivative."""
     return dr.custom(_Ssim, list(x), [dr.detach(plane) for plane in y], width, height)
 
 
@@ -49,11 +47,8 @@ def _blur(
     derive: Callable[[list[Float]], list[Float]] = list,
     finish: Callable[[list[Float], Float, Float], list[Float]] = lambda totals, pixel, inside: totals,
 ) -> list[Float]:
-    """Blur planes along x (axis 0) or y (axis 1), evaluated.
-
-    `derive` makes the values to blur of what is read at a pixel; `finish` makes the planes to return of the
-    blurred values, their pixel (mi.UInt32), and whether it is one.
-    """
+    """Blur planes along x (axis 0) or y (axis 1), evaluated. `derive` makes the values to blur of what is
+    read; `finish` the planes to return of the blurred values, their pixel, and whether it is one."""
     size, lines, stride = (width, height, 1) if axis == 0 else (height, width, width)
     runs = -(-size // RUN)
     lane = dr.arange(mi.UInt32, runs * lines)

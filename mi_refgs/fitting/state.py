@@ -33,17 +33,8 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexColours, VertexSurfels
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.checkpoint import (
-    MESH,
-    OPTIMISER,
-    PARAMS,
-    PHOTOGRAPHED,
-    channels_of,
-    light_of,
-    part,
-    surroundings_of,
-    tensors,
-)
+from mi_refgs.runs import checkpoint
+from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, PHOTOGRAPHED
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.kind import FittedLight, LightKind
 from mi_refgs.shade.light.near_field import NearField
@@ -80,7 +71,7 @@ class ParameterTable:
     @property
     def surfels(self) -> Surfels:
         """The surfels, attached to the leaves that the optimiser owns."""
-        found = channels_of(self.params, self.prefix)
+        found = checkpoint.channels_of(self.params, self.prefix)
         return Surfels({name: tensor for name, tensor in found.items() if name in ATTRIBUTES})
 
     def clear(self) -> None:
@@ -94,9 +85,7 @@ class ParameterTable:
 
     def apply(self, edit: TableEdit) -> None:
         """Replace the surfels by edited ones in Morton order; moments and statistics follow the rows.
-
-        Raises InputError for an edit whose arrays have other lengths than its surfels, or unknown parents.
-        """
+        Raises InputError for an edit whose arrays have other lengths than its surfels, or unknown parents."""
         before, count, parents = self.surfels.count, edit.surfels.count, edit.parent
         known = (parents >= 0) & (parents < before)
         if not len(parents) == len(edit.fresh) == count or not known.all():
@@ -192,12 +181,12 @@ class FitState:
     @property
     def surroundings(self) -> Surroundings | None:
         """The background in images without alpha, also attached."""
-        return surroundings_of(self.params)
+        return checkpoint.surroundings_of(self.params)
 
     @property
     def light(self) -> FittedLight | None:
         """The light, also attached."""
-        return light_of(self.light_kind, self.params)
+        return checkpoint.light_of(self.light_kind, self.params)
 
     @property
     def near(self) -> NearField | None:
@@ -241,8 +230,8 @@ class FitState:
     @staticmethod
     def from_arrays(setup: FitSetup, state: Mapping[str, np.ndarray]) -> FitState:
         """Restore the content of a checkpoint of this setup, bit for bit."""
-        made = FitState._assembled(setup, tensors(state, PARAMS), _occluder_of(state))
-        made.optimiser.load_state_dict(part(state, OPTIMISER))
+        made = FitState._assembled(setup, checkpoint.tensors(state, PARAMS), _occluder_of(state))
+        made.optimiser.load_state_dict(checkpoint.part(state, OPTIMISER))
         for table in made.tables:
             table.error_sum = upload(state[f"{table.prefix}error_sum"])
         made.iteration, made.seconds = int(state["iteration"]), float(state["seconds"])
@@ -251,7 +240,7 @@ class FitState:
         if "region" in state:
             made.region = Region.of(json.loads(state["region"].tobytes()), "checkpoint")
         if f"{PHOTOGRAPHED}weight" in state:
-            made.photographed = PhotographedLight.restored(part(state, PHOTOGRAPHED))
+            made.photographed = PhotographedLight.restored(checkpoint.part(state, PHOTOGRAPHED))
         _, stage = setup.method.stage_at(max(made.iteration, 1))
         made.prefilter.restore(made.light, made.shading(stage), state)
         return made
@@ -270,7 +259,7 @@ def _occluder_of(state: Mapping[str, np.ndarray]) -> Occluder:
         occluder.update(mesh)
         if f"{MESH}surfels" in state:
             count = len(state[f"{PARAMS}position"])
-            occluder.vertex_surfels = VertexSurfels.restored(mesh, count, part(state, MESH))
+            occluder.vertex_surfels = VertexSurfels.restored(mesh, count, checkpoint.part(state, MESH))
         if f"{MESH}ambient" in state:
             occluder.ambient = VertexColours.of(mesh, state[f"{MESH}ambient"])
     return occluder

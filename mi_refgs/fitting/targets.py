@@ -87,9 +87,6 @@ class Targets:
             for index, block in wanted:
                 self._target(index, block)
 
-    def __getitem__(self, index: int) -> Target:
-        return self._target(index, 1)
-
     def at(self, iteration: int, index: int) -> Target:
         """The target of a view in a (1-based) iteration, whose images may be coarse."""
         view = self.data.views[index]

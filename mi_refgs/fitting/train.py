@@ -54,7 +54,7 @@ class Trainer:
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Set up a fit of `data`: from a `state`, the newest checkpoint of `run`, or the start. `targets` of
-        another fit are shared if they are of the same data."""
+        another fit are shared if they are of the same data. Raises InputError for another method's state."""
         method.require_registered()
         require_memory(method, data)
         self.run, self.tell, self.warn = run, tell, warn
@@ -78,7 +78,9 @@ class Trainer:
             self.fit = FitState.start(self.setup)
             self.happen()
         else:
-            self.restore(state)
+            self.setup.require_own(state, None if run is None else run.path)
+            self.fit = FitState.from_arrays(self.setup, state)
+            self.health.checked = self.fit.iteration
 
     def use(self, data: Dataset) -> None:
         """Continue with other views."""
@@ -94,12 +96,6 @@ class Trainer:
     def state(self) -> dict[str, np.ndarray]:
         """The content of a checkpoint."""
         return self.fit.arrays()
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from the content of a checkpoint; raises InputError if it is not one of the method."""
-        self.setup.require_own(state, None if self.run is None else self.run.path)
-        self.fit = FitState.from_arrays(self.setup, state)
-        self.health.checked = self.fit.iteration
 
     @property
     def method(self) -> Method:
@@ -158,9 +154,7 @@ class Trainer:
 
     def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
         """Run to the last iteration; an interrupt ends it after the current step, saved, and is passed on.
-
-        `progress` is called after each step. Raises InputError when the run folder cannot be written.
-        """
+        `progress` is called after each step. Raises InputError when the run folder cannot be written."""
         with held_interrupts() as release:
             self.release = release
             with self._saved_if_interrupted():

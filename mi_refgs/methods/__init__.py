@@ -1,6 +1,7 @@
 """Methods as data: the TOML files of `variants/`, read strictly and scaled to a preset."""
 
 from mi_refgs.methods.build import plain as plain
+from mi_refgs.methods.fields import Window as Window
 from mi_refgs.methods.method import LossWeight as LossWeight
 from mi_refgs.methods.method import Method as Method
 from mi_refgs.methods.method import Stage as Stage
@@ -13,4 +14,3 @@ from mi_refgs.methods.read import for_purpose as for_purpose
 from mi_refgs.methods.read import load as load
 from mi_refgs.methods.read import load_resolved as load_resolved
 from mi_refgs.methods.read import names as names
-from mi_refgs.methods.window import Window as Window

@@ -11,22 +11,8 @@ from typing import Any, Literal
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.methods.ranges import Metadata, require_allowed
-from mi_refgs.methods.window import ITERATIONS, Window
-from mi_refgs.registry import Registry
+from mi_refgs.methods.fields import FLAT, ITERATIONS, Window
 from mi_refgs.shade.options import NOT_A_SETTING
-
-FLAT = {"flat": True}  # metadata of a dataclass's field that is one too, with keys in the same table
-
-
-def by_name(registry: Registry[Any]) -> Metadata:
-    """Metadata of a `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME, if it is."""
-    return {"by_name": registry}
-
-
-def by_kind(registry: Registry[Any], default: str) -> Metadata:
-    """Metadata of a field whose table becomes the registered dataclass that its key `kind` names."""
-    return {"by_kind": (registry, default)}
 
 
 def settings(kind: Any) -> dict[str, tuple[Any, Mapping[str, Any]]]:
@@ -55,7 +41,12 @@ def build(
         chosen = registry.find(table.pop("kind", default), f"{key}.kind")
         return build(chosen, table, key)
     built = _converted(kind, value, key)
-    require_allowed(built, metadata, key)
+    if built is not None and (allowed := metadata.get("allowed")):
+        allows, wanted = allowed
+        values = built.values() if isinstance(built, dict) else built if isinstance(built, tuple) else [built]
+        for one in values:
+            if not allows(one):
+                raise InputError(f"{one} is out of range", field=key, remedy=f"give {wanted}")
     return built
 
 

@@ -10,12 +10,8 @@ from typing import Any, ClassVar, Literal
 
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.errors import InputError, UnknownNameError
-from mi_refgs.methods.build import FLAT, by_kind, by_name
-from mi_refgs.methods.event import EVENTS, Event
-from mi_refgs.methods.initialiser import INITIALISERS
-from mi_refgs.methods.loss import LOSSES
-from mi_refgs.methods.ranges import at_least, between, more_than
-from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.methods.extensions import EVENTS, INITIALISERS, LOSSES, Event
+from mi_refgs.methods.fields import FLAT, ITERATIONS, Window, at_least, between, by_kind, by_name, more_than
 from mi_refgs.registry import load_again
 from mi_refgs.shade.light.kind import LIGHTS, LightKind
 from mi_refgs.shade.options import ShadingOptions

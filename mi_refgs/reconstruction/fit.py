@@ -116,7 +116,7 @@ class Previews(Progress):
         if trainer.run is None or not is_due:
             return
         view = trainer.data.views[0].load()
-        rendered = RenderedView.of(trainer.view(trainer.targets[0].camera), trainer.data, view)
+        rendered = RenderedView.of(trainer.view(view.camera()), trainer.data, view)
         map_ = None if trainer.fit.light is None else trainer.fit.light.environment()
         light = None if map_ is None else light_panels(map_.radiance().numpy())
         image = contact_sheet([panels(rendered, view)], light)

@@ -10,12 +10,11 @@ from typing import Any
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.events.exposure import EXPOSURE_FILE
 from mi_refgs.formats import Shot
 from mi_refgs.formats.orbits import shots_around, turntable_cameras
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
-from mi_refgs.runs.run import CAMERAS, Run
+from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import read_views, with_poses, with_region
 from mi_refgs.splat import Camera
@@ -37,10 +36,10 @@ class Provenance:
     @staticmethod
     def of(run: Run) -> Provenance:
         """Read a run folder; raises InputError if it is none, or has a record that cannot be used."""
-        method, (edits, exposure) = run.method(), (run.path / name for name in (EDITS, EXPOSURE_FILE))
+        method, (edits, exposure) = run.method(), (run.path / name for name in (EDITS, EXPOSURE))
         made = read_json(edits).get("edits", []) if edits.is_file() else []
         records = {CAMERAS: cameras} if (cameras := run.cameras()) else {}
-        records |= {EXPOSURE_FILE: read_json(exposure)} if exposure.is_file() else {}
+        records |= {EXPOSURE: read_json(exposure)} if exposure.is_file() else {}
         return Provenance(method, run.dataset(), run.region(), tuple(made), records)
 
     def with_data(self, folder: Path | None) -> Provenance:

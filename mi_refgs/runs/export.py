@@ -26,19 +26,9 @@ from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import read_mesh, write_mesh
 from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
+from mi_refgs.runs import trained_scene as names
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.trained_scene import (
-    AROUND_FILE,
-    ARTEFACTS,
-    BACKGROUND_MAP,
-    LIGHT_MAP,
-    MESH,
-    MODEL,
-    NEAR_FIELD,
-    SCENE,
-    SURFELS,
-    TrainedScene,
-)
+from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import write_ply
 
@@ -47,43 +37,42 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Ca
     """Write the artefacts into `folder`, each atomically; returns their paths. `camera` and `more` become the
     sensors of scene.xml; others' artefacts go. Raises BusyError for a run in training; InputError if a file
     cannot be written or a value is not finite."""
-    write: dict[str, Callable[[Path], object]] = {SURFELS: partial(write_ply, surfels=fitted.surfels)}
+    write: dict[str, Callable[[Path], object]] = {names.SURFELS: partial(write_ply, surfels=fitted.surfels)}
     if fitted.light is not None:
-        write[LIGHT_MAP] = fitted.light.write
+        write[names.LIGHT_MAP] = fitted.light.write
     if fitted.near is not None:
-        write[NEAR_FIELD] = fitted.near.write
+        write[names.NEAR_FIELD] = fitted.near.write
     if fitted.mesh is not None:
-        write[MESH] = partial(write_mesh, mesh=fitted.mesh)
+        write[names.MESH] = partial(write_mesh, mesh=fitted.mesh)
     if fitted.surroundings is not None:
-        write[AROUND_FILE] = partial(write_ply, surfels=fitted.surroundings.surfels)
+        write[names.AROUND_FILE] = partial(write_ply, surfels=fitted.surroundings.surfels)
         if fitted.surroundings.background is not None:
-            write[BACKGROUND_MAP] = fitted.surroundings.background.write
-    written = [*write, SCENE, MODEL]
-    light, near, mesh, around, behind = (
-        name if name in write else None for name in (LIGHT_MAP, NEAR_FIELD, MESH, AROUND_FILE, BACKGROUND_MAP)
-    )
+            write[names.BACKGROUND_MAP] = fitted.surroundings.background.write
+    written = [*write, names.SCENE, names.MODEL]
+    light, near, around, behind = (name if name in write else None for name in names.OPTIONAL)
+    mesh = names.MESH if names.MESH in write else None
     with Run(folder).alone():
         make_folder(folder)
-        for name in {*ARTEFACTS} - {*written}:
+        for name in {*names.ARTEFACTS} - {*written}:
             (folder / name).unlink(missing_ok=True)
         for name, write_file in write.items():
             write_file(folder / name)
         # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
         # scene file cannot express. Without a background map it is black, as in `render`.
         black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
-        files = SceneFiles(SURFELS, light, mesh, around, behind or black, near)
-        write_scene_xml(folder / SCENE, files, fitted.shading, [camera, *more])
+        files = SceneFiles(names.SURFELS, light, mesh, around, behind or black, near)
+        write_scene_xml(folder / names.SCENE, files, fitted.shading, [camera, *more])
         # Written last: if it is there, the other files are complete.
         note = {"iteration": fitted.iteration, "seconds": fitted.seconds, "surfels": fitted.surfels.count}
         about = {"files": written, "shading": asdict(fitted.shading)}
-        write_json(folder / MODEL, note | about, indent=2)
+        write_json(folder / names.MODEL, note | about, indent=2)
     return [folder / name for name in written]
 
 
 def fresh(run: Run, method: Method) -> TrainedScene | None:
     """The scene of a checkpoint that is newer than the artefacts; raises InputError if there is neither."""
-    shown, model = -1, run.path / MODEL
-    if (run.path / SURFELS).is_file():
+    shown, model = -1, run.path / names.MODEL
+    if (run.path / names.SURFELS).is_file():
         with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
             shown = int(read_json(model)["iteration"])
     if any(int(path.stem) > shown for path in run.checkpoints()):
@@ -103,7 +92,7 @@ def newest(run: Run, method: Method) -> TrainedScene:
     `TrainedScene.read`."""
     if (newer := fresh(run, method)) is not None:
         return newer
-    scene, mesh = TrainedScene.read(run.path, method.plugins), run.path / MESH
+    scene, mesh = TrainedScene.read(run.path, method.plugins), run.path / names.MESH
     return replace(scene, mesh=read_mesh(mesh)) if scene.mesh is None and mesh.is_file() else scene
 
 

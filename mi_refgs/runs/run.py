@@ -19,16 +19,7 @@ import numpy as np
 
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError, UnknownNameError
-from mi_refgs.io.files import (
-    BusyError,
-    cannot_write,
-    locked,
-    make_folder,
-    read_json,
-    remove_temporaries,
-    write_bytes,
-    write_json,
-)
+from mi_refgs.io import files
 from mi_refgs.io.ownership import RUN, own_folder, require_own
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
@@ -37,6 +28,8 @@ from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"  # the folder of the data set, and its region of interest
 CAMERAS = "cameras.json"  # the decision about camera corrections, and the corrected poses
+DECISIONS = "decisions.json"  # about components of the method
+EXPOSURE = "exposure.json"  # gains of the training views
 LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
 LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
@@ -66,14 +59,14 @@ class Run:
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Lock the run for changes; raises BusyError if another process has it locked for `wait` seconds."""
         busy = "another process trains this run or writes it; wait until it ends, or choose another folder"
-        return locked(self.path / LOCK, f"{self.path}: run folder: {busy}", wait)
+        return files.locked(self.path / LOCK, f"{self.path}: run folder: {busy}", wait)
 
     def busy(self) -> bool:
         """Whether another process has locked the run."""
         try:
             with self.alone():
                 return False
-        except BusyError:
+        except files.BusyError:
             return True
 
     def create(self, method: Method, dataset: str | None, region: Region | None = None) -> None:
@@ -86,10 +79,10 @@ class Run:
 
     def write_dataset(self, dataset: str | None, region: Region | None) -> None:
         record = {"path": dataset} | ({} if region is None else {"region": region.content})
-        write_bytes(self.path / DATASET, json.dumps(record).encode())
+        files.write_bytes(self.path / DATASET, json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
-        write_bytes(self.path / CONFIG, dump(method).encode())
+        files.write_bytes(self.path / CONFIG, dump(method).encode())
 
     def method(self) -> Method:
         """The resolved method; raises InputError if this is no run folder."""
@@ -98,7 +91,7 @@ class Run:
         return load_resolved(self.path / CONFIG)
 
     def _record(self, name: str) -> dict[str, Any]:
-        return read_json(self.path / name) if (self.path / name).is_file() else {}
+        return files.read_json(self.path / name) if (self.path / name).is_file() else {}
 
     def dataset(self) -> Path | None:
         """Folder of the data set that the run was fitted to, if it records one; raises InputError if not."""
@@ -120,13 +113,21 @@ class Run:
         """The decision about camera corrections, with corrected poses by view; {} for none."""
         return self._record(CAMERAS)
 
+    def decisions(self) -> list[dict[str, Any]]:
+        """The decisions about components of the method so far; raises InputError if they cannot be read."""
+        path = self.path / DECISIONS
+        try:
+            return list(json.loads(path.read_bytes())) if path.is_file() else []
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(f"cannot be read ({error})", path, remedy="restore it") from error
+
     def checkpoints(self) -> list[Path]:
         """Complete checkpoints, oldest first."""
         return sorted(x for x in (self.path / "checkpoints").glob("*.npz") if x.stem.isdecimal())
 
     def save_checkpoint(self, iteration: int, state: dict[str, np.ndarray]) -> None:
         """Save a state, then remove all but the newest two: a disk may lose writes. Raises InputError."""
-        write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", checkpoint.encode(state))
+        files.write_bytes(self.path / "checkpoints" / f"{iteration:07d}.npz", checkpoint.encode(state))
         for old in self.checkpoints()[:-2]:
             old.unlink(missing_ok=True)
 
@@ -151,14 +152,14 @@ class Run:
         """Remove checkpoints and lines of the logs of later iterations, and files of killed processes."""
         self._make_folders()
         for folder in (self.path, self.path / "checkpoints", self.path / "previews"):
-            remove_temporaries(folder)
+            files.remove_temporaries(folder)
         for path in self.checkpoints():
             if int(path.stem) > iteration:
                 path.unlink()
         for log in self.path.glob("*.jsonl"):
             text = log.read_text(encoding="utf-8", errors="replace")
             kept = [line for line in text.splitlines() if _logged(line) <= iteration]
-            write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
+            files.write_bytes(log, "".join(f"{line}\n" for line in kept).encode())
 
     def log(self, line: dict[str, Any]) -> None:
         """Append a JSON line with an `iteration` to the log, with null for numbers that are not finite."""
@@ -168,14 +169,14 @@ class Run:
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
         except OSError as error:
-            raise cannot_write(path, error) from error
+            raise files.cannot_write(path, error) from error
 
     def write_json(self, name: str, content: Any) -> None:
-        write_json(self.path / name, content, indent=2)
+        files.write_json(self.path / name, content, indent=2)
 
     def _make_folders(self) -> None:
         for name in ("checkpoints", "previews"):
-            make_folder(self.path / name)
+            files.make_folder(self.path / name)
 
 
 def _logged(line: str) -> float:

@@ -34,7 +34,8 @@ from mi_refgs.surfels.table import Surfels
 
 SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
 AROUND_FILE, BACKGROUND_MAP, NEAR_FIELD = "surroundings.ply", "background.exr", "near_field.npz"
-ARTEFACTS = (SURFELS, LIGHT_MAP, NEAR_FIELD, MESH, AROUND_FILE, BACKGROUND_MAP, SCENE, MODEL)
+OPTIONAL = (LIGHT_MAP, NEAR_FIELD, AROUND_FILE, BACKGROUND_MAP)
+ARTEFACTS = (SURFELS, *OPTIONAL, MESH, SCENE, MODEL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +96,11 @@ class TrainedScene:
             reason = f"no {error}" if isinstance(error, KeyError) else error
             raise InputError(f"cannot be read ({reason})", note, remedy=remedy) from error
         needed = {LIGHT_MAP} if shading.model.light != "none" else set()
-        names = (LIGHT_MAP, NEAR_FIELD, AROUND_FILE, BACKGROUND_MAP)
-        for name in names:
-            if name in needed | files and not (folder / name).is_file():
-                raise InputError("missing", folder / name, "file", remedy)
-        light, near, around, behind = (folder / name if (folder / name).is_file() else None for name in names)
+        optional = [folder / name for name in OPTIONAL]
+        for path in optional:
+            if path.name in needed | files and not path.is_file():
+                raise InputError("missing", path, "file", remedy)
+        light, near, around, behind = (path if path.is_file() else None for path in optional)
         fitted = TrainedScene(
             read_ply(folder / SURFELS),
             None if light is None else EnvironmentLight.from_file(light),

@@ -15,7 +15,7 @@ from mi_refgs.data.stereo import Stereo, stereo
 from mi_refgs.fitting.initialisers.points import along_pixels
 from mi_refgs.fitting.runner import begin
 from mi_refgs.methods import load
-from mi_refgs.methods.initialiser import Wanted
+from mi_refgs.methods.extensions import Wanted
 from mi_refgs.runs.run import Run
 from tests.helpers import read_loaded, with_pixels
 from tests.scenes import photographed as scene

@@ -29,8 +29,8 @@ from mi_refgs.fitting.runner import Choice, begin, chosen
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
+from mi_refgs.methods.fields import Window
 from mi_refgs.methods.method import AROUND, LossWeight, Method, SurroundingsOptions
-from mi_refgs.methods.window import Window
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene

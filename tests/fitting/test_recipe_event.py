@@ -16,8 +16,8 @@ from mi_refgs import methods
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.fitting.state import TableEdit
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import EVENTS
-from mi_refgs.methods.ranges import at_least
+from mi_refgs.methods.extensions import EVENTS
+from mi_refgs.methods.fields import at_least
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes.highlight import require_same_state, step_to

@@ -14,7 +14,7 @@ from mi_refgs import methods
 from mi_refgs.data import hull
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.fitting.initial import initial_surfels
-from mi_refgs.methods.initialiser import INITIALISERS, Start, Wanted
+from mi_refgs.methods.extensions import INITIALISERS, Start, Wanted
 from mi_refgs.surfels.init import even_points
 from tests.helpers import refused
 from tests.scenes.tiny import METHOD, write_data

@@ -14,7 +14,7 @@ import mi_refgs
 from mi_refgs import methods
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.loss import LOSSES
+from mi_refgs.methods.extensions import LOSSES
 from mi_refgs.types import Float
 from tests.helpers import refused
 from tests.scenes.highlight import without

@@ -24,9 +24,7 @@ from mi_refgs.evaluation.evaluate import render_names
 from mi_refgs.evaluation.images import displayed_over
 from mi_refgs.io.exr import read_exr, write_exr
 from mi_refgs.io.images import read_png
-from mi_refgs.methods.event import EVENTS
-from mi_refgs.methods.initialiser import INITIALISERS
-from mi_refgs.methods.loss import LOSSES
+from mi_refgs.methods.extensions import EVENTS, INITIALISERS, LOSSES
 from mi_refgs.runs.export import save
 from mi_refgs.shade.light import LIGHTS
 from mi_refgs.shade.reflectance import MODELS

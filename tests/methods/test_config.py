@@ -22,8 +22,8 @@ from mi_refgs.fitting.events.mesh import ExtractMesh
 from mi_refgs.fitting.events.propagate import Propagate
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.build import scaled
-from mi_refgs.methods.event import EVENTS as REGISTERED
-from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.methods.extensions import EVENTS as REGISTERED
+from mi_refgs.methods.fields import ITERATIONS, Window
 from mi_refgs.shade.shading import Shading
 from tests.helpers import refused
 from tests.scenes.highlight import ball

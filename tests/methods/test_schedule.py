@@ -12,8 +12,8 @@ import pytest
 from mi_refgs import fitting
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.methods.fields import Window
 from mi_refgs.methods.method import DataOptions, Method, Stage, SurfelOptions
-from mi_refgs.methods.window import Window
 from mi_refgs.shade.light.maps import Learnt
 from tests.scenes.highlight import ball
 

@@ -9,13 +9,12 @@ from typing import ClassVar
 from mi_refgs import methods
 from mi_refgs.fitting.decide import Decision
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import register
+from mi_refgs.methods.extensions import register_event
+from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import Method
-from mi_refgs.methods.ranges import at_least
-from mi_refgs.methods.window import ITERATIONS
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class ColourAlone(Decision):
     """Tries a method without light and materials."""
@@ -30,10 +29,8 @@ class ColourAlone(Decision):
         return [self.name]
 
     def chosen(self, method: Method, component: str) -> Method:
-        """The other method, with the length, the size of images and the settings of this one.
-
-        Settings of tables that the other method has not, such as those of its light, are left out.
-        """
+        """The other method, with the length, the size of images and the settings of this one, but for those
+        of tables that the other has not, such as those of its light."""
         preset = method.preset or f"{method.iterations}:{method.surfels.max_count}"
         plain = methods.plain(methods.load(self.method, preset))
         fitting = [text for text in method.assignments if _has_table(plain, text)]

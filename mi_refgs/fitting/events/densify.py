@@ -1,13 +1,12 @@
 """Densification by error, and pruning. [3DGS §5.2; Rota Bulò et al., Revising Densification, ECCV 2024, §3.1]
 
-The surfels with the largest squared error are split along their longest axis; transparent and oversized ones
-are removed, and those of the least blending weight. Splits run a few dozen times per fit, in NumPy.
+Splits run a few dozen times per fit, in NumPy.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,9 +18,8 @@ from mi_refgs.fitting.events.reset_opacity import ResetOpacity
 from mi_refgs.fitting.exchange import exchange
 from mi_refgs.fitting.state import TableEdit
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import Event, register
-from mi_refgs.methods.ranges import at_least, between
-from mi_refgs.methods.window import Window
+from mi_refgs.methods.extensions import Event, register_event
+from mi_refgs.methods.fields import Window, at_least, between
 from mi_refgs.splat import surfel_count
 from mi_refgs.splat.weights import blended_weights, listed_tiles
 from mi_refgs.surfels.attributes import logit, sigmoid
@@ -33,14 +31,11 @@ SPLIT_OFFSET, SPLIT_SCALE = 0.6, 0.72
 """Distance of the two children from the centre, and their scale, relative to the longest scale and along it:
 with `split_opacity` their profile is the parent's but for 2 % of its energy."""
 BACKGROUND_EXTENT = 0.5  # distances from the region's centre; larger surfels of the background are removed
-WEIGHED_VIEWS, WEIGHED_SIZE = (
-    48,
-    128,
-)  # views in which faint surfels are looked for; their longer side, pixels
+WEIGHED_VIEWS, WEIGHED_SIZE = 48, 128  # views in which faint surfels are sought; their longer side, pixels
 NO_ROWS = np.empty(0, np.int64)
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class Densify(Event[Trainer]):
     """Splits and prunes the surfels of the object and of the background."""
@@ -65,10 +60,10 @@ class Densify(Event[Trainer]):
         fit, extent = trainer.fit, trainer.data.scene_extent
         reset, rate = trainer.method.event.get(ResetOpacity.name), trainer.method.rates.of("opacity")
         grown = not isinstance(reset, ResetOpacity) or reset.grown(fit.iteration, self.prune_opacity, rate)
-        options = self if grown else replace(self, prune_opacity=0.0)
+        opacity = self.prune_opacity if grown else 0.0
         if len(fit.tables) > 1:
             self._clear_free_space(trainer)
-        faint = self._faint(trainer) if options.prune_opacity else [NO_ROWS] * len(fit.tables)
+        faint = self._faint(trainer) if opacity else [NO_ROWS] * len(fit.tables)
         for table, few in zip(fit.tables, faint, strict=True):
             largest: float | np.ndarray = self.prune_extent * extent
             if table.prefix:  # the background's surfels may grow with their distance
@@ -77,7 +72,7 @@ class Densify(Event[Trainer]):
                 offset = table.surfels.raw["position"].numpy() - np.array(region.centre)
                 largest = BACKGROUND_EXTENT * np.maximum(np.linalg.norm(offset, axis=1), region.radius)
             given: dict[str, Any] = {"largest": largest, "faint": few, "keep_one": bool(table.prefix)}
-            given |= {"grow": options.grow, "prune_opacity": options.prune_opacity}
+            given |= {"grow": self.grow, "prune_opacity": opacity}
             table.apply(densify_and_prune(table.surfels, table.error_sum, table.max_count, **given))
         exchange(trainer.setup, fit)
         for table in fit.tables:
@@ -109,8 +104,8 @@ class Densify(Event[Trainer]):
 def fill(trainer: Trainer) -> None:
     """Split the object's surfels with the largest error, as many as there is room for; prune none."""
     table = trainer.fit.tables[0]
-    given: dict[str, Any] = {"grow": 1.0, "prune_opacity": 0.0}
-    table.apply(densify_and_prune(table.surfels, table.error_sum, table.max_count, **given))
+    most = table.max_count
+    table.apply(densify_and_prune(table.surfels, table.error_sum, most, grow=1.0, prune_opacity=0.0))
     table.clear()
 
 

@@ -15,7 +15,7 @@ from mi_refgs.data.object_region import camera_positions, fitted_region, seen_sh
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.fitting.exchange import exchange
 from mi_refgs.fitting.train import FEW_VIEWS, Trainer
-from mi_refgs.methods.event import Event, register
+from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.render.panorama import SURFACE
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.types import Float
@@ -25,7 +25,7 @@ LEVEL = 0.05  # difference of depth, in radii of the region, up to which two pix
 LEVEL_COUNT = 3  # of the eight neighbours of a pixel; fewer are where an outline mixes near and far
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class FollowObject(Event[Trainer]):
     """Adapts an estimated region of interest to the object, once; one that a user gave stays."""

@@ -10,9 +10,8 @@ from typing import ClassVar
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.fitting.exchange import exchange
 from mi_refgs.fitting.train import FEW_VIEWS, Trainer
-from mi_refgs.methods.event import Event, register
-from mi_refgs.methods.ranges import at_least
-from mi_refgs.methods.window import Window
+from mi_refgs.methods.extensions import Event, register_event
+from mi_refgs.methods.fields import Window, at_least
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.tsdf import bounds_from_points, fuse
 from mi_refgs.render.pipeline import render_depth
@@ -22,7 +21,7 @@ from mi_refgs.surfels.table import Surfels
 RELEASED = Window(20_000, 50_000, 2_000)  # of the released Ref-Gaussian code on synthetic scenes
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class ExtractMesh(Event[Trainer]):
     """Fuses a new occluder from FEW_VIEWS training views, the last one, which is saved, from all."""
@@ -46,11 +45,9 @@ class ExtractMesh(Event[Trainer]):
 
 
 def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int = 128) -> Mesh:
-    """The surface of surfels as triangles, which occlude: fused from their depth in all cameras.
-
-    cameras: from all around. resolution: voxels along the longest side of the box around the surfels, 2 …
-    1023. Raises InputError without a finite position.
-    """
+    """The surface of surfels as triangles, which occlude: fused from their depth in cameras from all around.
+    resolution: voxels along the longest side of the box around the surfels, 2 … 1023. Raises InputError
+    without a finite position."""
     bounds = bounds_from_points(surfels.to_numpy()["position"])
     views = tee(render_depth(surfels, camera) for camera in cameras)
     depths, alphas = (depth for depth, _ in views[0]), (alpha for _, alpha in views[1])

@@ -1,13 +1,13 @@
 """Choice between metal and dielectric at the start of a fit, surfel by surfel, by a trial of both.
 
-The fit begins twice, once with every surfel metal and once with none. The one that explains the training
-images better continues, and each of its surfels starts as what explains the images around it better.
+The fit that explains the training images better continues; each of its surfels starts as what explains the
+images around it better.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -15,16 +15,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.errors import InputError
 from mi_refgs.fitting.decide import Decision, Row, conclude, run
 from mi_refgs.fitting.image_error import displayed_image, squared_error
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.event import register
+from mi_refgs.methods.extensions import register_event
+from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import Method
-from mi_refgs.methods.ranges import at_least
-from mi_refgs.methods.window import ITERATIONS
 from mi_refgs.splat.weights import blended_weights
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
@@ -36,18 +34,15 @@ NEIGHBOURHOOD = 0.05  # fraction of the surfels that a surfel shares its choice 
 CENTRES = 5_000  # surfels that the fraction is counted in: so many sums are computed
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class Metal(Decision):
     """Begins a fit as dielectric and as metal, and continues one of them: as metal if it gains METAL_GAIN."""
 
     name: ClassVar[str] = "metal"
     validates: ClassVar[bool] = False  # by training images
+    attributes: ClassVar[tuple[str, ...]] = ("metallic",)
     trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations with every surfel metal, or none
-
-    def require(self, attributes: Collection[str]) -> None:
-        if "metallic" not in attributes:
-            raise InputError("there is no attribute 'metallic'", remedy="add it, or drop this")
 
     def components(self) -> Sequence[str]:
         return [self.name]

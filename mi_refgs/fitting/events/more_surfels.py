@@ -9,10 +9,9 @@ from typing import Any, ClassVar
 from mi_refgs.fitting.decide import Decision
 from mi_refgs.fitting.events.densify import fill
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import register
+from mi_refgs.methods.extensions import register_event
+from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import Method
-from mi_refgs.methods.ranges import at_least
-from mi_refgs.methods.window import ITERATIONS
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Doubling:
     trial: int = field(metadata=ITERATIONS | at_least(1))
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class MoreSurfels(Decision):
     """Doubles the largest number of surfels as long as that pays."""

@@ -8,11 +8,11 @@ from typing import ClassVar
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.train import FEW_VIEWS, Trainer
-from mi_refgs.methods.event import Event, register
-from mi_refgs.methods.window import Window
+from mi_refgs.methods.extensions import Event, register_event
+from mi_refgs.methods.fields import Window
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class PhotographLight(Event[Trainer]):
     """Renders the background from the object; of open scenes with a light only."""

@@ -6,17 +6,14 @@ Ref-Gaussian §3.4]
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
-from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import Event, register
-from mi_refgs.methods.ranges import at_least, between
-from mi_refgs.methods.window import ITERATIONS, Window
+from mi_refgs.methods.extensions import Event, register_event
+from mi_refgs.methods.fields import ITERATIONS, Window, at_least, between
 from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
@@ -26,21 +23,18 @@ SCALE = 1.5  # factor of the scales of reflective surfels
 DULL = 0.05  # metallic up to which a surfel's colour gets noise
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class Propagate(Event[Trainer]):
     """Enlarges the reflective surfels of the object; noise keeps the colour of others from reflections."""
 
     name: ClassVar[str] = "propagate"
+    attributes: ClassVar[tuple[str, ...]] = ("metallic",)
     when: Window  # iterations at which it happens
     metallic: float = field(default=0.02, metadata=between(0, 1))  # reflective: at least this metallic …
     roughness: float | None = None  # … and at most this rough; absent: any roughness
     noise: float = field(default=0.0, metadata=at_least(0))  # half its width, in SH coefficients
     hold: int = field(default=200, metadata=ITERATIONS)  # iterations without opacity learning afterwards
-
-    def require(self, attributes: Collection[str]) -> None:
-        if "metallic" not in attributes:
-            raise InputError("there is no attribute 'metallic'", remedy="add it, or drop this")
 
     def due(self, trainer: Trainer) -> bool:
         held = trainer.fit.optimiser.factors.get("opacity", 1.0) == 0

@@ -11,8 +11,8 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import Event, register
-from mi_refgs.methods.window import Window
+from mi_refgs.methods.extensions import Event, register_event
+from mi_refgs.methods.fields import Window
 from mi_refgs.surfels.attributes import ATTRIBUTES, logit
 from mi_refgs.surfels.table import Surfels
 
@@ -20,13 +20,11 @@ OPACITY = 0.01  # of all surfels after a reset, at most
 PATIENCE = 4.5  # factor of the fewest steps in which an opacity can grow back; with 2, a scene was lost
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class ResetOpacity(Event[Trainer]):
     """Lowers the opacities of the object; the background map would replace the background's surfels, blurred.
-
-    Attributes in `raise_to_start` rise to at least their initial value. [3DGS-DR, for metallic]
-    """
+    Attributes in `raise_to_start` rise to at least their initial value. [3DGS-DR, for metallic]"""
 
     name: ClassVar[str] = "reset_opacity"
     when: Window  # iterations at which it happens

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.event import Event, register
+from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.method import LIGHT
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 
 
-@register
+@register_event
 @dataclass(frozen=True)
 class Restart(Event[Trainer]):
     """Gives what the next stage names (`stage.NAME.restart`) its initial values, without history."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mi_refgs.data import hull
-from mi_refgs.methods.initialiser import Initialiser, Start, Wanted, register
+from mi_refgs.methods.extensions import Initialiser, Start, Wanted, register_initialiser
 from mi_refgs.surfels import init
 
 
@@ -25,4 +25,4 @@ def on_hull(wanted: Wanted) -> Start | None:
     return Start(np.concatenate([outer, inner]), np.concatenate(colours), normals)
 
 
-register(Initialiser("hull", on_hull))
+register_initialiser(Initialiser("hull", on_hull))

@@ -10,7 +10,7 @@ from mi_refgs.data import hull
 from mi_refgs.data.dataset import PointCloud
 from mi_refgs.data.stereo import FARTHEST
 from mi_refgs.fitting.initialisers.random import at_random
-from mi_refgs.methods.initialiser import Initialiser, Start, Wanted, register
+from mi_refgs.methods.extensions import Initialiser, Start, Wanted, register_initialiser
 from mi_refgs.surfels import init
 
 
@@ -59,5 +59,5 @@ def along_pixels(wanted: Wanted) -> Start | None:
     return Start(points, colours)
 
 
-register(Initialiser("points", at_points))
-register(Initialiser("along_pixels", along_pixels))
+register_initialiser(Initialiser("points", at_points))
+register_initialiser(Initialiser("along_pixels", along_pixels))

@@ -10,7 +10,7 @@ from mi_refgs.data.object_region import in_free_space, seen_share
 from mi_refgs.data.region import Region
 from mi_refgs.data.stereo import FARTHEST
 from mi_refgs.errors import InputError
-from mi_refgs.methods.initialiser import Initialiser, Start, Wanted, register
+from mi_refgs.methods.extensions import Initialiser, Start, Wanted, register_initialiser
 from mi_refgs.surfels import init
 
 FARTHEST_CONTRACTED = 2 - 1 / FARTHEST  # of random points: beyond it the background map is as good
@@ -66,4 +66,4 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
     return found
 
 
-register(Initialiser("random", at_random))
+register_initialiser(Initialiser("random", at_random))

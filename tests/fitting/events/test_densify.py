@@ -18,7 +18,7 @@ from mi_refgs.fitting.events.propagate import Propagate
 from mi_refgs.fitting.events.reset_opacity import ResetOpacity
 from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.fitting.state import TableEdit
-from mi_refgs.methods.window import Window
+from mi_refgs.methods.fields import Window
 from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 

@@ -1,12 +1,43 @@
-"""Events on a schedule, at the multiples of an interval."""
+"""What the fields of settings say of themselves, `field(default=0.25, metadata=at_least(0))`, and windows."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-ITERATIONS = {"unit": "iterations"}  # metadata of a field that counts iterations, which a preset scales
+from mi_refgs.registry import Registry
+
+Metadata = dict[str, Any]
+"""Of a field. "allowed": a test of values that are not None, and a text that completes "give …"."""
+ITERATIONS: Metadata = {"unit": "iterations"}  # of a field that counts iterations, which a preset scales
+FLAT: Metadata = {"flat": True}  # of a dataclass's field that is one too, with keys in the same table
 TIE = 1e-6  # intervals by which a scaled window may miss a multiple of its interval through rounding
+
+
+def at_least(low: float) -> Metadata:
+    """Metadata of a finite number that is at least `low`."""
+    return {"allowed": (lambda value: low <= value < math.inf, f"{low:,} or more")}
+
+
+def more_than(low: float) -> Metadata:
+    """Metadata of a finite number above `low`."""
+    return {"allowed": (lambda value: low < value < math.inf, f"more than {low:g}")}
+
+
+def between(low: float, high: float) -> Metadata:
+    """Metadata of a number from `low` to `high`, both included."""
+    return {"allowed": (lambda value: low <= value <= high, f"a number from {low:g} to {high:g}")}
+
+
+def by_name(registry: Registry[Any]) -> Metadata:
+    """Metadata of a `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME, if it is."""
+    return {"by_name": registry}
+
+
+def by_kind(registry: Registry[Any], default: str) -> Metadata:
+    """Metadata of a field whose table becomes the registered dataclass that its key `kind` names."""
+    return {"by_kind": (registry, default)}
 
 
 @dataclass(frozen=True)
