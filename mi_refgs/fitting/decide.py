@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,6 +18,7 @@ from mi_refgs.fitting.image_error import displayed_image, psnr
 from mi_refgs.fitting.initial import converted, with_columns
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import Event, register_event
+from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import APART, AROUND, LIGHT, Method
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, part
 from mi_refgs.runs.run import DECISIONS, Run
@@ -38,15 +39,25 @@ class Row:
     psnr_with: float | None = None
 
 
+@dataclass(frozen=True)
+class Trial:
+    """When a component is tried."""
+
+    after: int = field(metadata=ITERATIONS | at_least(0))  # iterations before
+    trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations with and without it that are compared
+
+
 class Decision(Event[Trainer]):
     """An event that decides about components of a method, each once, between two steps."""
 
     outside: ClassVar[bool] = True
-    validates: ClassVar[bool] = True  # by views that are held out
     gain: ClassVar[float]  # dB on validation views from which a component stays
 
     def components(self) -> Sequence[str]:
         """The components, in the order in which they are decided."""
+        return [self.name]
+
+    def trial_of(self, component: str) -> Trial:
         raise NotImplementedError
 
     def chosen(self, method: Method, component: str) -> Method:
@@ -62,13 +73,18 @@ class Decision(Event[Trainer]):
         """Prepare the fork of a fit that has a component; returns why there is nothing to try, if so."""
         return ""
 
-    def decide(self, trainer: Trainer, steps: int) -> None:
+    def due(self, trainer: Trainer) -> bool:
+        left = self.pending(trainer.fit.decisions)
+        waits = trainer.validation is None or trainer.iteration >= trainer.method.iterations
+        return bool(left) and not waits and trainer.iteration >= self.trial_of(left[0]).after
+
+    def apply(self, trainer: Trainer) -> None:
         """Decide about the next component by continuing the fit with and without it for some steps."""
         began = time.perf_counter()
-        conclude(trainer, self._tried(trainer, self.pending(trainer.fit.decisions)[0], steps), began)
+        conclude(trainer, self._tried(trainer, self.pending(trainer.fit.decisions)[0]), began)
 
-    def _tried(self, trainer: Trainer, component: str, steps: int) -> Row:
-        begin = trainer.iteration
+    def _tried(self, trainer: Trainer, component: str) -> Row:
+        begin, steps = trainer.iteration, self.trial_of(component).trial
         if begin + steps > trainer.method.iterations:
             return Row(component, begin, False, "too late in the fit")
         try:
@@ -89,8 +105,8 @@ class Decision(Event[Trainer]):
 
 def waiting(trainer: Trainer) -> list[str]:
     """The components that validation views are still to decide."""
-    of_views = [x for x in trainer.method.event.values() if isinstance(x, Decision) and x.validates]
-    return [name for decision in of_views for name in decision.pending(trainer.fit.decisions)]
+    decisions = [event for event in trainer.method.event.values() if isinstance(event, Decision)]
+    return [name for decision in decisions for name in decision.pending(trainer.fit.decisions)]
 
 
 def validates(trainer: Trainer) -> bool:

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from mi_refgs import methods
-from mi_refgs.fitting.decide import Decision
-from mi_refgs.fitting.train import Trainer
+from mi_refgs.fitting.decide import Decision, Trial
 from mi_refgs.methods.extensions import register_event
-from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import Method
 
 
 @register_event
 @dataclass(frozen=True)
-class ColourAlone(Decision):
+class ColourAlone(Decision, Trial):
     """Tries a method without light and materials."""
 
     name: ClassVar[str] = "colour_alone"
     gain: ClassVar[float] = -0.1  # it costs less, and may lose a little
     method: str  # the other method, by its name or path
-    after: int = field(metadata=ITERATIONS | at_least(0))  # iterations before it is tried
-    trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations of both that are compared
 
-    def components(self) -> Sequence[str]:
-        return [self.name]
+    def trial_of(self, component: str) -> Trial:
+        return self
 
     def chosen(self, method: Method, component: str) -> Method:
         """The other method, with the length, the size of images and the settings of this one, but for those
@@ -42,13 +37,6 @@ class ColourAlone(Decision):
         return replace(
             other, data=data, surfels=surfels, **{name: getattr(method, name) for name in (*kept, *own)}
         )
-
-    def due(self, trainer: Trainer) -> bool:
-        waits = trainer.validation is None or not self.after <= trainer.iteration < trainer.method.iterations
-        return not waits and bool(self.pending(trainer.fit.decisions))
-
-    def apply(self, trainer: Trainer) -> None:
-        self.decide(trainer, self.trial)
 
 
 def _has_table(method: dict[str, object], assignment: str) -> bool:

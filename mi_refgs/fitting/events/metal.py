@@ -7,7 +7,6 @@ images around it better.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -15,14 +14,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.fitting.decide import Decision, Row, conclude, run
+from mi_refgs.fitting.decide import Row, conclude, run
 from mi_refgs.fitting.image_error import displayed_image, squared_error
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.extensions import register_event
+from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import ITERATIONS, at_least
-from mi_refgs.methods.method import Method
 from mi_refgs.splat.weights import blended_weights
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
@@ -36,19 +34,13 @@ CENTRES = 5_000  # surfels that the fraction is counted in: so many sums are com
 
 @register_event
 @dataclass(frozen=True)
-class Metal(Decision):
+class Metal(Event[Trainer]):
     """Begins a fit as dielectric and as metal, and continues one of them: as metal if it gains METAL_GAIN."""
 
     name: ClassVar[str] = "metal"
-    validates: ClassVar[bool] = False  # by training images
+    outside: ClassVar[bool] = True
     attributes: ClassVar[tuple[str, ...]] = ("metallic",)
     trial: int = field(metadata=ITERATIONS | at_least(1))  # iterations with every surfel metal, or none
-
-    def components(self) -> Sequence[str]:
-        return [self.name]
-
-    def chosen(self, method: Method, component: str) -> Method:
-        return method
 
     def due(self, trainer: Trainer) -> bool:
         return trainer.iteration == 0

@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from mi_refgs.fitting.decide import Decision
+from mi_refgs.fitting.decide import Decision, Trial
 from mi_refgs.fitting.events.densify import fill
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import register_event
-from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import Method
-
-
-@dataclass(frozen=True)
-class Doubling:
-    """When one doubling is tried."""
-
-    after: int = field(metadata=ITERATIONS | at_least(0))  # iterations before
-    # Iterations that are compared: children of a split improve the images after about 100.
-    trial: int = field(metadata=ITERATIONS | at_least(1))
 
 
 @register_event
@@ -30,7 +20,8 @@ class MoreSurfels(Decision):
 
     name: ClassVar[str] = "more_surfels"
     gain: ClassVar[float] = 0.15  # a part of what twice as many gain in the end
-    doubling: tuple[Doubling, ...]  # trials, in their order
+    # In their order; children of a split improve the images after about 100 iterations.
+    doubling: tuple[Trial, ...]
 
     def components(self) -> Sequence[str]:
         return [f"surfels_{2 ** (i + 1)}x" for i in range(len(self.doubling))]
@@ -39,26 +30,13 @@ class MoreSurfels(Decision):
         capacity = 2.0 ** (1 + self.components().index(component))
         return replace(method, surfels=replace(method.surfels, capacity=capacity))
 
-    def due(self, trainer: Trainer) -> bool:
-        doubling = self._next(trainer)
-        return doubling is not None and trainer.iteration >= doubling.after
-
-    def apply(self, trainer: Trainer) -> None:
-        doubling = self._next(trainer)
-        assert doubling is not None
-        self.decide(trainer, doubling.trial)
+    def trial_of(self, component: str) -> Trial:
+        return self.doubling[self.components().index(component)]
 
     def begin(self, rival: Trainer) -> str:
         before = rival.surfels.count
         fill(rival)
         return "" if rival.surfels.count > before else "no surfels to split: densification has ended"
-
-    def _next(self, trainer: Trainer) -> Doubling | None:
-        """The doubling to decide; None without validation views, and after one that did not pay."""
-        left = self.pending(trainer.fit.decisions)
-        if trainer.validation is None or not left or trainer.iteration >= trainer.method.iterations:
-            return None
-        return self.doubling[len(self.doubling) - len(left)]
 
     def pending(self, decisions: Sequence[Mapping[str, Any]]) -> list[str]:
         """Those after a doubling that did not pay are decided, too."""
