@@ -174,10 +174,7 @@ class FitSetup:
 
 
 def learning_rates(
-    names: Iterable[str],
-    extent: float,
-    iterations: int,
-    rates: Rates = DEFAULT_RATES,
+    names: Iterable[str], extent: float, iterations: int, rates: Rates = DEFAULT_RATES
 ) -> dict[str, LearningRate]:
     """The rates at which attributes of surfels learn in a fit of so many iterations, by their names;
     positions in parts of the scene's extent, scene units (`Dataset.scene_extent`)."""

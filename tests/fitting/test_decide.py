@@ -16,7 +16,7 @@ from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import decide
 from mi_refgs.fitting.decide import Decision, as_decided, differences, fork
-from mi_refgs.fitting.events import more_surfels
+from mi_refgs.fitting.events.densify import fill
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
@@ -172,7 +172,7 @@ def test_more_surfels_begin_where_the_error_is(method: Method, views: Dataset) -
     trainer = step_to(Trainer(method, views), 3)
     error = trainer.fit.tables[0].error_sum.numpy()
     more = fork(trainer, replace(method, surfels=replace(method.surfels, capacity=4 / 3)))
-    more_surfels.fill(more)
+    fill(more)
     assert more.surfels.count == more.method.surfels.most == 80
     position = trainer.surfels.raw["position"].numpy()
     same = (more.surfels.raw["position"].numpy()[:, None] == position).all(-1).any(0)

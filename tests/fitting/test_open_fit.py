@@ -21,7 +21,7 @@ from mi_refgs.fitting.events import densify as densify_event
 from mi_refgs.fitting.events import follow_object
 from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.photograph_light import PhotographLight
-from mi_refgs.fitting.events.reset_opacity import ResetOpacity
+from mi_refgs.fitting.events.resets import ResetOpacity
 from mi_refgs.fitting.exchange import depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight

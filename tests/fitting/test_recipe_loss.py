@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -30,11 +32,13 @@ def rough(inputs: mi_refgs.LossInputs) -> Float | None:
     return dr.mean(dr.detach(inputs.frame.object_alpha) * (1 - roughness))
 
 
-@pytest.fixture
-def registered() -> Iterator[None]:
-    mi_refgs.register_loss(mi_refgs.Loss("rough", rough, maps=True, attributes=("roughness",)))
-    yield
-    LOSSES.unregister("rough")
+@contextmanager
+def registered(name: str, *value: Any, **reads: Any) -> Iterator[None]:
+    mi_refgs.register_loss(mi_refgs.Loss(name, *value, **reads))
+    try:
+        yield
+    finally:
+        LOSSES.unregister(name)
 
 
 def roughness_after(data: Path, method: Path, *settings: str) -> float:
@@ -46,11 +50,11 @@ def roughness_after(data: Path, method: Path, *settings: str) -> float:
     return float(np.mean(trainer.surfels.to_numpy()["roughness"]))
 
 
-def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path, registered: None) -> None:
-    without = roughness_after(data, method)
-    weighed = roughness_after(data, method, "loss.rough=1.0")
-    late = roughness_after(data, method, "loss.rough={weight=1.0, start=12}")
-    early = roughness_after(data, method, "loss.rough={weight=1.0, until=6}")
+def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path) -> None:
+    weights = "1.0", "{weight=1.0, start=12}", "{weight=1.0, until=6}"
+    with registered("rough", rough, maps=True, attributes=("roughness",)):
+        without = roughness_after(data, method)
+        weighed, late, early = (roughness_after(data, method, f"loss.rough={weight}") for weight in weights)
     assert weighed > without + 0.02 and late == pytest.approx(without, abs=1e-4)
     assert without < early < weighed
 
@@ -62,8 +66,7 @@ def test_photometric_loss_is_replaced_or_required(data: Path, method: Path) -> N
         pairs = zip(inputs.image, inputs.target.image, strict=True)
         return sum((dr.mean(dr.square(a - b)) for a, b in pairs), mi.Float(0)) / 3
 
-    mi_refgs.register_loss(mi_refgs.Loss("squared", squared))
-    try:
+    with registered("squared", squared):
         settings = [*SETTINGS, "loss.l1=0", "loss.ssim=0", "loss.normal=0"]
         for more in (["loss.squared=1"], []):
             chosen = methods.load(str(method), "quick", [*settings, *more])
@@ -73,20 +76,14 @@ def test_photometric_loss_is_replaced_or_required(data: Path, method: Path) -> N
                 assert float(trainer.loss[0]) == pytest.approx(float(trainer.error[0]), rel=1e-5)
             else:
                 refused(trainer.step, "loss: none in iteration 1; give one a weight")
-    finally:
-        LOSSES.unregister("squared")
 
 
-def test_loss_per_pixel_is_refused(data: Path, method: Path) -> None:
-    mi_refgs.register_loss(mi_refgs.Loss("uneven", lambda inputs: inputs.frame.object_alpha))
-    try:
-        with pytest.raises(mi_refgs.InputError, match=r"loss\.uneven: has \d+ values; reduce it"):
-            roughness_after(data, method, "loss.uneven=1.0")
-    finally:
-        LOSSES.unregister("uneven")
-
-
-def test_loss_that_is_not_registered_is_refused(data: Path, method: Path) -> None:
+def test_loss_per_pixel_or_of_no_name_is_refused(data: Path, method: Path) -> None:
+    with (
+        registered("uneven", lambda inputs: inputs.frame.object_alpha),
+        pytest.raises(mi_refgs.InputError, match=r"loss\.uneven: has \d+ values; reduce it"),
+    ):
+        roughness_after(data, method, "loss.uneven=1.0")
     with pytest.raises(mi_refgs.InputError, match=r"loss\.rough: 'rough' is unknown; use l1 or"):
         roughness_after(data, method, "loss.rough=1.0")
 

@@ -185,7 +185,7 @@ def build(case: Case, found: Values, folder: Path) -> Built:
         (integrator if case["emitter"] == "nested" else scene)["sky"] = _emitter(case, folder)
     if case["input"] == "xml":
         path = folder / "scene.xml"
-        path.write_bytes(ElementTree.tostring(_xml(scene, "")))
+        path.write_bytes(ElementTree.tostring(xml(scene, "")))
         with mitsuba_exr():
             loaded: Any = mi.load_file(str(path))
     else:
@@ -226,7 +226,8 @@ def _emitter(case: Case, folder: Path) -> dict[str, Any]:
     return made | {"filename": str(folder / "sky.exr")}
 
 
-def _xml(value: dict[str, Any], name: str) -> ElementTree.Element:
+def xml(value: dict[str, Any], name: str) -> ElementTree.Element:
+    """What `mi.load_file` reads as the dictionary that `mi.load_dict` reads."""
     kind = value["type"]
     if kind == "scene":
         element = ElementTree.Element("scene", version="3.0.0")
@@ -238,7 +239,7 @@ def _xml(value: dict[str, Any], name: str) -> ElementTree.Element:
         if isinstance(inner, dict) and inner["type"] == "rgb":
             put(element, **{key: inner["value"]})
         elif isinstance(inner, dict):
-            element.append(_xml(inner, key))
+            element.append(xml(inner, key))
         elif isinstance(inner, mi.ScalarTransform4f):
             transform = ElementTree.SubElement(element, "transform", name=key)
             numbers = " ".join(repr(float(x)) for x in np.array(inner.matrix).ravel())

@@ -27,7 +27,6 @@ from mi_refgs.plugins.aovs import suffixes, values_of_planes
 from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.render.display import image_array
 from mi_refgs.render.load_scene import load_scene
-from mi_refgs.render.scene_xml import put
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import save
 from mi_refgs.runs.trained_scene import SCENE, TrainedScene
@@ -43,6 +42,7 @@ from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.viewer_scene import BACKGROUND, IMAGE, DisplayOptions, planes_of
 from tests.laws.covering import covering_array, marked
+from tests.laws.option_scenes import xml
 from tests.scenes.integrator import (
     OTHER_OPTIONS,
     background_light,
@@ -81,16 +81,18 @@ def shadings() -> list[tuple[Shading, str]]:
 SHADINGS = shadings()
 
 
-def sensor(crop: bool = False) -> Any:
+def lens(crop: bool) -> dict[str, Any]:
     film: dict[str, Any] = {"type": "hdrfilm", "pixel_format": "rgba", "component_format": "float32"}
-    film |= {"width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}} | (window() if crop else {})
+    film |= {"width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
+    if crop:
+        names = "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"
+        film |= dict(zip(names, CROP, strict=True))
     to_world = mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1])
-    lens = {"type": "perspective", "fov": FOV, "near_clip": NEAR, "to_world": to_world}
-    return mi.load_dict(lens | {"film": film})
+    return {"type": "perspective", "fov": FOV, "near_clip": NEAR, "to_world": to_world, "film": film}
 
 
-def window() -> dict[str, int]:
-    return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), CROP, strict=True))
+def sensor(crop: bool = False) -> Any:
+    return mi.load_dict(lens(crop))
 
 
 def trained(shading: Shading, primitive: str, around: str, meshed: bool, bare: bool) -> TrainedScene:
@@ -361,13 +363,5 @@ def crop_sensor_of(path: Path, crop: bool) -> None:
     root = tree.getroot()
     for old in root.findall("sensor"):
         root.remove(old)
-    one = ElementTree.SubElement(root, "sensor", type="perspective", id="sensor")
-    put(one, fov=FOV, near_clip=NEAR)
-    transform = ElementTree.SubElement(one, "transform", name="to_world")
-    pose = np.array(sensor().world_transform().matrix, np.float64).ravel()
-    ElementTree.SubElement(transform, "matrix", value=" ".join(map(repr, map(float, pose))))
-    film = ElementTree.SubElement(one, "film", type="hdrfilm")
-    put(film, width=WIDTH, height=HEIGHT, **(window() if crop else {}))
-    put(film, pixel_format="rgba", component_format="float32")
-    ElementTree.SubElement(film, "rfilter", type="box")
+    root.append(xml(lens(crop), "sensor"))
     tree.write(path)

@@ -1,4 +1,4 @@
-"""Events of a fit, one file each: its settings, when it is due, what it does. `decide` has `hold_out`."""
+"""Events of a fit: their settings, when they are due, what they do. `decide` has `hold_out`."""
 
 ORDER = (
     # After every step:

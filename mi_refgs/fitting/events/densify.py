@@ -14,7 +14,7 @@ import numpy as np
 from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.events.reset_opacity import ResetOpacity
+from mi_refgs.fitting.events.resets import ResetOpacity
 from mi_refgs.fitting.exchange import exchange
 from mi_refgs.fitting.state import TableEdit
 from mi_refgs.fitting.train import Trainer

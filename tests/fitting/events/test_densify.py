@@ -12,10 +12,9 @@ import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.events import densify as event
-from mi_refgs.fitting.events import reset_opacity
 from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.propagate import Propagate
-from mi_refgs.fitting.events.reset_opacity import ResetOpacity
+from mi_refgs.fitting.events.resets import OPACITY, PATIENCE, ResetOpacity
 from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.fitting.state import TableEdit
 from mi_refgs.methods.fields import Window
@@ -125,7 +124,7 @@ def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
 def test_wait_follows_rate_that_lifts_opacities() -> None:
     """As many steps as Adam needs under a constant gradient, times the patience; 150 as shipped."""
     rate, reset = 0.05, ResetOpacity(Window(0, 10, 10))
-    params = {"opacity": mi.TensorXf(np.full((1, 1), logit(reset_opacity.OPACITY), np.float32))}
+    params = {"opacity": mi.TensorXf(np.full((1, 1), logit(OPACITY), np.float32))}
     optimiser = Adam(params, {"opacity": LearningRate(rate)})
     steps = 0
     while sigmoid(params["opacity"].numpy())[0, 0] < OPTIONS.prune_opacity:
@@ -137,9 +136,9 @@ def test_wait_follows_rate_that_lifts_opacities() -> None:
         return next(i for i in range(11, 9_999) if reset.grown(i, opacity, rate)) - 10
 
     shipped = wait(OPTIONS.prune_opacity, rate)
-    assert shipped == pytest.approx(reset_opacity.PATIENCE * steps, rel=0.05) == pytest.approx(150, rel=0.02)
+    assert shipped == pytest.approx(PATIENCE * steps, rel=0.05) == pytest.approx(150, rel=0.02)
     assert wait(OPTIONS.prune_opacity, rate / 2) == pytest.approx(2 * shipped, abs=1)
-    assert wait(reset_opacity.OPACITY, rate) == 1 and reset.grown(10, OPTIONS.prune_opacity, rate)
+    assert wait(OPACITY, rate) == 1 and reset.grown(10, OPTIONS.prune_opacity, rate)
     assert not reset.grown(10**6, OPTIONS.prune_opacity, 0.0)
 
 

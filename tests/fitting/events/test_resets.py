@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refgs.fitting.events.reset_opacity import OPACITY
+from mi_refgs.fitting.events.resets import OPACITY
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.surfels.attributes import sigmoid
 from tests.scenes.highlight import ball, small_method, step_to

@@ -1,4 +1,4 @@
-"""Resets of opacity: surfels that the images require grow back, others are pruned. [3DGS §5.2]"""
+"""Resets: opacities that surfels grow back if images require them, and what a stage begins anew."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import Window
-from mi_refgs.surfels.attributes import ATTRIBUTES, logit
+from mi_refgs.methods.method import LIGHT
+from mi_refgs.surfels.attributes import ATTRIBUTES, attribute, logit
 from mi_refgs.surfels.table import Surfels
 
 OPACITY = 0.01  # of all surfels after a reset, at most
@@ -24,7 +25,7 @@ PATIENCE = 4.5  # factor of the fewest steps in which an opacity can grow back; 
 @dataclass(frozen=True)
 class ResetOpacity(Event[Trainer]):
     """Lowers the opacities of the object; the background map would replace the background's surfels, blurred.
-    Attributes in `raise_to_start` rise to at least their initial value. [3DGS-DR, for metallic]"""
+    [3DGS §5.2] Attributes in `raise_to_start` rise to at least their initial value. [3DGS-DR, for metallic]"""
 
     name: ClassVar[str] = "reset_opacity"
     when: Window  # iterations at which it happens
@@ -53,3 +54,30 @@ class ResetOpacity(Event[Trainer]):
             return True
         lift = max(logit(opacity) - logit(OPACITY), 0.0)
         return since >= (PATIENCE * lift / rate if rate > 0 else math.inf)
+
+
+@register_event
+@dataclass(frozen=True)
+class Restart(Event[Trainer]):
+    """Gives what the next stage names (`stage.NAME.restart`) its initial values, without history."""
+
+    name: ClassVar[str] = "restart"
+    always: ClassVar[bool] = True
+
+    def due(self, trainer: Trainer) -> bool:
+        before, _ = trainer.method.stage_at(max(trainer.iteration, 1))
+        name, stage = trainer.method.stage_at(trainer.iteration + 1)
+        return bool(stage.restart) and name != before
+
+    def apply(self, trainer: Trainer) -> None:
+        fit, method, raw = trainer.fit, trainer.method, trainer.surfels.to_numpy()
+        _, stage = method.stage_at(trainer.iteration + 1)
+        rng = trainer.setup.rng(trainer.iteration + 1, "restart")
+        names = tuple(name for name in stage.restart if name != LIGHT)
+        for name in names:
+            count, width = raw[name].shape
+            raw[name] = attribute(name).start(count, width, rng, method.surfels.first(name))
+        fit.tables[0].replace(Surfels.from_numpy(raw), cleared=names)
+        if LIGHT in stage.restart and method.light is not None and method.light.learns:
+            fit.params[LIGHT] = method.light.start()
+            fit.optimiser.reset(LIGHT)
