@@ -25,7 +25,7 @@ PATIENCE = 4.5  # factor of the fewest steps in which an opacity can grow back; 
 @dataclass(frozen=True)
 class ResetOpacity(Event[Trainer]):
     """Lowers the opacities of the object; the background map would replace the background's surfels, blurred.
-    [3DGS §5.2] Attributes in `raise_to_start` rise to at least their initial value. [3DGS-DR, for metallic]"""
+    [3DGS §5.2] Attributes in `raise_to_start` rise to at least their initial value. [3DGS-DR: metallic]"""
 
     name: ClassVar[str] = "reset_opacity"
     when: Window  # iterations at which it happens
