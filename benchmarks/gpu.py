@@ -174,7 +174,7 @@ def frame(small: bool) -> Iterator[Row]:
 def tests(small: bool) -> Iterator[Row]:
     """Laws and hard cases with this variant."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=line"]
-    command += ["tests/hard_cases", "tests/laws/test_splat_laws.py", "tests/laws/test_render_laws.py"]
+    command += ["tests/hard_cases", "tests/laws/test_image_laws.py"]
     command += ["-k", "roughness"] if small else ["-n", "8", "-p", "no:benchmark"]
     environment = os.environ | {"MI_REFGS_TEST_VARIANT": str(mi.variant())}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
