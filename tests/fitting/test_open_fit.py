@@ -13,9 +13,10 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import READERS, Dataset, PointCloud, read_dataset
-from mi_refgs.data.images import ImageFile
+from mi_refgs.data.images import ImageFile, Pixels
 from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.events import densify as densify_event
 from mi_refgs.fitting.events import follow_object
@@ -31,6 +32,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.fields import Window
 from mi_refgs.methods.method import AROUND, LossWeight, Method, SurroundingsOptions
+from mi_refgs.reference.camera import look_at
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -215,6 +217,25 @@ def test_points_start_on_their_side_of_planes(data: Dataset, method: Method) -> 
     assert np.any(REGION.contains(outer))  # below the plane, too
     empty = replace(data, region=replace(region, planes=((0.0, 0.0, 1.0, 0.8),)))
     refused(lambda: initial_parameters(method, empty, np.random.default_rng(0), True), "hardly anything")
+
+
+def test_points_of_a_surface_are_where_depth_is_level_and_opaque() -> None:
+    """A near square in front of a far plane, without the mixed depths at its outline and a hole."""
+    origin = np.array([3.0, -2.0, 1.5])
+    pose, pixels = look_at(origin, np.array([0.2, 0.1, -0.3])), Pixels(np.zeros((40, 60, 3), np.float32))
+    view = View("v", 60, 40, 70.0, 75.0, 28.0, 21.0, pose, pixels)
+    depth, alpha = np.full((40, 60), 6.0), np.ones((40, 60))
+    depth[10:20, 20:30] = 3.0
+    depth[9, 20:30] = np.linspace(3.5, 5.5, 10)
+    alpha[30:35, 40:50] = 0.3
+    points = follow_object.surface_points(view, depth.ravel(), alpha.ravel(), 1.0)
+    row, column, seen = view.project(points)
+    along = (points - origin) @ pose[:3, 2]
+    assert seen.all() and {*np.round(along, 6)} == {3.0, 6.0}
+    found = np.zeros((40, 60), bool)
+    found[np.rint(row).astype(int), np.rint(column).astype(int)] = True
+    assert found[10:20, 20:30].all() and not found[9, 20:30].any() and not found[30:35, 40:50].any()
+    assert np.sum(~found) < 10 + 50 + 12
 
 
 def test_region_follows_object_once(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
