@@ -12,7 +12,7 @@ from mi_refgs.data import stereo as sweep
 from mi_refgs.data.dataset import Dataset, PointCloud
 from mi_refgs.data.region import Region
 from mi_refgs.data.stereo import Stereo, stereo
-from mi_refgs.fitting.initialisers.points import along_pixels
+from mi_refgs.fitting.initialisers import along_pixels
 from mi_refgs.fitting.runner import begin
 from mi_refgs.methods import load
 from mi_refgs.methods.extensions import Wanted

@@ -1,11 +1,11 @@
-"""The region of interest during a fit: once its surfels have the scene's shape, it follows the object.
+"""Events of open scenes: the region follows the object, and the background becomes the light of photographs.
 
 The rendered depth of some training views gives points on all surfaces, without floaters that others hide.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
 
@@ -14,8 +14,10 @@ import numpy as np
 from mi_refgs.data.object_region import camera_positions, fitted_region, seen_share
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.fitting.exchange import exchange
+from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.train import FEW_VIEWS, Trainer
 from mi_refgs.methods.extensions import Event, register_event
+from mi_refgs.methods.fields import Window
 from mi_refgs.render.panorama import SURFACE
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.types import Float
@@ -57,6 +59,31 @@ class FollowObject(Event[Trainer]):
         centre = ", ".join(f"{x:.3g}" for x in found.centre)
         trainer.tell(f"region of interest: the object is within {found.radius:.3g} units of ({centre})")
         exchange(trainer.setup, trainer.fit)
+
+
+@register_event
+@dataclass(frozen=True)
+class PhotographLight(Event[Trainer]):
+    """Renders the background from the object, for the loss `photographed`; of scenes with a light only."""
+
+    name: ClassVar[str] = "photograph_light"
+    when: Window  # iterations at which it happens
+
+    def due(self, trainer: Trainer) -> bool:
+        open_ = trainer.fit.surroundings is not None and trainer.region is not None
+        return open_ and trainer.method.light is not None and self.when.due(trainer.iteration)
+
+    def apply(self, trainer: Trainer) -> None:
+        trainer.check()
+        light, around, region = trainer.fit.light, trainer.fit.surroundings, trainer.region
+        assert light is not None and around is not None and region is not None
+        views = trainer.data.views
+        posed = [
+            replace(views[i], to_world=trainer.camera(i).pose()) for i in evenly_spread(len(views), FEW_VIEWS)
+        ]
+        trainer.fit.photographed = PhotographedLight.of(
+            trainer.surfels.detach(), around, region, posed, light.environment().height
+        )
 
 
 def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.ndarray:

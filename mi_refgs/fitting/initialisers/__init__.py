@@ -1,1 +1,0 @@
-"""Where surfels start, one file for each way: a function from data and random draws to points."""
