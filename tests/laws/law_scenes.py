@@ -42,6 +42,17 @@ class View:
         centre = self.width / 2, self.height / 2
         return Camera.from_pose(self.width, self.height, -FOCAL, -FOCAL, *centre, self.to_world, self.near)
 
+    def sensor(self) -> dict[str, Any]:
+        """As Mitsuba's scenes have it."""
+        film = {"type": "hdrfilm", "width": self.width, "height": self.height, "pixel_format": "rgba"}
+        return {
+            "type": "perspective",
+            "fov": float(2 * np.degrees(np.arctan(self.width / 2 / FOCAL))),
+            "to_world": mi.ScalarTransform4f(self.to_world),
+            "film": film | {"rfilter": {"type": "box"}},
+            "sampler": {"type": "independent", "sample_count": 1},
+        }
+
     def moved(self, matrix: np.ndarray) -> View:
         return replace(self, to_world=matrix @ self.to_world)
 

@@ -11,6 +11,7 @@ from mi_refgs.surfels.primitives import PRIMITIVES
 from tests.laws.covering import Case, Rule
 
 WIDTH, HEIGHT = 16, 12
+FOV, NEAR = 45.0, 0.01
 CROPS = {"none": (0, 0, WIDTH, HEIGHT), "inner": (3, 2, 8, 6), "corner": (8, 6, 8, 6)}
 """Offset and size, pixels. 2 × 2 samples of half the size share the kernels of the whole."""
 ACCURACY: dict[str, Any] = {"none": None, "dominant": True, "antialias": True, "directions": 7}

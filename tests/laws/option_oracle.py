@@ -21,19 +21,8 @@ from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
 from tests.laws.covering import Case
-from tests.laws.option_cases import CROPS, HEIGHT, WIDTH
-from tests.laws.option_scenes import (
-    AROUND,
-    BACKDROP,
-    FOV,
-    NEAR,
-    Values,
-    aov_types,
-    mesh,
-    rotation,
-    shading,
-    surfels_of,
-)
+from tests.laws.option_cases import CROPS, FOV, HEIGHT, NEAR, WIDTH
+from tests.laws.option_scenes import AROUND, BACKDROP, Values, aov_types, mesh, rotation, shading, surfels_of
 
 Array = np.ndarray
 XYZ = np.array(

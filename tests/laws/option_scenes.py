@@ -29,7 +29,7 @@ from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.laws.covering import Case
-from tests.laws.option_cases import ACCURACY, CROPS, FORMATS, HEIGHT, WIDTH
+from tests.laws.option_cases import ACCURACY, CROPS, FORMATS, FOV, HEIGHT, NEAR, WIDTH
 from tests.scenes.integrator import raw_channels, sky
 
 Values = dict[str, np.ndarray]
@@ -37,8 +37,6 @@ AROUND = "surroundings_"
 OTHERS = 10  # rows of the surroundings
 SCALE = 0.8  # of envmap emitters
 CONSTANT, BACKDROP = (0.5, 1.0, 1.6), (0.3, 0.1, 0.6)  # radiance of constant lights, of a background
-FOV = 45.0
-NEAR = 0.01
 SOME = ("normal", "depth", "roughness")
 TURN = Rotation.from_rotvec([0.7, 0.9, -0.4])
 TAGS = {

@@ -20,26 +20,11 @@ from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
-from tests.laws.law_scenes import (
-    COUNT,
-    DISCS,
-    FOCAL,
-    HEIGHT,
-    LIGHT_ROWS,
-    SCENES,
-    SEEDS,
-    SHADINGS,
-    WIDTH,
-    Scene,
-    View,
-    differing,
-    draw,
-    gradients,
-    random_scene,
-    rotated,
-)
+from tests.laws import law_scenes
+from tests.laws.law_scenes import COUNT, SCENES, SEEDS, SHADINGS, Scene, View, differing, draw, gradients
 from tests.scenes.integrator import plane_mesh, sky
 
+ROWS = law_scenes.LIGHT_ROWS
 EXACT = 2e-6  # between images of the same float32 arithmetic, but for fused operations and equal sums' order
 GRADIENT = 1e-4  # relative L2 between gradients: sums by scatter come in any order
 SILHOUETTE = 0.251  # |cos| to the ray up to which a normal may point away from the camera
@@ -115,7 +100,7 @@ def test_zero_opacity_equals_removal(shading: Shading, scene: Scene, seed: int) 
 
 
 @BOTH
-@given(scene=DISCS, seed=SEEDS)
+@given(scene=law_scenes.DISCS, seed=SEEDS)
 def test_a_disc_has_no_front_and_no_first_axis(shading: Shading, scene: Scene, seed: int) -> None:
     """Turned over, turned by a half about its normal, axes exchanged, quaternions of the other sign: the same
     image. Discs near the silhouette, whose normals stay as they are, are not turned over."""
@@ -142,7 +127,8 @@ def test_tiles_do_not_show(seed: int, tile: tuple[int, int]) -> None:
     position = np.stack([*(0.15 * z * rng.normal(size=(2, COUNT))), z], axis=1)
     tilt = rng.normal(size=(COUNT, 3)) * [0.04, 0.04, 1]  # σ sin θ is far below the layers' distance
     rotation = Rotation.from_rotvec(tilt).as_quat()
-    layers = random_scene(seed, size=0.3, opacity=1.0).changed(position=position, rotation=rotation)
+    layers = law_scenes.random_scene(seed, size=0.3, opacity=1.0)
+    layers = layers.changed(position=position, rotation=rotation)
     scene = Scene(layers.raw, View(np.eye(4)))
     shipped = draw(scene)
     with pytest.MonkeyPatch.context() as patch:
@@ -189,21 +175,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
 ADJOINT = 1e-5  # |⟨δ, Jv⟩ - ⟨Jᵀδ, v⟩| over |δ| |Jv|: float32 sums of a few hundred products
 
 
-def camera(scene: Scene) -> dict[str, Any]:
-    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgba"}
-    return {
-        "type": "perspective",
-        "fov": float(2 * np.degrees(np.arctan(WIDTH / 2 / FOCAL))),
-        "to_world": mi.ScalarTransform4f(scene.view.to_world),
-        "film": film | {"rfilter": {"type": "box"}},
-        "sampler": {"type": "independent", "sample_count": 1},
-    }
-
-
 def loaded(scene: Scene, light: Any, **changes: Any) -> mi.Scene:
     channels = {name: upload_tensor(values) for name, values in scene.raw.items()}
     integrator = {"type": "refgs", **channels, "light": light} | changes
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(scene)})
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": scene.view.sensor()})
 
 
 def picture(*arguments: Any, **changes: Any) -> np.ndarray:
@@ -219,10 +194,10 @@ def envmap(radiance: np.ndarray, turn: np.ndarray | None = None) -> dict[str, An
 
 @cache
 def shared(setting: str) -> mi.Scene:
-    light = EnvironmentLight.from_radiance(sky(LIGHT_ROWS)).raw
+    light = EnvironmentLight.from_radiance(sky(ROWS)).raw
     with TemporaryDirectory() as folder:
         mesh = {"mesh": plane_mesh(Path(folder))} if "mesh" in setting else {}
-        return loaded(random_scene(0), light, **mesh, **SETTINGS[setting])
+        return loaded(law_scenes.random_scene(0), light, **mesh, **SETTINGS[setting])
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
@@ -233,7 +208,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
     of, rng = shared(setting), np.random.default_rng(seed)
     params = mi.traverse(of)
     values = {f"integrator.{name}": raw for name, raw in scene.raw.items()}
-    values["integrator.light"] = rng.normal(size=(LIGHT_ROWS, 2 * LIGHT_ROWS, 3)).astype(np.float32)
+    values["integrator.light"] = rng.normal(size=(ROWS, 2 * ROWS, 3)).astype(np.float32)
     tangents = {key: rng.normal(size=value.shape).astype(np.float32) for key, value in values.items()}
 
     def rendered() -> tuple[dict[str, Any], Any]:
@@ -262,12 +237,9 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
 @given(scene=SCENES, seed=SEEDS)
 def test_the_world_has_no_preferred_direction(scene: Scene, seed: int) -> None:
     turn = Rotation.random(random_state=seed)
-    still = picture(scene, envmap(sky(LIGHT_ROWS)), diffuse="irradiance")
-    turned = picture(
-        rotated(scene, turn),
-        envmap(sky(LIGHT_ROWS), turn.as_matrix()),
-        diffuse="irradiance",
-    )
+    still = picture(scene, envmap(sky(ROWS)), diffuse="irradiance")
+    other = envmap(sky(ROWS), turn.as_matrix())
+    turned = picture(law_scenes.rotated(scene, turn), other, diffuse="irradiance")
     # Positions, quaternions and camera are rounded anew; at a cut a pixel may change sides.
     assert np.mean(np.any(np.abs(turned - still) > 5e-4, axis=2)) <= 0.01
 
@@ -293,7 +265,7 @@ def test_no_more_light_leaves_than_arrives(
         metallic=np.full((COUNT, 1), logit(metallic)),
         roughness=np.full((COUNT, 1), logit(roughness)),
     )
-    light = EnvironmentLight.constant(1.0, LIGHT_ROWS).raw
+    light = EnvironmentLight.constant(1.0, ROWS).raw
     rgba = picture(uniform, light, diffuse="irradiance", **options)
     assert rgba.min() >= 0
     # Lookups are bilinear, a prefiltered 1 is 1 ± 1e-4.
