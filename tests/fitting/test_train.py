@@ -100,20 +100,6 @@ def test_stage_has_its_own_rates(method: Method) -> None:
     assert np.abs(trainer.fit.params["metallic"].numpy() - before_deferred).max() > 0
 
 
-def test_edit_clears_moments_of_what_it_changed(method: Method) -> None:
-    """The propagation of iteration 5 changes opacities and scales."""
-    trainer = Trainer(method, ball())
-    trainer.step()
-
-    def moving() -> set[str]:
-        return {name for name, value in trainer.state().items() if name.endswith("first") and np.any(value)}
-
-    before = moving()
-    trainer.fit.iteration = 5
-    trainer.happen()
-    assert before - moving() == {"optimiser/opacity/first", "optimiser/scale/first"}
-
-
 @pytest.mark.parametrize("stage", ["initial", "deferred"])
 def test_error_is_shared_by_surfels(stage: str, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """They sum to the squared error times alpha, and each gets that of the pixels that show it."""
