@@ -97,6 +97,13 @@ def level_maps(light: Any) -> list[np.ndarray]:
     return [flat[first : first + 2 * h * h].reshape(h, 2 * h, 3) for first, h in light.operator.shapes]
 
 
+def arrays_of(frame: Any) -> dict[str, np.ndarray]:
+    """Every array of a frame by its name."""
+    arrays = {**vars(frame), **frame.maps, **({} if frame.terms is None else vars(frame.terms))}
+    known = {name: x for name, x in arrays.items() if x is not None and name not in ("maps", "terms")}
+    return {name: np.array(x, np.float64) for name, x in known.items()}
+
+
 def read_loaded(*arguments: Any, **options: Any) -> Dataset:
     """`read_dataset` with all views loaded."""
     data = read_dataset(*arguments, **options)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
 from pathlib import Path
+
+import psutil
 
 from mi_refgs.errors import InputError
 
@@ -59,24 +59,12 @@ def require(needed: float, what: str, remedy: str) -> None:
 
 def available() -> float:
     """Bytes that this process may still allocate, by the machine and its control groups."""
-    return min(_machine(), *_groups(), math.inf)
+    return min(psutil.virtual_memory().available, *_groups(), math.inf)
 
 
 def resident() -> float:
-    """Bytes that this process has allocated; 0 if the system does not report them."""
-    try:
-        return int((PROC / "self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return 0
-
-
-def _machine() -> float:
-    with contextlib.suppress(OSError, ValueError, IndexError, StopIteration):
-        lines = (PROC / "meminfo").read_text().splitlines()
-        return next(1024 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    with contextlib.suppress(AttributeError, ValueError, OSError):  # other systems: all installed memory
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return math.inf
+    """Bytes that this process has allocated."""
+    return float(psutil.Process().memory_info().rss)
 
 
 def _groups() -> list[float]:

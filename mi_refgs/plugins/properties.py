@@ -93,7 +93,7 @@ class BackgroundProperties:
 
     @staticmethod
     def read(props: Any) -> BackgroundProperties:
-        behind = read_background(props)
+        behind = _behind(props)
         colour, light = (None, behind) if isinstance(behind, EnvironmentLight) else (behind, None)
         raw = _attributes(props, "surroundings", AROUND)
         names = {"radiance_sh", *(n for primitive in PRIMITIVES.values() for n in primitive.widths)}
@@ -118,8 +118,8 @@ class BackgroundProperties:
         return frame.background if self.map is not None else self.colour
 
 
-def read_background(props: Any) -> Any:
-    """Read what is behind everything: mi.Color3f, an EnvironmentLight, or None for transparency."""
+def _behind(props: Any) -> Any:
+    """What is behind everything: mi.Color3f, an EnvironmentLight, or None for transparency."""
     value = _get(props, "background", None)
     if isinstance(value, str):
         return EnvironmentLight.from_file(_path(props, "background") or "")

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from mi_refgs import constants as c
 from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, ray_slopes, rotation_axes, sigmoid
@@ -249,11 +250,7 @@ def rays(camera: PinholeCamera, x: Array, y: Array) -> Array:
 
 def bilinear_map(values: Array, x: Array, y: Array) -> Array:
     """Values (P, C) at points of the image (P,), in pixels, of a map (H, W, C); the border repeats."""
-    column, row = np.floor(x - 0.5).astype(int), np.floor(y - 0.5).astype(int)
-    u, v = (x - 0.5 - column)[:, None], (y - 0.5 - row)[:, None]
-
-    def at(i: int, j: int) -> Array:
-        clipped = np.clip(row + j, 0, len(values) - 1), np.clip(column + i, 0, values.shape[1] - 1)
-        return values[clipped]
-
-    return (1 - v) * ((1 - u) * at(0, 0) + u * at(1, 0)) + v * ((1 - u) * at(0, 1) + u * at(1, 1))
+    planes = (
+        map_coordinates(v, (y - 0.5, x - 0.5), order=1, mode="nearest") for v in np.moveaxis(values, -1, 0)
+    )
+    return np.stack([*planes], axis=1)

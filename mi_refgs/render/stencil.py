@@ -20,22 +20,24 @@ def neighbours(
 ) -> list[Float]:
     """The plane (mi.Float, raster order) by each step: out_k(x, y) = plane(x + dx_k, y + dy_k), dx, dy in
     {-1, 0, 1}, borders repeated. A plane of compacted `pixels`, detached, is 0 at all others."""
+
+    def beside(pixel: UInt32) -> list[UInt32]:
+        x, y = pixel % width, pixel // width
+        return [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
+
     if pixels is not None:
         dr.eval(plane)
         inside = dr.minimum(pixels.raster, width * height - 1)  # patches reach beyond the image
-        x, y = inside % width, inside // width
-        index = [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
-        return [pixels.at(plane, i) for i in index]
+        return [pixels.at(plane, i) for i in beside(inside)]
 
     def shifted(plane: Float) -> list[Float]:
         dr.eval(plane)
-        x, y = _pixel(width, height)
-        index = [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
-        return [dr.gather(mi.Float, plane, i) for i in index]
+        return [dr.gather(mi.Float, plane, i) for i in beside(dr.arange(mi.UInt32, width * height))]
 
     def gathered(shifts: list[Float]) -> Float:
         """Pixel s was read by the pixels p = s - step and, where the border repeats, by s itself."""
-        x, y = _pixel(width, height)
+        index = dr.arange(mi.UInt32, width * height)
+        x, y = index % width, index // width
         total = mi.Float(0)
         dr.eval(shifts)
         for (dx, dy), shift in zip(steps, shifts, strict=True):
@@ -45,11 +47,6 @@ def neighbours(
         return total
 
     return list(linear(plane, shifted, gathered))
-
-
-def _pixel(width: int, height: int) -> tuple[UInt32, UInt32]:
-    index = dr.arange(mi.UInt32, width * height)
-    return index % width, index // width
 
 
 def _moved(place: UInt32, step: int, size: int) -> UInt32:

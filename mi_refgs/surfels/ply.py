@@ -83,12 +83,8 @@ def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
 
 
 def write_ply(path: str | Path, surfels: Surfels) -> None:
-    """Write surfels as binary float32 PLY, atomically and exactly. Raises InputError if that fails."""
-    write_bytes(path, encode_ply(surfels))
-
-
-def encode_ply(surfels: Surfels) -> bytes:
-    """The bytes of the PLY file; raises InputError if a value is not finite."""
+    """Write surfels as binary float32 PLY, atomically and exactly. Raises InputError if that fails, or if a
+    value is not finite."""
     surfels.validate()
     tables = surfels.to_numpy()
     columns: dict[str, np.ndarray] = {}
@@ -109,4 +105,4 @@ def encode_ply(surfels: Surfels) -> bytes:
         rows[name] = column
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {surfels.count}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]
-    return "\n".join(header).encode("ascii") + rows.tobytes()
+    write_bytes(path, "\n".join(header).encode("ascii") + rows.tobytes())

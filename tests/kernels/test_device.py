@@ -53,6 +53,7 @@ UNUSABLE: dict[str, Callable[[], object]] = {
     "a run": lambda: mi_refgs.load("some"),
     "a fit": lambda: mi_refgs.fit("some", "some"),
     "a plugin": lambda: mi.load_dict({"type": "refgs", "filename": "some.ply"}),
+    "a material": lambda: mi.load_dict({"type": "refgs_bsdf"}),
 }
 
 

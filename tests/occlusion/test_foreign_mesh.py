@@ -16,6 +16,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import unit, vector
+from tests.scenes.splats import discs
 
 SCALES = [1.0, 1e-6, 1e6]
 UP = np.array([0.0, 0, 1])
@@ -67,16 +68,11 @@ def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, 
     made = occluder(tmp_path, trimesh.Trimesh(scale * ball.vertices, ball.faces, process=False))
     # Surfels that lie flat on the ball do not agree with its normals: the mesh's own must serve.
     count = len(ball.vertices)
+    size, flat = np.full((count, 2), np.log(0.1 * scale)), np.tile([1.0, 0, 0, 0], (count, 1))
+    materials = {"albedo": np.zeros((count, 3)), "metallic": np.zeros((count, 1))}
+    materials["roughness"] = np.linspace(-2, 2, count)[:, None]
     surfels = Surfels.from_numpy(
-        {
-            "position": scale * ball.vertices,
-            "rotation": np.tile([1.0, 0, 0, 0], (count, 1)),
-            "scale": np.full((count, 2), np.log(0.1 * scale)),
-            "opacity": np.zeros((count, 1)),
-            "albedo": np.zeros((count, 3)),
-            "metallic": np.zeros((count, 1)),
-            "roughness": np.linspace(-2, 2, count)[:, None],
-        }
+        discs(position=scale * ball.vertices, rotation=flat, scale=size, **materials)
     )
     made.set_materials(surfels)
     rows = np.array(made.surface(surfels, MATERIALS).rows).reshape(count, 8)

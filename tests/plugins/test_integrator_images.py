@@ -11,6 +11,7 @@ import pytest
 
 from tests.helpers import refused
 from tests.scenes.integrator import HEIGHT, WIDTH, check_derivatives, image, plane_mesh, scene, sensor
+from tests.scenes.splats import discs
 
 EVERY_AOV = "al:albedo,m:metallic,r:roughness,n:normal,dd.y:depth,a:alpha,v:visibility"
 EVERY_AOV += ",di:diffuse,sp:specular,ind:indirect"
@@ -65,13 +66,7 @@ def test_a_batch_is_its_sensors_side_by_side() -> None:
 
 def test_depth_is_that_of_mitsuba() -> None:
     """One large opaque disc against a rectangle in the same plane under Mitsuba's own `aov` integrator."""
-    raw = {
-        "position": [[0, 0, 0]],
-        "rotation": [[0, 0, 0, 1]],
-        "scale": np.log([[50.0, 50.0]]),
-        "opacity": [[9.0]],
-        "radiance_sh": [[1.0, 1.0, 1.0]],
-    }
+    raw = discs(scale=np.log([[50.0, 50.0]]), opacity=[[9.0]], radiance_sh=[[1.0, 1.0, 1.0]])
     view = sensor(near_clip=0.5, film={"width": 5, "height": 5})
     channels = {name: mi.TensorXf(np.array(values, np.float32)) for name, values in raw.items()}
     ours = {"type": "refgs", "aovs": "d:depth", **channels}
@@ -91,14 +86,6 @@ def test_supersampling_is_a_box_filter_over_pixel_centres() -> None:
         np.testing.assert_allclose(image(of, spp=spp), mean, atol=2e-5)
     np.testing.assert_array_equal(image(of), image(of, spp=1, seed=7))
     assert np.abs(image(of) - mean).max() > 1e-3
-
-
-@pytest.mark.parametrize("spp", [1, 4])
-def test_crop_window_is_part_of_the_whole(spp: int) -> None:
-    crop = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 9, "crop_height": 7}
-    part = scene(sensor(film=crop))
-    np.testing.assert_allclose(image(part, spp=spp), image(scene(), spp=spp)[2:9, 3:12], atol=2e-5)
-    assert list(part.sensors()[0].film().bitmap().size()) == [9, 7]
 
 
 @pytest.mark.parametrize(

@@ -29,18 +29,13 @@ MOTION = (0.2 * np.array([0.3, -0.5, 0.4, 0.2, 0.3, -0.1])).astype(np.float32)  
 @pytest.mark.parametrize("far", [0.0, 1e4])
 def test_displaced_camera_is_at_its_pose(far: float) -> None:
     """In float64; also far from the world's origin, where float32 resolves a thousandth."""
-    pose = camera().to_world.copy()
-    pose[:3, 3] += far
+    pose, expected = camera().to_world.copy(), moved_pose(camera().to_world, MOTION.astype(np.float64))
+    for matrix in (pose, expected):
+        matrix[:3, 3] += far
     eye = Camera.from_pose(8, 8, -9, -9, 4, 4, pose)
-    x = np.array(MOTION, np.float64)
-    centre = mi.Point3f(CENTRE + far)
-    q = Rotation.from_quat([*(0.5 * x[:3]), 1]).as_matrix()
-    found = eye.displaced(mi.Matrix3f(q), centre, mi.Vector3f(x[3:]))
-    change = np.eye(4)
-    change[:3, :3] = q
-    about = np.array(centre, np.float64).ravel()
-    change[:3, 3] = about - q @ about + x[3:]
-    np.testing.assert_allclose(found.pose(), change @ eye.pose(), atol=2e-6)
+    rotation, translation = rotation_of(mi.Float(MOTION))
+    found = eye.displaced(rotation, mi.Point3f(CENTRE + far), translation)
+    np.testing.assert_allclose(found.pose(), expected, atol=2e-6)
     assert found.motion is None
 
 

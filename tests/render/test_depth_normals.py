@@ -17,7 +17,7 @@ from mi_refgs.render import display
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
-from tests.fitting.image_checks import HEIGHT, STEP, VALUE, WIDTH, gradient, planes, stack
+from tests.fitting.image_checks import HEIGHT, WIDTH, check, stack
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 1), (3, 4)])
@@ -111,24 +111,7 @@ def test_normal_consistency_through_the_depth(rng: np.random.Generator, has_back
         share = x[..., 5] if has_background else None
         return reference.normal_consistency(x[..., :3], depth_normal, valid, weight, share)
 
-    at = packed.astype(np.float32).astype(np.float64)
-    leaves = planes(at)
-    dr.enable_grad(leaves)
-    value = loss(leaves)
-    assert abs(float(value[0]) - define(at)) < VALUE
-    dr.backward(value)
-    found = stack(leaves)
-    direction = rng.normal(size=at.shape) * (at != 0)
-    for channels in (slice(0, 3), slice(3, 4), slice(4, 5), *[slice(5, 6)] * has_background):
-        part = np.zeros(at.shape)
-        part[..., channels] = direction[..., channels]
-        slope = (define(at + STEP * part) - define(at - STEP * part)) / (2 * STEP)
-        scale = np.linalg.norm(found[..., channels]) * np.linalg.norm(part)
-        assert scale > 0 and abs(np.sum(found * part) - slope) <= 1e-4 * scale
-    wanted = gradient(
-        lambda z: define(np.concatenate([at[..., :3], z, at[..., 4:]], axis=-1)), at[..., 3:4] + 0.0
-    )
-    assert np.linalg.norm(found[..., 3:4] - wanted) <= 2e-4 * np.linalg.norm(wanted)
+    check(loss, define, packed, share=0.2, tolerance=1e-4)
 
 
 def test_aligned_and_empty_pixels_keep_their_roughness() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import arrays_of
 from tests.scenes import integrator as scenes
 
 FEW = 512  # samples of a pass in these tests: two rows of pixels or more of 4 × 4 samples
@@ -35,17 +34,6 @@ SHADINGS = {
     "irradiance": Shading(diffuse="irradiance", occlusion=True, ambient_rays=8),
     "monte_carlo": Shading(at="surfel", reflectance="monte_carlo", occlusion=True),
 }
-
-
-def leaves(tree: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """Every array of a frame with its name."""
-    if is_dataclass(tree):
-        tree = {field.name: getattr(tree, field.name) for field in fields(tree)}
-    if isinstance(tree, dict):
-        for key, value in tree.items():
-            yield from leaves(value, f"{name}.{key}")
-    elif tree is not None and not isinstance(tree, bool):
-        yield name, np.array(tree, np.float64)
 
 
 def renderer(shading: Shading, samples: int, folder: Path, around: bool = False) -> Any:
@@ -64,11 +52,11 @@ def test_a_frame_in_passes_is_the_whole_frame(
     name, samples = [*SHADINGS][case], (16, 1)[case % 2]
     view = renderer(SHADINGS[name], samples, tmp_path, around=case % 4 < 2)
     eye = Camera.from_sensor(mi.load_dict(scenes.sensor()))
-    whole = dict(leaves(view(eye)))
+    whole = arrays_of(view(eye))
     monkeypatch.setattr(passes, "PASS_SAMPLES", FEW if samples > 1 else 64)
     assert len(passes.bands(eye, round(samples**0.5), SHADINGS[name].neighbours)) > 1
-    parts = dict(leaves(view(eye)))
-    assert whole.keys() == parts.keys() and {".alpha", ".radiance", ".maps.roughness"} <= parts.keys()
+    parts = arrays_of(view(eye))
+    assert whole.keys() == parts.keys() and {"alpha", "radiance", "roughness"} <= parts.keys()
     for key, value in whole.items():
         np.testing.assert_allclose(parts[key], value, atol=2e-5, err_msg=key)
 
@@ -79,7 +67,7 @@ def test_a_crop_window_is_part_of_the_whole(case: int, tmp_path: Path) -> None:
     view = renderer([*SHADINGS.values()][case], (1, 4)[case % 2], tmp_path)
     crop = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
     cameras = (Camera.from_sensor(mi.load_dict(scenes.sensor(film=film))) for film in ({}, crop))
-    whole, part = (dict(leaves(view(camera))) for camera in cameras)
+    whole, part = (arrays_of(view(camera)) for camera in cameras)
     for key, value in whole.items():
         if value.shape[-1] == scenes.HEIGHT * scenes.WIDTH:
             value = value.reshape(*value.shape[:-1], scenes.HEIGHT, scenes.WIDTH)[..., 2:8, 5:12]

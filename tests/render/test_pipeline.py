@@ -19,6 +19,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
+from tests.scenes import splats
 from tests.scenes.integrator import HEIGHT, WIDTH, raw_channels, sky
 from tests.scenes.shading_points import exact_light
 
@@ -26,16 +27,7 @@ COLOUR = Shading(at="surfel", reflectance="radiance")
 
 
 def discs(**channels: Any) -> Surfels:
-    """Surfels at the origin that face +z, grey and opaque unless `channels` says otherwise."""
-    count = max(len(values) for values in channels.values())
-    raw = {
-        "position": np.zeros((count, 3)),
-        "rotation": np.tile([0.0, 0, 0, 1], (count, 1)),
-        "scale": np.full((count, 2), np.log(0.3)),
-        "opacity": np.full((count, 1), 20.0),
-        "radiance_sh": np.zeros((count, 3)),
-    }
-    return Surfels.from_numpy(raw | channels)
+    return Surfels.from_numpy(splats.discs(**channels))
 
 
 def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:

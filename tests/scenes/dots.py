@@ -10,6 +10,7 @@ import numpy as np
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.view import View
 from mi_refgs.io.images import write_png
+from mi_refgs.reference.camera import look_at
 
 POINTS = np.random.default_rng(3).uniform(-0.5, 0.5, (9, 3))
 COLOURS = np.random.default_rng(4).integers(60, 256, (9, 3))  # sRGB, 8 bits
@@ -34,10 +35,7 @@ class Shot:
         """World to camera."""
         angle, height = 0.5 * self.index, 0.4 * np.sin(self.index)
         eye = np.array([np.cos(angle), height, np.sin(angle)])
-        forward = -eye / np.linalg.norm(eye)
-        right = np.cross(forward, [0.1, 1, 0])
-        right /= np.linalg.norm(right)
-        return np.stack([right, np.cross(forward, right), forward])
+        return (look_at(eye, np.zeros(3), (0.1, 1, 0))[:3, :3] * [-1, -1, 1]).T
 
     @property
     def translation(self) -> np.ndarray:

@@ -66,12 +66,16 @@ def image(of: mi.Scene, **arguments: object) -> np.ndarray:
     return mi.render(of, **arguments).numpy()
 
 
+def joined(voxel: float, *parts: trimesh.Trimesh) -> Mesh:
+    whole: Any = trimesh.util.concatenate(parts)
+    return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.uint32), voxel)
+
+
 def wall(scale: float = 1) -> Mesh:
     """A wall behind the sphere's right half, seen in its reflections; `scale`: of the unit of length."""
     box = trimesh.creation.box((0.2, 8, 8))
     box.apply_translation((-2.5, 4, 0))
-    vertices = (box.vertices * scale).astype(np.float32)
-    return Mesh(vertices, box.faces.astype(np.uint32), 0.05 * scale)
+    return joined(0.05 * scale, box.apply_scale(scale))
 
 
 def plane_mesh(folder: Path) -> str:
@@ -85,9 +89,8 @@ def hollow_mesh(folder: Path) -> str:
     ball = trimesh.creation.icosphere(subdivisions=2)
     wall = trimesh.creation.box((0.2, 4, 4))
     wall.apply_translation((-1.1, 1, 0))
-    mesh: Any = trimesh.util.concatenate([ball, wall.subdivide_to_size(0.5)])
     path = folder / "hollow.ply"
-    write_mesh(path, Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), 0.02))
+    write_mesh(path, joined(0.02, ball, wall.subdivide_to_size(0.5)))
     return str(path)
 
 
@@ -188,11 +191,8 @@ def camera_at(focal: float, offset: tuple[int, int] = (0, 0)) -> Camera:
 
 def two_balls() -> Mesh:
     """A ball below the discs, and one beside it that blocks its mirror rays."""
-    balls = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2)]
-    vertices = [np.asarray(ball.vertices, np.float32) for ball in balls]
-    faces = np.asarray(balls[0].faces, np.uint32)
-    both = np.concatenate([vertices[0], vertices[1] + np.array([-1.8, 1.2, 0.8], np.float32)])
-    return Mesh(both, np.concatenate([faces, faces + len(vertices[0])]).astype(np.uint32), 0.05)
+    one, other = (trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.8, 1.2))
+    return joined(0.05, one, other.apply_translation((-1.8, 1.2, 0.8)))
 
 
 OTHER_OPTIONS: dict[str, Any] = {

@@ -23,7 +23,7 @@ from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.synthesis.make_dataset import make_dataset
-from tests.scenes.integrator import sky
+from tests.scenes.integrator import joined, sky
 
 SIZE = 40
 METAL: dict[str, Any] = {"albedo": (0.9, 0.6, 0.3), "roughness": 0.35, "metallic": 1.0}
@@ -85,10 +85,8 @@ def known_surfels() -> Surfels:
 
 def known_mesh() -> Mesh:
     """The balls, of few enough triangles to be quick."""
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    vertices = np.concatenate([r * ball.vertices + c for c, r in zip(CENTRES, RADII, strict=True)])
-    faces = np.concatenate([ball.faces, ball.faces + len(ball.vertices)])
-    return Mesh(vertices.astype(np.float32), faces.astype(np.uint32), 2e-3)
+    parts = zip(CENTRES, RADII, strict=True)
+    return joined(2e-3, *(trimesh.creation.icosphere(3, r).apply_translation(c) for c, r in parts))
 
 
 def known_scene() -> TrainedScene:

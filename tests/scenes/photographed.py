@@ -10,6 +10,8 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates, zoom
 
+from mi_refgs.reference.camera import look_at
+
 WIDTH, HEIGHT, FOCAL = 256, 192, 260.0
 BLOCK = np.array([0.7, 0.5, 0.8])  # half widths and the height, whose bottom is at z = 0
 
@@ -32,11 +34,8 @@ def around(count: int, arc: float = 120.0, radius: float = 3.2, height: float = 
 
 
 def look(origin: np.ndarray, target: tuple[float, float, float] = (0.0, 0.0, 0.35)) -> Shot:
-    forward = np.array(target) - origin
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    return Shot(np.stack([right, np.cross(forward, right), forward]), origin)
+    pose = look_at(origin, np.array(target))  # left, up, forward
+    return Shot((pose[:3, :3] * [-1, -1, 1]).T, origin)
 
 
 def noise(seed: int, size: int = 512) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -82,6 +83,19 @@ def make_gaussians(seed: int) -> Scene:
     scale[beside] = np.log(0.8)
     raw = scene.raw | {"scale": scale, "position": position}
     return replace(scene, raw={n: x.astype(np.float32).astype(np.float64) for n, x in raw.items()})
+
+
+def discs(**channels: Any) -> dict[str, Any]:
+    """Raw values of discs at the origin that face +z, grey and opaque unless `channels` says otherwise."""
+    count = max(len(values) for values in channels.values())
+    raw = {
+        "position": np.zeros((count, 3)),
+        "rotation": np.tile([0.0, 0, 0, 1], (count, 1)),
+        "scale": np.full((count, 2), np.log(0.3)),
+        "opacity": np.full((count, 1), 20.0),
+        "radiance_sh": np.zeros((count, 3)),
+    }
+    return raw | channels
 
 
 def quaternion_to(normal: np.ndarray) -> np.ndarray:

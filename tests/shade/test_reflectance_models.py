@@ -16,7 +16,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import models
 from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
+from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace
 from mi_refgs.surfels.table import Surfels
@@ -174,11 +174,6 @@ def test_degenerate_points_stay_finite(shading: Shading, names: tuple[str, ...])
         dr.set_grad(leaf, 1)
         total = shaded(points.replaced(roughness=leaf), EnvironmentLight(raw), shading).total()
         assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
-
-
-def test_mirror_direction() -> None:
-    normal, view = mi.Vector3f(0, 1, 0), dr.normalize(mi.Vector3f(1, 1, 0))
-    np.testing.assert_allclose(reflect(view, normal).numpy().ravel(), [-(0.5**0.5), 0.5**0.5, 0], atol=1e-6)
 
 
 def test_safe_normalize() -> None:

@@ -43,13 +43,6 @@ def test_against_scipy_and_the_recursion(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(basis_of(d[-56:]), [reference.sh_basis(x, 3) for x in d[-56:]], atol=2e-6)
 
 
-def test_degree_one_signs() -> None:
-    """3DGS: (-y, +z, -x) times ½√(3/π)."""
-    k = 0.5 * np.sqrt(3 / np.pi)
-    expected = k * np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])
-    np.testing.assert_allclose(basis_of(np.eye(3), 1)[:, 1:], expected, atol=1e-7)
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_derivatives_of_eval(degree: int, rng: np.random.Generator) -> None:
     n, count = 40, (degree + 1) ** 2

@@ -26,6 +26,7 @@ from mi_refgs.surfels.table import Surfels
 from tests.helpers import slow, unit, vector
 from tests.scenes import corner as scenes
 from tests.scenes.shading_points import exact_light, exact_terms
+from tests.scenes.splats import discs
 
 # ---------------- materials on the mesh ----------------
 
@@ -36,17 +37,9 @@ def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
     scale = np.array([[0.3, 0.2], [0.25, 0.4], [0.5, 0.3]])
     opacity, colour = np.array([0.9, 0.5, 0.2]), np.array([0.1, 0.5, 0.9])
     logit = np.log(colour / (1 - colour))
-    surfels = Surfels.from_numpy(
-        {
-            "position": position,
-            "rotation": np.tile([0.0, 0, 0, 1], (3, 1)),
-            "scale": np.log(scale),
-            "opacity": np.log(opacity / (1 - opacity)),
-            "albedo": np.tile(logit[:, None], 3),
-            "metallic": logit,
-            "roughness": logit,
-        }
-    )
+    materials = {"albedo": np.tile(logit[:, None], 3), "metallic": logit, "roughness": logit}
+    shape = {"scale": np.log(scale), "opacity": np.log(opacity / (1 - opacity))}
+    surfels = Surfels.from_numpy(discs(position=position, **shape, **materials))
     vertices = np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0.1], [50, 0, 0]], np.float32)
     mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 3, 2]], np.uint32), 0.1)
     rows = np.array(scenes.with_materials(mesh, surfels).surface(surfels, MATERIALS).rows).reshape(4, 8)

@@ -19,6 +19,7 @@ from mi_refgs.shade.points import TERMS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.lanes import CompactedPixels, Grid, Lanes
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import arrays_of
 from tests.scenes.integrator import camera_at, image, raw_channels, scattered_discs, scene, sky, two_balls
 
 MAPS = ("albedo", "metallic", "roughness", "visibility")
@@ -34,11 +35,8 @@ def things(gaussians: bool = False) -> Surfels:
 
 
 def values(frame: Frame) -> dict[str, np.ndarray]:
-    terms = {} if frame.terms is None else frame.terms.known()
-    unlike = {} if frame.background is None else {"object_alpha": frame.object_alpha}
-    named = {"radiance": frame.radiance, "alpha": frame.alpha, "depth": frame.depth, "normal": frame.normal}
-    every = named | {"background": frame.background} | unlike | terms | frame.maps
-    return {name: np.array(value) for name, value in every.items() if value is not None}
+    own = frame.background is not None
+    return {name: value for name, value in arrays_of(frame).items() if own or name != "object_alpha"}
 
 
 def assert_same(expected: Frame, found: Frame) -> None:

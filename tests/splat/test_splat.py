@@ -221,12 +221,9 @@ def test_reference_footprints_match_textbook_intersections() -> None:
 def test_crossing_surfels_each_hide_the_other_on_their_own_side() -> None:
     """Two opaque, tilted discs that cross: a tile shows the nearer plane, not the nearer centre."""
     tilt = np.radians(50)
-    raw = {
-        "position": np.array([[0, 0, 0], [0, 0, 0.01]]),
-        "rotation": np.array([[0, np.sin(s * tilt / 2), 0, np.cos(tilt / 2)] for s in (1, -1)]),
-        "scale": np.zeros((2, 2)),
-        "opacity": np.full((2, 1), 8.0),
-    }
+    rotation = np.array([[0, np.sin(s * tilt / 2), 0, np.cos(tilt / 2)] for s in (1, -1)])
+    position = np.array([[0, 0, 0], [0, 0, 0.01]])
+    raw = scenes.discs(position=position, rotation=rotation, scale=np.zeros((2, 2)))
     camera = oracle.PinholeCamera(32, 32, -50, -50, 16, 16, look_at(np.array([0, 0, 4.0]), np.zeros(3)))
     maps = scenes.fast_maps(scenes.Scene(raw, np.eye(2), camera))
     first, second = (f.numpy().reshape(32, 32)[16] for f in maps.features)
@@ -263,8 +260,7 @@ def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: 
     monkeypatch.setattr(tiles, "MAX_PAIR_BITS", 22)
     count = 1 << 16  # large discs, parallel to the image
     position = np.stack([np.zeros(count), np.zeros(count), np.linspace(2, 3, count)], axis=1)
-    raw = {"position": position, "rotation": np.tile([0.0, 0, 0, 1], (count, 1))}
-    raw |= {"scale": np.full((count, 2), 4.0), "opacity": np.zeros((count, 1))}
+    raw = scenes.discs(position=position, scale=np.full((count, 2), 4.0))
     camera = Camera.from_pose(1024, 1024, -500, -500, 512, 512, np.eye(4))
     with pytest.raises(InputError, match=r"65,536 tiles of 1024 × 1024 pixels; render fewer pixels"):
         splat(Surfels.from_numpy(raw), [], camera)
@@ -277,13 +273,8 @@ def test_the_cut_biases_gradients_by_what_is_documented(opacity: float) -> None:
     mass, by_size, by_opacity = 0.0, 0.0, 0.0
     for i in range(places * places):
         x, y = (k + 0.5 for k in divmod(i, places))
-        raw = {
-            "position": np.array([[0.0, 0, 1]]),
-            "rotation": np.array([[0.0, 0, 0, 1]]),
-            "scale": np.full((1, 2), np.log(scale)),
-            "opacity": np.log([[opacity / (1 - opacity)]]),
-        }
-        surfels = Surfels.from_numpy(raw)
+        shape = {"scale": np.full((1, 2), np.log(scale)), "opacity": np.log([[opacity / (1 - opacity)]])}
+        surfels = Surfels.from_numpy(scenes.discs(position=[[0, 0, 1]], **shape))
         surfels.enable_grad()
         centre = (size / 2 + x / places, size / 2 + y / places)
         camera = Camera.from_pose(size, size, -focal, -focal, *centre, np.eye(4))

@@ -9,7 +9,7 @@ from mi_refgs.fitting.events import densify
 from mi_refgs.reference.camera import rotation_axes
 from mi_refgs.reference.footprint import Gaussian, Rules
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.splats import make_gaussians
+from tests.scenes.splats import discs, make_gaussians
 
 
 def test_reference_footprints_match_textbook_matrices() -> None:
@@ -38,8 +38,8 @@ def test_reference_footprints_match_textbook_matrices() -> None:
 
 def test_the_normal_is_the_shortest_axis() -> None:
     scales = np.log([[1, 2, 3], [2, 1, 3], [3, 2, 1], [1, 1, 1], [1, 1, 2]])
-    raw = {"position": np.zeros((5, 3)), "scale": scales, "opacity": np.zeros((5, 1))}
-    surfels = Surfels.from_numpy(raw | {"rotation": np.random.default_rng(0).normal(size=(5, 4))})
+    rotation = np.random.default_rng(0).normal(size=(5, 4))
+    surfels = Surfels.from_numpy(discs(scale=scales, rotation=rotation))
     axes = np.stack([np.array(axis).T for axis in surfels.frame()], axis=1)
     expected = axes[np.arange(5), [0, 1, 2, 2, 0]]
     normal = np.array(surfels.primitive.normal(surfels)).T
@@ -47,12 +47,7 @@ def test_the_normal_is_the_shortest_axis() -> None:
 
 
 def test_a_gaussian_is_split_along_its_longest_axis() -> None:
-    raw = {
-        "position": np.ones((2, 3)),
-        "rotation": np.tile([0.0, 0, 0, 1], (2, 1)),
-        "scale": np.log([[0.3, 0.1, 0.05], [0.05, 0.1, 0.3]]),
-        "opacity": np.zeros((2, 1)),
-    }
+    raw = discs(position=np.ones((2, 3)), scale=np.log([[0.3, 0.1, 0.05], [0.05, 0.1, 0.3]]))
     gaussians = Surfels.from_numpy(raw)
     edited = densify.densify_and_prune(gaussians, np.ones(2), 4, grow=1.0)
     children = edited.surfels.to_numpy()

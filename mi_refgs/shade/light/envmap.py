@@ -114,11 +114,11 @@ class UnfilteredLight:
         u, v = azimuth_polar(direction)
         return interpolated(lambda i: dr.gather(mi.Color3f, self.texels, i), u, v, h, 2 * h)
 
-    def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
-        raise InputError("the light is not filtered", "light", "irradiance", "call prefilter()")
+    def specular(self, direction: mi.Vector3f, roughness: mi.Float | None = None) -> mi.Color3f:
+        remedy = "call prefilter(), or look up `radiance`"
+        raise InputError("the light is not filtered", "light", "lookup", remedy)
 
-    def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        raise InputError("the light is not filtered", "light", "specular", "call prefilter()")
+    irradiance = specular
 
 
 def interpolated(texel: Callable[[Any], Any], u: Any, v: Any, h: Any, w: Any) -> Any:

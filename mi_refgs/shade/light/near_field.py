@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -105,9 +105,6 @@ class LocalLight:
 
     def __post_init__(self) -> None:
         dr.eval(self.near.on_device)  # lookups may be in a loop, which cannot upload
-
-    def detached(self) -> LocalLight:
-        return replace(self, position=dr.detach(self.position))
 
     def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
         return self.light.specular(self.near.seen_from(self.position, direction), roughness)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -74,8 +75,8 @@ class MonteCarlo(Reflectance):
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         count = dr.opaque(mi.UInt32, options.directions)
         normal = dr.detach(safe_normalize(points.normal))
-        if isinstance(light, LocalLight):
-            light = light.detached()  # as the normal: the loop's adjoint keeps derivatives of its state only
+        if isinstance(light, LocalLight):  # as the normal: the loop's adjoint has its state's derivatives
+            light = replace(light, position=dr.detach(light.position))
         free, incident = points.get("free"), points.get("incident")
         base = dr.fma(points.albedo, BASE_RANGE[1], BASE_RANGE[0])
         roughness = dr.fma(points.roughness, ROUGHNESS_RANGE[1], ROUGHNESS_RANGE[0])
