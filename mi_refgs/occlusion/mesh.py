@@ -128,11 +128,6 @@ def read_mesh(path: Path | str) -> Mesh:
 
 
 def _voxel(header: Header) -> float | None:
-    """The voxel size in a comment, None without one; raises ValueError unless it is positive."""
-    noted = [words[1:2] for words in map(str.split, header.comments) if words[:1] == [VOXEL_COMMENT]]
-    voxel = float(noted[0][0]) if noted and noted[0] else 0.0
-    if not noted:
-        return None
-    if not 0 < voxel < np.inf:
-        raise ValueError("a voxel without size")
-    return voxel
+    """The voxel size in a comment, None without one."""
+    noted = [words for words in map(str.split, header.comments) if words[:1] == [VOXEL_COMMENT]]
+    return float(noted[0][1]) if noted else None
