@@ -38,6 +38,7 @@ train data -o file/out --method tiny.toml
 train data -o run --method tiny.toml
 train data -o run --resume --preset standard
 train data -o new --resume
+doctor --masks
 train data -o out --plugin no.py
 train data -o out --plugin wrong.py
 dataset no.xml -o out

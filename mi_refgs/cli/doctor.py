@@ -13,7 +13,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from mi_refgs import llvm
-from mi_refgs.cli.command import Common, Result, optional
+from mi_refgs.cli.command import Common, Flag, Result, optional
+from mi_refgs.errors import InputError
 
 PROBE_TIMEOUT = 60.0  # time limit of the trial kernel in seconds; it usually takes half a second
 
@@ -92,14 +93,18 @@ class Doctor:
 
     data: Annotated[Positional[Path | None], optional("DATA")] = None
     """data set to examine instead of the installation"""
+    masks: Flag = False  # write masks of images whose background has one colour into the data set
     common: Common = Common()
 
     def run(self) -> Result:
         """Examine the data set or the installation."""
         if self.data is not None:
-            from mi_refgs.data.survey import survey, survey_text
+            from mi_refgs.data.survey import survey, survey_text, write_masks
 
             found = survey(self.data)
-            return Result(found, survey_text(found))
+            written = {"masks written": write_masks(self.data, found)} if self.masks else {}
+            return Result(found | written, survey_text(found | written))
+        if self.masks:
+            raise InputError("no data set is given", "--masks", remedy="name its folder")
         report = examine()
         return Result(report, text(report), 0 if report["usable"] else 1)

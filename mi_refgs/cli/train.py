@@ -41,6 +41,7 @@ class Train:
     light_fixed: Flag = False  # do not change the map of --light
     set: Settings = ()
     resume: Flag = False  # continue the run from its newest checkpoint
+    force: Flag = False  # fit data that the checks before a fit refuse
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -51,7 +52,7 @@ class Train:
         begin = time.monotonic()
         given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
         given |= {"settings": joined(self.set), "purpose": self.purpose}
-        given |= {"light": self.light, "light_fixed": self.light_fixed}
+        given |= {"light": self.light, "light_fixed": self.light_fixed, "force": self.force}
         fit(self.data, self.method, progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None

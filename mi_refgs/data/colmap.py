@@ -4,6 +4,7 @@ Every eighth image by name is a test view, unless `test.txt` beside the reconstr
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,8 @@ class Reconstruction:
         self.source = model / f"images.{ending}"
         self.cameras = read_cameras(model / f"cameras.{ending}")
         self.images = read_images(self.source)
-        self.point_file = model / f"points3D.{ending}"
+        point_file = model / f"points3D.{ending}"
+        self.table = read_points(point_file) if point_file.is_file() else None
         self.folder = ImageFolder.of(folder, flat=True)
         found = {image.name: self.folder.find(image.name) for image in self.images}
         self.files = {name: file for name, file in found.items() if file is not None}
@@ -79,13 +81,18 @@ class Reconstruction:
             raise error.at(file=where) from None
         pose = from_world_to_camera(image.rotation, image.translation, f"{self.source}: {image.name}")
         file = ImageFile.of(self.files[image.name], self.options.downscale, self.folder.mask(image.name))
-        return make_view(file, self.options, where, image.name, _intrinsics(camera, file), pose, lens)[0]
+        view = make_view(file, self.options, where, image.name, _intrinsics(camera, file), pose, lens)[0]
+        tracks, observed = None, image.observed
+        if self.table is not None and len(numbers := self.table.number):
+            at = np.searchsorted(numbers, observed[:, 2]) % len(numbers)
+            keypoints = observed[:, :2] * (file.width / camera.width, file.height / camera.height)
+            tracks = np.hstack([keypoints, self.table.position[at]])[numbers[at] == observed[:, 2]]
+        return replace(view, tracks=tracks)
 
     def points(self) -> PointCloud | None:
         """The reliable points, or all where only a few are reliable; None without any."""
-        if not self.point_file.is_file():
+        if (points := self.table) is None:
             return None
-        points = read_points(self.point_file)
         good = (points.views >= MIN_VIEWS) & (points.error <= MAX_ERROR)
         if np.count_nonzero(good) < MIN_POINTS:
             good[:] = True

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.poses import MITSUBA_FROM_OPENCV
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import write_bytes
 
@@ -34,6 +35,7 @@ MODELS: dict[str, tuple[int, str]] = {
 """Camera models whose distortion can be undone: number in binary files, parameters in their order."""
 TEST_LIST = "test.txt"  # beside the model: names of the test views, one per line, as 3DGS reads it
 MAX_NAME = 4096  # bytes of an image's name; no path is longer
+OBSERVED = 500  # keypoints of an image that are read, evenly spread: enough for a median, and read at once
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Image:
     camera: int
     rotation: np.ndarray  # (3, 3) float64
     translation: np.ndarray  # (3,)
+    observed: np.ndarray  # (K, 3): column and row of keypoints, pixels; numbers of their points
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,7 @@ class Points:
     colour: np.ndarray  # (P, 3) uint8, sRGB-encoded
     error: np.ndarray  # (P,) mean reprojection error, pixels; −1 or 0: unknown
     views: np.ndarray  # (P,) track length: number of images that show it
+    number: np.ndarray  # (P,) by which images name it, ascending
 
 
 class _Cursor:
@@ -130,7 +134,7 @@ def read_cameras(path: Path) -> dict[int, Camera]:
 def read_images(path: Path) -> list[Image]:
     """The images sorted by name; raises InputError for a file that cannot be used."""
     images: dict[str, Image] = {}
-    for name, camera, *pose in _records(path, _binary_images, _text_images):
+    for name, observed, camera, *pose in _records(path, _binary_images, _text_images):
         values = np.array(pose, dtype=np.float64)
         if not (np.abs(values).max() <= MAX_NUMBER and np.linalg.norm(values[:4]) > 0):
             remedy = "remove the image, or reconstruct again"
@@ -138,16 +142,19 @@ def read_images(path: Path) -> list[Image]:
         if name in images:
             raise InputError("the image occurs twice", path, abbreviated(name), "remove one of the two")
         rotation = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()  # COLMAP's w is first
-        images[name] = Image(name, camera, rotation, values[4:])
+        observed = observed[(observed[:, 2] >= 0) & np.isfinite(observed).all(axis=1)]
+        observed = observed[evenly_spread(len(observed), OBSERVED)]
+        images[name] = Image(name, camera, rotation, values[4:], observed)
     return [images[name] for name in sorted(images)]
 
 
 def read_points(path: Path) -> Points:
     """The points with usable numbers; raises InputError for an unusable file."""
-    table = np.array([*_records(path, _binary_points, _text_points)], dtype=np.float64).reshape(-1, 8)
+    table = np.array([*_records(path, _binary_points, _text_points)], dtype=np.float64).reshape(-1, 9)
+    table = table[np.argsort(table[:, 8])]
     table = table[(np.abs(table[:, :3]) <= MAX_NUMBER).all(axis=1)]
     colour = np.clip(table[:, 3:6], 0, 255).astype(np.uint8)
-    return Points(table[:, :3], colour, table[:, 6], table[:, 7].astype(np.int64))
+    return Points(table[:, :3], colour, table[:, 6], table[:, 7].astype(np.int64), table[:, 8])
 
 
 Records = Iterator[tuple[Any, ...]]
@@ -193,8 +200,10 @@ def _text_cameras(lines: Iterator[str]) -> Records:
 def _binary_images(cursor: _Cursor) -> Records:
     for _ in range(cursor.count(73)):
         _, *pose, camera = cursor.take("i7di")
-        yield cursor.name(), camera, *pose
-        cursor.skip(24)  # observations: x, y, number of the point
+        name, count = cursor.name(), cursor.count(24)
+        rows = np.frombuffer(cursor.data, "<f8, <f8, <i8", count, cursor.at)
+        cursor.at += rows.nbytes
+        yield name, np.stack([rows[f"f{i}"] for i in range(3)], axis=-1), camera, *pose
 
 
 def _text_images(lines: Iterator[str]) -> Records:
@@ -202,23 +211,24 @@ def _text_images(lines: Iterator[str]) -> Records:
         _, *pose, camera, name = line.split(maxsplit=9)
         if len(pose) != 7:
             raise ValueError("an image has no pose, camera and name")
-        yield name, int(camera), *map(float, pose)
-        if len(next(lines, "").split()) % 3:  # observations: x, y, number of the point
+        words = next(lines, "").split()
+        if len(words) % 3:
             raise ValueError("an image is not followed by a line of points, which may be empty")
+        yield name, np.array(words, dtype=np.float64).reshape(-1, 3), int(camera), *map(float, pose)
 
 
 def _binary_points(cursor: _Cursor) -> Records:
     for _ in range(cursor.count(51)):
-        _, *numbers = cursor.take("Q3d3Bd")
-        yield *numbers, cursor.skip(8)  # the track: image and index of the observation
+        number, *numbers = cursor.take("Q3d3Bd")
+        yield *numbers, cursor.skip(8), number  # the track: image and index of the observation
 
 
 def _text_points(lines: Iterator[str]) -> Records:
     for line in _without_comments(lines):
-        _, *words = line.split()
+        number, *words = line.split()
         if len(words) < 7:
             raise ValueError("a point has no position, colour and error")
-        yield *map(float, words[:7]), len(words[7:]) // 2
+        yield *map(float, words[:7]), len(words[7:]) // 2, float(number)
 
 
 def _without_comments(lines: Iterator[str]) -> Iterator[str]:

@@ -172,6 +172,7 @@ class Dataset:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # subtracted from all positions of the files
     unknown: PixelRays | None = None  # pixels whose depth stereo has not found; None: it has not been tried
     downscale: int = 1  # side of the blocks of pixels that are averaged
+    source: Path | None = None  # the file that lists the views
 
     @staticmethod
     def from_mitsuba(scene: Any, sensors: Any = None, **options: Any) -> Dataset:
@@ -281,7 +282,7 @@ def read_dataset(
         notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
     colour, about = np.full(3, options.background, dtype=np.float32), (points, region, notes, (x, y, z))
     known = (colour, images == "exr", found.environment, *about)
-    return Dataset(path, split, views, *known, downscale=options.downscale)
+    return Dataset(path, split, views, *known, downscale=options.downscale, source=found.source)
 
 
 def require_no_data(path: Path) -> None:
@@ -323,4 +324,5 @@ def _offset(views: tuple[View, ...]) -> np.ndarray:
 def _moved(view: View, offset: np.ndarray) -> View:
     to_world = view.to_world.copy()
     to_world[:3, 3] -= offset
-    return replace(view, to_world=to_world)
+    tracks = None if view.tracks is None else view.tracks - [0, 0, *offset]
+    return replace(view, to_world=to_world, tracks=tracks)

@@ -2,37 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
-from mi_refgs.data.dataset import Dataset, read_dataset, reader_of
-from mi_refgs.errors import InputError, counted
+from mi_refgs.data.checks import ALIKE, FINE, SAID, examine
+from mi_refgs.data.dataset import read_dataset, reader_of
+from mi_refgs.data.images import IMAGES, MASKS
+from mi_refgs.data.view import View
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import read_bytes, write_png
 
-SMALL = 64 * 64  # pixels of the first image as it is read
-FEW_VIEWS = 20  # number of training views below which surfels overfit; published scenes have 100 and more
-ONE_PLACE = 1e-4  # distance of cameras in one place from their mean, over that from the origin or the points
+PIXELS = 400 * 400  # of the first image at most, as the preset "standard" reads it
 
 
 def survey(folder: Path) -> dict[str, Any]:
-    """Survey a data set, reading small images."""
-    train = read_dataset(folder, "train", pixels=SMALL, truth=False)
+    """Survey the views of a data set in images about as large as a fit reads them."""
+    train = read_dataset(folder, "train", pixels=PIXELS, truth=False)
+    if train.downscale > 1:  # JPEG files are decoded smaller by a power of two, in a tenth of the time
+        train = read_dataset(folder, "train", downscale=1 << (train.downscale - 1).bit_length(), truth=False)
     first = train.views[0].file or train.views[0]
-    notes, views = [*train.notes], [*train.views]
+    findings, notes, views = examine(train), [*train.notes], [*train.views]
     try:
         views += read_dataset(folder, "test", downscale=train.downscale, truth=False).views
     except InputError as error:
         notes.append(f"no test views ({error})")
-    for view in views:
-        view.load()  # refuses broken files
+    with ThreadPoolExecutor() as pool:
+        deque(pool.map(View.load, views), 0)  # refuses broken files
     with_alpha = sum(view.has_alpha for view in views)
-    try:
-        require_several_sides(train)
-    except InputError as error:
-        notes.append(error.advice)
-    if len(train.views) > 1 and (few := few_views(len(train.views))):
-        notes.append(few)
+    notes += [finding.error.advice for finding in findings if finding.level != FINE]
     if not with_alpha:
         notes.append("no alpha: the background is fitted, too; masks would leave it out")
         if train.region is None:
@@ -52,30 +55,37 @@ def survey(folder: Path) -> dict[str, Any]:
         "points": len(train.points.position) if train.points else 0,  # to start from
         "environment map": train.environment is not None,
         "region": None if train.region is None else train.region.content,
+        "checks": {finding.name: finding.numbers for finding in findings},
         "notes": notes,
     }
 
 
+def write_masks(folder: Path, found: dict[str, Any]) -> int:
+    """Write masks of images with a constant background by their survey, without the pixels that mix it with
+    the object; returns their number. Raises InputError for other images, and for a folder that has masks."""
+    background = found["checks"].get("background", {})
+    if background.get("result") != SAID:
+        raise InputError("no constant background", folder, "--masks", "segment the object by another program")
+    files = list[Path]()
+    for split in ("train", "test"):
+        with contextlib.suppress(InputError):
+            files += [v.file.path for v in read_dataset(folder, split, truth=False).views if v.file]
+    named = [file.relative_to(folder).parts for file in files]
+    names = [Path(*parts[parts[0].startswith(IMAGES) :]).with_suffix(".png") for parts in named]
+    if (masks := folder / MASKS).exists():
+        raise InputError("exists", masks, "--masks", "remove it")
+    for file, name in zip(files, names, strict=True):
+        pixels = np.pad(read_bytes(file)[0][..., :3], ((1, 1), (1, 1), (0, 0)), mode="edge").astype(np.int16)
+        alike = (abs(pixels - background["colour"]) <= 255 * ALIKE).all(axis=-1)
+        alike[[0, -1]], alike[:, [0, -1]] = True, True
+        label = ndimage.label(alike)[0]
+        write_png(masks / name, ~ndimage.binary_dilation(label == label[0, 0])[1:-1, 1:-1])
+    return len(files)
+
+
 def survey_text(found: dict[str, Any]) -> str:
     """A survey as text, one line per item, notes last."""
-    lines = [f"{name:<16}{value}" for name, value in found.items() if name != "notes"]
+    lines = [f"{name:<16}{value}" for name, value in found.items() if name not in ("checks", "notes")]
+    for name, numbers in found["checks"].items():
+        lines.append(f"{name:<16}{', '.join(f'{key} {value}' for key, value in numbers.items())}")
     return "\n".join([*lines, *(f"NOTE: {note}" for note in found["notes"])])
-
-
-def few_views(count: int) -> str | None:
-    """A note if there are few training views, else None."""
-    views = counted(count, "training view")
-    return f"only {views}; other views may look wrong" if count < FEW_VIEWS else None
-
-
-def require_several_sides(data: Dataset) -> None:
-    """Raise InputError if all views are in one place, which leaves the shape undetermined."""
-    origins = np.array([view.to_world[:3, 3] for view in data.views])
-    middle = origins.mean(axis=0)
-    spread = np.linalg.norm(origins - middle, axis=1).max()
-    scale = float(np.abs(origins).max())
-    if data.points is not None:
-        scale = max(scale, float(np.median(np.linalg.norm(data.points.position - middle, axis=1))))
-    if spread <= ONE_PLACE * scale:
-        views = "a single training view shows" if len(origins) == 1 else "training views in one place show"
-        raise InputError(f"{views} no shape", data.path, "cameras", "add images from other sides")

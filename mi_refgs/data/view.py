@@ -52,6 +52,8 @@ class View:
     that the others describe."""
     near: float = 0.0  # depth of the near plane, scene units; `read_dataset` derives it from all cameras
     file: FileCamera | None = None  # from which the image was read
+    tracks: np.ndarray | None = field(default=None, repr=False)
+    """(K, 5) column and row of keypoints in pixels of that file, 0 at its corner, and their points, world."""
 
     def load(self) -> View:
         """The view with its image decoded; raises InputError for an unreadable file or another size."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
+from mi_refgs.data import checks
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.object_region import (
     DENSE,
@@ -23,7 +24,6 @@ from mi_refgs.data.object_region import (
 )
 from mi_refgs.data.region import REGION_FILE, region_pixels
 from mi_refgs.data.stereo import stereo
-from mi_refgs.data.survey import few_views, require_several_sides
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.decide import HOLDOUT, as_decided, differences, waiting
 from mi_refgs.fitting.per_view import camera_of, gains_of
@@ -53,6 +53,7 @@ class Choice:
     preset: str | None = None  # "standard" by default
     settings: Settings = ()
     purpose: str | None = None  # `about.purpose` of the method, in place of a name
+    force: bool = False  # fit also what `checks` refuse
 
     def __post_init__(self) -> None:
         if isinstance(self.method, Method) and (self.preset or self.settings):
@@ -107,15 +108,13 @@ def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, pro
         run.require_none()
         method, views = chosen(data, choice, progress.say)
         method.require_registered()
-    if note := few_views(len(views.views)):
-        progress.warn(f"{views.path}: {note}")
     if not views.has_alpha and (method.surroundings is None or views.region is None):
         what = "surfels start at random, and model the background too"
         progress.warn(f"{views.path}: images without alpha: {what}")
     with run.alone():
         if not resume:  # asked again: another process may have begun a run while the data was read
             run.require_none()
-        return _fit(method, views, run, progress)
+        return _fit(method, views, run, progress, choice.force)
 
 
 def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> tuple[Method, Dataset]:
@@ -140,10 +139,10 @@ def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:
     return name if views.has_alpha or views.region is None else method.about.without_alpha or name
 
 
-def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Trainer:
+def _fit(method: Method, views: Dataset, run: Run, progress: Progress, force: bool) -> Trainer:
     """Train to the last iteration and write the artefacts, with the run locked."""
     output, resumed = run.path, run.exists()
-    trainer = begin(method, views, run, progress.say, progress.warn)
+    trainer = begin(method, views, run, progress.say, progress.warn, force)
     if resumed:
         # Commands that follow read the data set of the last fit.
         before = run.dataset()
@@ -176,23 +175,30 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress) -> Traine
 
 
 def begin(
-    method: Method, views: Dataset, run: Run, tell: Tell = lambda _: None, warn: Tell = lambda _: None
+    method: Method,
+    views: Dataset,
+    run: Run,
+    tell: Tell = lambda _: None,
+    warn: Tell = lambda _: None,
+    force: bool = False,
 ) -> Trainer:
     """Create a trainer that writes into `run`, from its newest checkpoint if the folder contains a run.
 
-    `tell` is called with what is found and decided, `warn` with steps that failed. Raises InputError for
-    cameras that are all in one place, damaged checkpoints, and a folder that cannot be written.
+    `tell` is called with what is found and decided, `warn` with steps that failed and what `checks` find.
+    Raises InputError for data that they refuse unless `force`, damaged checkpoints, and a folder that cannot
+    be written.
     """
     resumed = run.exists()
     views = with_region(views, run.region(), tell)
-    state = run.load_checkpoint() if resumed else None
+    state, found = run.load_checkpoint() if resumed else None, list[checks.Finding]()
     if resumed and state is None and (run.path / MODEL).is_file():
         what = "none, but a scene that was edited, imported or copied, which a fit would replace"
         raise InputError(what, run.path, "checkpoints", "choose another -o")
     if state is not None:
         method = as_decided(method, decisions_of(state))
     else:
-        require_several_sides(views)
+        found = checks.examine(views)
+        checks.heed(found, warn, force)
         for note in views.notes:
             tell(f"{views.path}: {note}")
         views, surfaces = _with_stereo(views, tell)
@@ -203,6 +209,7 @@ def begin(
         run.rewind(trainer.iteration)
     else:
         run.create(trainer.method, views.folder, views.region)
+        run.write_json("checks.json", {one.name: one.numbers for one in found})
         if len(views.views) < HOLDOUT and (names := waiting(trainer)):
             few = f"{len(views.views)} views: too few to hold some out"
             tell(f"{views.path}: {few}, so {' and '.join(names)} are not decided")

@@ -35,6 +35,7 @@ def fit(
     light_fixed: bool = False,
     output: str | Path | None = None,
     resume: bool = False,
+    force: bool = False,
     progress: bool | Progress = True,
 ) -> Reconstruction:
     """Fit surfels, materials and an environment map to the images in folder `data`, as `refgs train` does.
@@ -55,7 +56,8 @@ def fit(
 
     output: the run folder. Without one a temporary folder is used, which is removed with the last
     `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`;
-    other arguments are those that it was started with, or absent. progress: True shows messages and a bar on
+    other arguments are those that it was started with, or absent. force: fit data that the checks before a
+    fit refuse, such as cameras that contradict their points. progress: True shows messages and a bar on
     standard error, False only Python's warnings; a `Progress` is called after each step.
 
     Raises InputError for bad input, and KeyboardInterrupt with a message that says where the checkpoints are.
@@ -74,7 +76,7 @@ def fit(
         folder = source.path if isinstance(source, Dataset) else source
         settings = [*_light_settings(light, light_fixed, folder), *methods.assignments(settings)]
         named = str(method) if isinstance(method, Path) else method
-        choice = runner.Choice(named, preset, settings, purpose)
+        choice = runner.Choice(named, preset, settings, purpose, force)
         runner.fit(source, Path(output), choice, resume=resume, progress=listener)
     except KeyboardInterrupt:
         if temporary is not None:

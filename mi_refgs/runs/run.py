@@ -1,8 +1,8 @@
 """The run folder: readable by other programs, written atomically, resumable.
 
-config.toml  dataset.json  metrics.jsonl  checkpoints/  previews/      written during the fit
-surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json               by `runs.export`
-metrics.json  contact_sheet.png  eval/                                 by `evaluation`
+config.toml  dataset.json  checks.json  metrics.jsonl  checkpoints/  previews/  written during the fit
+surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json                        by `runs.export`
+metrics.json  contact_sheet.png  eval/                                          by `evaluation`
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from tests.helpers import refused
 from tests.scenes.layouts import change_transforms, write_colmap
 from tests.scenes.tiny import train_command, write_data, write_method
 
-FEW = "only 5 training views; other views may look wrong"
+FEW = "only 5 training views; other views may look wrong; add images"
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -30,7 +30,7 @@ def test_survey_of_complete_data_set(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert found["layout"] == "Blender, NeRF, nerfstudio"
     assert (found["training views"], found["test views"], found["with alpha"]) == (5, 2, 7)
     assert (found["size"], found["sizes"], found["points"], found["region"]) == ([20, 20], 1, 0, None)
-    assert found["environment map"] and found["notes"] == [FEW]
+    assert found["environment map"] and FEW in found["notes"]
     text = said(capsys, str(data))
     assert "test views      2\n" in text and f"NOTE: {FEW}" in text
     assert json.loads(said(capsys, str(data), "--json")) == found
@@ -50,20 +50,23 @@ def test_survey_refuses_other_folders(tmp_path: Path) -> None:
     refused(["doctor", tmp_path], "no layout is recognised", "transforms_train.json")
 
 
-@pytest.mark.parametrize(
-    ("count", "words"), [(1, "a single training view shows no shape"), (3, "in one place show no shape")]
-)
+@pytest.mark.parametrize("count", [1, 3])
 def test_cameras_in_one_place_are_refused(
-    count: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Named before anything is computed, with the exit code of bad input."""
+    words = "in one place show no shape"
     data = write_data(tmp_path / "ball", views=count, truth=False)
     same = {"transform_matrix": np.eye(4).tolist()}
     change_transforms(data, lambda made: [frame.update(same) for frame in made["frames"]], "train")
     assert words in said(capsys, str(data))
     assert main(train_command(data, tmp_path / "run", write_method(tmp_path))) == 2
     error = capsys.readouterr().err
-    assert f"{data}: cameras: " in error and words in error and not (tmp_path / "run").exists()
+    assert (
+        f"{data}/transforms_train.json: cameras: " in error
+        and words in error
+        and not (tmp_path / "run").exists()
+    )
 
 
 def test_images_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

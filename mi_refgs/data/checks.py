@@ -1,0 +1,239 @@
+"""What is looked at before the first step of a fit, and by `refgs doctor DATA`: cameras are compared with
+points, images with those of neighbouring cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.images import CACHE_BYTES
+from mi_refgs.data.region import region_of
+from mi_refgs.data.view import View, evenly_spread
+from mi_refgs.errors import InputError
+from mi_refgs.io.images import linear_from_srgb
+
+FINE, SAID, REFUSED = LEVELS = "fine", "said", "refused"
+FEW_VIEWS = 20  # number of training views below which surfels overfit; published scenes have 100 and more
+ONE_PLACE = 1e-4  # distance of cameras in one place from their mean, over that from the origin or the points
+KEYPOINTS = 20  # in all, and of a view, from which a median is more than chance
+FAR, TOO_FAR = 2.0, 8.0  # pixels of the file from a keypoint; COLMAP keeps 4 at most
+WHOLE = 400  # longer side of a file, pixels, below which both are less in proportion: fits read about as many
+OFF_VIEWS = 0.1  # share of views too far off from which a fit is refused: it would make fog of the scene
+AHEAD, HALF, CLOUD = 0.95, 0.5, 0.25  # shares in front: of keypoints all are; at random, and in a room, half
+STRETCHED, OFF_CENTRE = 0.05, 0.2  # fx / fy − 1, and distance from the centre over the size; lenses have 0.02
+STOPS = 1.0  # 90 % range of brightness against neighbours; up to 0.7 in sets of one exposure
+SHARP = 0.25  # of the neighbours' variance of the Laplacian; 0.5 in sharp sets, 0.1 at a blur of σ = 1 pixel
+OVERLAP, COSINE = 0.1, 0.5  # share of its points that another view shows, and of the angle of the two, 60°
+ALIKE, CONSTANT = 4 / 255, 0.9  # difference of colours of one background; share of the border that is it
+POINTS, NEIGHBOURS = 2_000, 4  # points of a scene that are projected; views with which one is compared
+IMAGES, PIXELS = 200, 150  # images that are looked at, and samples along their shorter side, at most
+
+
+@dataclass(frozen=True)
+class Finding:
+    name: str
+    level: str  # of LEVELS
+    numbers: dict[str, Any]  # for JSON
+    error: InputError  # what is odd, likely causes and the remedy
+
+
+def examine(data: Dataset) -> list[Finding]:
+    """What CHECKS find in training views, whose images are decoded into the cache of the data set."""
+    sight, found = Sight(data), list[Finding]()
+    for name, measure, sentence in CHECKS:
+        if (measured := measure(sight)) is not None:
+            numbers = {k: float(f"{x:.3g}") if isinstance(x, float) else x for k, x in measured[0].items()}
+            level, odd = LEVELS[measured[1]], [view.name for view in measured[2]]
+            which = f"{len(odd)} of {len(data.views)} views, such as '{odd[0]}'," if odd else "all views"
+            what = sentence.format(which=which, **numbers) + "; --force fits them" * (level == REFUSED)
+            error = InputError(what, data.source or data.path, name)
+            found.append(Finding(name, level, numbers | {"views": odd, "result": level}, error))
+    return found
+
+
+def heed(found: Sequence[Finding], warn: Callable[[str], None], force: bool) -> None:
+    """Warn of what is odd; raises InputError for what no fit can use, unless forced."""
+    for one in sorted(found, key=lambda one: one.level != REFUSED):
+        if one.level == REFUSED and not force:
+            raise one.error
+        if one.level != FINE:
+            warn(str(one.error))
+
+
+class _Look(NamedTuple):
+    """What is seen of one image, as displayed."""
+
+    view: View
+    sharpness: float  # log2 of the variance of the Laplacian over the squared mean
+    brightness: float  # log2 of the mean linear colour of what is covered; both are NaN if nothing is
+    border: np.ndarray  # (N, 3)
+
+
+def _look(view: View) -> _Look:
+    loaded, step = view.load(), max(min(view.width, view.height) // PIXELS, 1)
+    image, weight = loaded.displayed, loaded.covered()[::step, ::step]
+    grey = np.clip(image[..., 1], 0, 1)
+    bend = grey[1:-1, 1:-1] * 4 - grey[1:-1, :-2] - grey[1:-1, 2:] - grey[:-2, 1:-1] - grey[2:, 1:-1]
+    colour = linear_from_srgb(np.clip(image[::step, ::step], 0, 1)).mean(axis=-1)
+    sharp = bend.var() / max(grey.mean() ** 2, 1e-6) if weight.any() else np.nan
+    bright = np.average(colour, weights=weight) if weight.any() else np.nan
+    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])[::step]
+    return _Look(view, float(np.log2(sharp + 1e-12)), float(np.log2(bright + 1e-6)), border)
+
+
+Measured = tuple[dict[str, Any], int, Sequence[View]]  # numbers, index of LEVELS, and the views that are odd
+
+
+class Sight:
+    """The training views, what several checks need of them, and the checks; None: nothing to measure."""
+
+    def __init__(self, data: Dataset) -> None:
+        self.data, self.views = data, data.views
+        poses = np.array([view.to_world for view in data.views])
+        self.origins, self.axes = poses[:, :3, 3], poses[:, :3, 2]
+
+    @cached_property
+    def points(self) -> np.ndarray | None:
+        """Some points (P, 3) of the scene: those of the data, or on a sphere that the cameras look at."""
+        if self.data.points is not None:
+            return self.data.points.position[evenly_spread(len(self.data.points.position), POINTS)]
+        try:
+            region = self.data.region or region_of(self.views)
+        except InputError:
+            return None
+        offset = np.random.default_rng(0).normal(size=(POINTS, 3))
+        return region.centre + region.radius * offset / np.linalg.norm(offset, axis=1)[:, None]
+
+    @cached_property
+    def shown(self) -> np.ndarray | None:
+        """(V, P) whether a view shows a point."""
+        return None if self.points is None else np.array([v.project(self.points)[2] for v in self.views])
+
+    @cached_property
+    def tracks(self) -> list[tuple[View, np.ndarray]]:
+        """Views with the distances (K,) of points from keypoints, pixels; NaN behind the camera."""
+        found = list[tuple[View, np.ndarray]]()
+        for view in self.views:
+            if view.tracks is not None and view.file is not None:
+                local = (view.tracks[:, 2:] - view.to_world[:3, 3]) @ view.to_world[:3, :3]
+                (fx, fy, cx, cy), lens = view.file.intrinsics, view.file.lens
+                with np.errstate(over="ignore", invalid="ignore"):  # a lens is anything far out of the image
+                    x, y = -local[:, :2].T / np.where(local[:, 2] > 0, local[:, 2], np.nan)
+                    x, y = (x, y) if lens is None else lens.distort(x, y)
+                    off = np.stack([fx * x + cx, fy * y + cy]) - view.tracks[:, :2].T
+                found.append((view, np.hypot(*off)))
+        return found
+
+    @cached_property
+    def looks(self) -> list[_Look]:
+        """Of as many images as the cache holds at once, so that a fit does not decode them again."""
+        held = CACHE_BYTES // (16 * max(view.width * view.height for view in self.views))
+        with ThreadPoolExecutor() as pool:
+            chosen = evenly_spread(len(self.views), max(min(IMAGES, held), 1))
+            return [*pool.map(_look, [self.views[i] for i in chosen])]
+
+    def beside(self, name: str) -> tuple[list[View], np.ndarray]:
+        """Views, and how a number of their `looks` differs from the median of their neighbours, (L,)."""
+        looks = [look for look in self.looks if np.isfinite(getattr(look, name))]
+        if len(looks) <= 2 * NEIGHBOURS:
+            return [], np.empty(0)
+        values, views = np.array([getattr(look, name) for look in looks]), [look.view for look in looks]
+        place = [[*v.to_world[:3, 3] / self.data.scene_extent, *v.to_world[:3, 2]] for v in views]
+        near = np.argsort(cdist(place, place), axis=1)[:, 1 : 1 + NEIGHBOURS]
+        return views, values - np.median(values[near], axis=1)
+
+    def one_place(self) -> Measured:
+        middle, scale = self.origins.mean(axis=0), float(np.abs(self.origins).max())
+        spread = float(np.linalg.norm(self.origins - middle, axis=1).max())
+        if self.data.points is not None:
+            scale = max(scale, float(np.median(np.linalg.norm(self.data.points.position - middle, axis=1))))
+        return {"spread": spread}, 2 * (spread <= ONE_PLACE * scale), ()
+
+    def few(self) -> Measured:
+        return {"count": len(self.views)}, len(self.views) < FEW_VIEWS, ()
+
+    def ahead(self) -> Measured | None:
+        if self.tracks:
+            share = 1 - float(np.isnan(np.concatenate([distance for _, distance in self.tracks])).mean())
+            return {"share": share}, (share < AHEAD) + (share < HALF), ()
+        if self.data.points is None or self.points is None:
+            return None
+        share = float(np.median([np.mean(view.depth_of(self.points) > 0) for view in self.views]))
+        return {"share": share}, share < CLOUD, ()
+
+    def keypoints(self) -> Measured | None:
+        found = [(view, distance[np.isfinite(distance)]) for view, distance in self.tracks]
+        every = np.concatenate([np.empty(0), *(distance for _, distance in found)])
+        if len(every) < KEYPOINTS or (file := found[0][0].file) is None:
+            return None
+        median, p90 = np.quantile(every, (0.5, 0.9)).tolist()
+        of_views = {view: float(np.median(d)) for view, d in found if len(d) >= KEYPOINTS}
+        typical = max(median, float(np.quantile([median, *of_views.values()], 1 - OFF_VIEWS)))
+        unit, worst = min(max(file.width, file.height) / WHOLE, 1), max([median, *of_views.values()])
+        level = 2 if typical > TOO_FAR * unit else int(max(typical / FAR, worst / TOO_FAR) > unit)
+        numbers = {"median": median, "p90": p90, "worst": worst, "size": f"{file.width} × {file.height}"}
+        return numbers, level, [view for view, one in of_views.items() if one > FAR * unit and level]
+
+    def aimless(self) -> Measured:
+        odd = {look.view.name for look in self.looks if np.isnan(look.brightness)}
+        if self.shown is not None:
+            odd |= {self.views[i].name for i in np.flatnonzero(~self.shown.any(axis=1))}
+        return {}, len(odd) > 0, [view for view in self.views if view.name in odd]
+
+    def shape(self) -> Measured:
+        given = [(v.fx / v.fy, v.cx / v.width + 0.5, v.cy / v.height + 0.5) for v in self.views]
+        odd = abs(np.array(given) - 1) > (STRETCHED, OFF_CENTRE, OFF_CENTRE)
+        stretch, *centre = abs(np.array(given) - 1).max(axis=0).tolist()
+        views = [self.views[i] for i in np.flatnonzero(odd.any(axis=1))]
+        return {"stretch": stretch, "offset": max(centre)}, len(views) > 0, views
+
+    def exposure(self) -> Measured | None:
+        views, stops = self.beside("brightness")
+        spread = float(np.subtract(*np.quantile(stops, (0.95, 0.05)))) if views else 0.0
+        return ({"stops": spread}, spread > STOPS, ()) if views else None
+
+    def blur(self) -> Measured | None:
+        views, sharp = self.beside("sharpness")
+        odd = [views[i] for i in np.flatnonzero(2**sharp < SHARP)]
+        return ({"least": float(2 ** sharp.min())}, len(odd) > 0, odd) if views else None
+
+    def overlap(self) -> Measured | None:
+        if self.shown is None or len(self.views) < 2:
+            return None
+        shown = self.shown.astype(np.float32)
+        share = shown @ shown.T / np.maximum(shown.sum(axis=1), 1)[:, None]
+        share[(self.axes @ self.axes.T < COSINE) | np.eye(len(share), dtype=bool)] = 0
+        odd = [self.views[i] for i in np.flatnonzero((share.max(axis=1) < OVERLAP) & self.shown.any(axis=1))]
+        return {"least": float(share.max(axis=1).min())}, len(odd) > 0, odd
+
+    def background(self) -> Measured | None:
+        if self.data.has_alpha:
+            return None
+        border = np.concatenate([look.border for look in self.looks])
+        colour = np.median(border, axis=0)
+        share = float(np.mean((abs(border - colour) <= ALIKE).all(axis=-1)))
+        return {"share": share, "colour": (255 * colour).round().tolist()}, share >= CONSTANT, ()
+
+
+WRONG = "another model's images file; images turned by EXIF, resized or cropped"
+CHECKS: tuple[tuple[str, Callable[[Sight], Measured | None], str], ...] = (
+    ("cameras", Sight.one_place, "{which} in one place show no shape; add images from other sides"),
+    ("views", Sight.few, "only {count} training views; other views may look wrong; add images"),
+    ("points", Sight.ahead, "{share:.0%} are in front of their cameras; correct the axes of the poses"),
+    ("keypoints", Sight.keypoints, "points project {median} pixels (median; 90 %: {p90}) from them in images "
+     f"of {{size}}; {{which}} are off by up to {{worst}} ({WRONG}?); use files of one model"),
+    ("frusta", Sight.aimless, "{which} show no point and no object; correct or leave them out"),
+    ("shape", Sight.shape, "{which} are stretched by {stretch:.0%}, or cropped, {offset:.0%} off-centre"),
+    ("exposure", Sight.exposure, "neighbours differ by {stops} stops; fit gains: --set event.exposure={{}}"),
+    ("blur", Sight.blur, "{which} are blurred: {least:.0%} as sharp as neighbours; leave them out"),
+    ("overlap", Sight.overlap, "{which} share nearly nothing with others; add images between them"),
+    ("background", Sight.background, "{share:.0%} of the border is {colour}; doctor --masks cuts it out"),
+)  # fmt: skip
+"""Name, function and sentence of each check, in the order in which they are reported."""
