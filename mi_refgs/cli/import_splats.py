@@ -26,7 +26,7 @@ class Import:
       refgs import point_cloud.ply -o runs/vase --relightable --preset quick
     """
 
-    file: Annotated[Positional[Path], arg(metavar="FILE.ply")]  # 3D Gaussians or surfels of any SH degree
+    file: Annotated[Positional[Path], arg(metavar="FILE.ply")]  # 3D Gaussians or surfels
     output: Output  # new run folder
     camera: Cameras = None
     """cameras of scene.xml, with --relightable of the views, in the form of transforms.json (default: around
@@ -34,6 +34,8 @@ class Import:
     linear: Flag = False  # colours are linear radiance, as fitted by this program (default: display-encoded)
     box: Annotated[Sequence[float] | None, optional("X0 Y0 Z0 X1 Y1 Z1", constructor=Six)] = None
     """import only what has its centre in this axis-aligned box"""
+    envmap: Annotated[Path | None, optional("FILE")] = None
+    """light of a file with materials, as Ref-Gaussian writes it: a lat-long map, first row towards +z"""
     relightable: Flag = False
     """render views from all around and fit materials, an environment map and a mesh to them"""
     purpose: Annotated[str | None, optional("{photographs,relighting}", name="for")] = None
@@ -46,6 +48,8 @@ class Import:
         given = {"--for": self.purpose, "--preset": self.preset}
         for option in (name for name, value in given.items() if value and not self.relightable):
             raise InputError("only a relightable import is fitted", option, remedy="add --relightable")
+        if self.envmap is not None and self.relightable:
+            raise InputError("the fit finds the light", "--envmap", remedy="leave it out")
         from mi_refgs.formats.cameras import read_cameras
 
         cameras = None if self.camera is None else read_cameras(self.camera)
@@ -57,7 +61,7 @@ class Import:
         from mi_refgs.runs.run import Run
 
         Run(self.output).require_none()
-        made = import_splats(self.file, linear=self.linear, box=self.box)
+        made = import_splats(self.file, linear=self.linear, box=self.box, light=self.envmap)
         cameras = made.cameras() if cameras is None else cameras
         files = save(made.trained, self.output, made.method, cameras[0], more=cameras[1:])
         surfels = made.trained.surfels

@@ -11,7 +11,7 @@ _SAMPLES = Option("samples", 4, "samples per pixel of an EXR file, box filtered:
 
 _SPLATS, _MESH = (_DEGREE, _OBJECT), ((_FACES, _TEXTURE), "export")
 for _name, _summary, _suffix, _write, *_more in (
-    ("3dgs-ply", "3D Gaussians with baked colours, for viewers", ".ply", "gaussian_ply:write", _SPLATS),
+    ("3dgs-ply", "3D Gaussians with baked colours, for viewers", ".ply", "gaussians:write_ply", _SPLATS),
     ("gltf-splats", "the same in glTF (KHR_gaussian_splatting)", ".glb", "gltf:write_gaussians", _SPLATS),
     ("gltf-mesh", "glTF: a mesh with metallic-roughness textures", ".glb", "gltf:write_mesh", *_MESH),
     ("mitsuba", "a folder for plain Mitsuba: a textured mesh, envmap", "", "mitsuba_scene:write", *_MESH),

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mi_refgs.data.colmap_model import write_model
 from mi_refgs.data.lens import COEFFICIENTS
-from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
+from mi_refgs.data.poses import MITSUBA_FROM_OPENCV, MITSUBA_FROM_OPENGL
 from mi_refgs.data.transforms import Frame
 from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
-from mi_refgs.io.files import make_folder, write_json
+from mi_refgs.io.files import make_folder, read_any_json, write_json
 from mi_refgs.io.images import ENDINGS
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
@@ -80,13 +82,29 @@ def _file(shot: Shot) -> FileCamera:
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Read the pinhole cameras of a transforms.json; its images are not read. Keys as in `data.transforms`,
-    and near (depth of the near plane, 0 by default). Raises InputError for a file without sizes, focal
-    lengths or poses, and for another lens."""
-    frames = Frame.all_of(path)
+    """Read the pinhole cameras of a transforms.json, or of the cameras.json of 3DGS, a list; images are not
+    read. Keys as in `data.transforms`, and near (depth of the near plane, 0 by default). Raises InputError
+    for a file without sizes, focal lengths or poses, and for another lens."""
+    content = read_any_json(path)
+    listed = isinstance(content, list)
+    frames = [_listed(path, *pair) for pair in enumerate(content)] if listed else Frame.all_of(path)
     if not frames:
         raise InputError("empty", path, "frames", "add one entry for each camera")
     return [_camera(frame) for frame in frames]
+
+
+def _listed(path: Path, index: int, entry: Any) -> Frame:
+    """A camera of 3DGS: camera-to-world rotation of OpenCV's axes, position, and pixels."""
+    pose = np.eye(4)
+    try:
+        pose[:3, :3], pose[:3, 3] = entry["rotation"], entry["position"]
+        keys = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
+        own = {key: entry[theirs] for key, theirs in keys.items()}
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        what, remedy = "no camera of 3DGS", "give its cameras.json, or a transforms.json"
+        raise InputError(what, path, f"[{index}]", remedy) from error
+    own["transform_matrix"] = (pose @ MITSUBA_FROM_OPENCV @ MITSUBA_FROM_OPENGL).tolist()
+    return Frame(path, f"[{index}]", own, own)
 
 
 def _camera(frame: Frame) -> Camera:

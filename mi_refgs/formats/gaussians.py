@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -27,12 +28,14 @@ from scipy.spatial import cKDTree
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
+from mi_refgs.io.files import write_bytes
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.splat import Camera, Tables, splat, surfel_count
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
+from mi_refgs.surfels.ply import encode_ply
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
@@ -43,6 +46,18 @@ VIEWS = 64  # maximum number of renders that colours are fitted to
 PIXELS = 400**2  # maximum number of pixels per render: colours need no more, and time grows with it
 STEPS = 3  # conjugate-gradient steps after the first
 DAMPING = 0.1  # λ, over the 1/4π that Y² is on average
+
+
+def write_ply(
+    trained: TrainedScene, target: Path, shots: Sequence[Shot], *, degree: int, object: bool
+) -> list[Path]:
+    """The PLY file of 3D Gaussian Splatting, which its viewers, editors and converters read.
+
+        x y z  nx ny nz  f_dc_0..2  f_rest_0..  opacity  scale_0..2  rot_0..3      little-endian float32
+
+    Logits, logarithms and display-encoded colours, as in `surfels.ply`. The colours are fitted to renders."""
+    write_bytes(target, encode_ply(gaussians(trained, shots, degree, object)))
+    return [target]
 
 
 def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_only: bool) -> Surfels:

@@ -21,6 +21,7 @@ TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp(\.[^.]*)?")  # names of the tem
 ANY_FILE = 2**24  # bytes of pixels that a header of any file may promise
 MAX_EXPANSION = 1100  # bytes of pixels per byte of a larger file: DEFLATE expands by at most 1,032
 MAX_PIXELS = 2**28  # largest number of pixels of an image file: twice those of a 16K panorama
+LFS = b"version https://git-lfs"  # first bytes of what Git leaves in place of a file that was not fetched
 POLL = 0.1  # seconds between two tries to take a lock
 _OWN = threading.local()  # `held`: paths of the locks of this thread
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -148,22 +149,31 @@ def inside(folder: Path, name: object) -> Path | None:
     return folder / parts
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
-    """The object in a JSON file; raises InputError for anything else."""
-    path = Path(path)
+def read_any_json(path: Path) -> Any:
+    """The value in a JSON file; raises InputError for other files."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         what, remedy = f"cannot be read ({error})", "correct it or export it again"
         raise InputError(what, path, "JSON", remedy) from error
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """The object in a JSON file; raises InputError for anything else."""
+    path = Path(path)
+    content = read_any_json(path)
     if not isinstance(content, dict):
         raise InputError("the outermost value is not an object", path, "JSON", "export the file again")
     return content
 
 
 def require_file(path: Path) -> None:
-    """Raise InputError unless this is a file."""
+    """Raise InputError unless this is a file with its content."""
     if is_file(path):
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            if file.read(len(LFS)) == LFS:
+                what = "a Git LFS pointer in place of the file"
+                raise InputError(what, path, "file", "fetch it with `git lfs pull`")
         return
     if os.path.isdir(path):  # unlike Path.is_dir, False for an impossible name
         raise InputError("is a folder", path, "file", "name a file in it")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -10,6 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 from mi_refgs.errors import InputError
+from mi_refgs.io.files import require_file
 from mi_refgs.kernels.memory import PER_PLY_BYTE, require
 
 MAX_HEADER_LINES = 1000  # a header of surfels has 124 lines at most
@@ -21,20 +24,23 @@ TYPES = {
 }
 """NumPy's names of the types, without the byte order."""
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "a"}
+OTHERS = {b"PK": "a zip archive", b"\x1f\x8b": "a gzip file", b"glTF": "a glTF file", b"<": "a web page"}
 
 
 @dataclass(frozen=True)
 class Element:
     name: str
     count: int  # rows
-    fields: list[tuple[str, str]]  # name and TYPES code of the properties that are numbers
-    lists: list[tuple[str, str]]  # name and code of the length of the properties that are lists
+    properties: list[tuple[str, str, str]]  # name, TYPES code, and of a list the code of its length, else ""
+
+    @property
+    def fields(self) -> list[tuple[str, str]]:
+        """Name and code of the properties that are numbers."""
+        return [(name, code) for name, code, length in self.properties if not length]
 
     def row_bytes(self, text: bool) -> int:
         """Smallest size of a row: every list empty; as text, a digit and a space per property."""
-        if text:
-            return 2 * (len(self.fields) + len(self.lists))
-        return sum(int(code[1]) for _, code in (*self.fields, *self.lists))
+        return sum(2 if text else int((length or code)[1]) for _, code, length in self.properties)
 
 
 @dataclass(frozen=True)
@@ -47,8 +53,11 @@ class Header:
 def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or mesh.ply of a run") -> Header:
     """Read the header up to the data. Raises InputError for a file without PLY header (the remedy is to give
     `wanted`) and for a header that promises more rows than the file contains."""
-    if file.readline(MAX_LINE).strip() != b"ply":
-        raise InputError("not a PLY file", path, "header", f"give {wanted}")
+    first = file.readline(MAX_LINE)
+    if first.strip() != b"ply":
+        require_file(path)
+        kind = next((f" but {name}" for magic, name in OTHERS.items() if first.startswith(magic)), "")
+        raise InputError(f"not a PLY file{kind}", path, "header", f"give {wanted}")
     order, comments = "", []
     elements: list[Element] = []
     for _ in range(MAX_HEADER_LINES):
@@ -62,11 +71,11 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
             case ["comment" | "obj_info", *rest]:
                 comments.append(" ".join(rest))
             case ["element", name, count] if count.isdigit() and len(count) < 19:
-                elements.append(Element(name, int(count), [], []))
+                elements.append(Element(name, int(count), []))
             case ["property", kind, name] if elements and kind in TYPES:
-                elements[-1].fields.append((name, TYPES[kind]))
+                elements[-1].properties.append((name, TYPES[kind], ""))
             case ["property", "list", length, kind, name] if elements and {length, kind} <= TYPES.keys():
-                elements[-1].lists.append((name, TYPES[length]))
+                elements[-1].properties.append((name, TYPES[kind], TYPES[length]))
             case ["end_header"]:
                 break
             case _:
@@ -78,7 +87,7 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
         raise InputError("no format or no element", path, "header", "export it again")
     left = os.fstat(file.fileno()).st_size - file.tell()
     for element in elements:
-        names = [name for name, _ in (*element.fields, *element.lists)]
+        names = [name for name, _, _ in element.properties]
         if not names:
             raise InputError(f"{element.name} has no property", path, "header", "export it again")
         if len({*names}) < len(names):
@@ -91,26 +100,52 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
 
 
 def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
-    """The `vertex` element as a structured array. Raises InputError as `read_header` does, and for vertices
-    that are not the first element or have lists."""
-    header = read_header(path, file)
-    vertex, text = header.elements[0], header.order == "a"
-    if vertex.name != "vertex":
-        raise InputError("the vertices must come first", path, vertex.name, "export it as a surfel PLY")
-    if vertex.lists:
-        name, _ = vertex.lists[0]
-        raise InputError("not a number property", path, name, "export the vertices without lists")
-    size = vertex.count * (8 if text else 1) * max(vertex.row_bytes(False), 1)
-    require(PER_PLY_BYTE * size, f"{path}: vertex: {vertex.count:,} rows", "keep fewer of them")
-    if not text:
-        dtype = np.dtype([(name, header.order + code) for name, code in vertex.fields])
-        return np.frombuffer(file.read(vertex.count * dtype.itemsize), dtype=dtype)
-    values = np.empty((vertex.count, len(vertex.fields)))
-    for row in range(vertex.count):
+    """The numbers of the `vertex` element as a structured array (N,). Raises InputError as `read_header`."""
+    return read_rows(path, file, read_header(path, file))
+
+
+def read_rows(path: Path, file: BinaryIO, header: Header) -> np.ndarray:
+    """The same, after the header of the file has been read; lists and other elements are skipped."""
+    text = header.order == "a"
+    for element in header.elements:
+        if element.name == "vertex":
+            size = element.count * (8 if text else 1) * max(element.row_bytes(False), 1)
+            require(PER_PLY_BYTE * size, f"{path}: vertex: {element.count:,} rows", "keep fewer of them")
+        if text or len(element.fields) < len(element.properties):
+            rows = _parsed(path, file, element, header.order)
+        else:
+            dtype = np.dtype([(name, header.order + code) for name, code in element.fields])
+            rows = np.frombuffer(file.read(element.count * dtype.itemsize), dtype=dtype)
+        if element.name == "vertex":
+            return rows
+    raise InputError("the element is missing", path, "vertex", "export it as a surfel PLY")
+
+
+def _parsed(path: Path, file: BinaryIO, element: Element, order: str) -> np.ndarray:
+    """Rows of an element that is text or has lists, whose numbers are float64."""
+    rows = np.empty(element.count, dtype=[(name, "f8") for name, _ in element.fields])
+    words: Iterator[float] = iter(())
+
+    def take(code: str) -> float:
+        if order == "a":
+            return next(words)
+        return struct.unpack(order + np.dtype(code).char, file.read(int(code[1])))[0]
+
+    for row in range(element.count):
         try:
-            values[row] = [float(word) for word in file.readline().split()]
-        except ValueError as error:
+            words = map(float, file.readline().split() if order == "a" else ())
+            numbers = []
+            for _, code, length in element.properties:
+                if not length:
+                    numbers.append(take(code))
+                elif order == "a":
+                    [next(words) for _ in range(int(take(length)))]
+                else:
+                    file.seek(int(take(length)) * int(code[1]), os.SEEK_CUR)
+            if next(words, None) is not None:
+                raise ValueError("more numbers than properties")
+            rows[row] = (*numbers,)
+        except (ValueError, OverflowError, StopIteration, struct.error, OSError) as error:
             what = f"row {row} is broken or missing"
-            raise InputError(what, path, "vertex", "copy or export the file again") from error
-    dtype = np.dtype([(name, "f8") for name, _ in vertex.fields])
-    return np.ascontiguousarray(values).view(dtype).reshape(vertex.count)
+            raise InputError(what, path, element.name, "copy or export the file again") from error
+    return rows

@@ -24,7 +24,7 @@ from mi_refgs.editing.options import EditOptions, Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
-from mi_refgs.formats.gaussian_ply import method_of, read_splats
+from mi_refgs.formats.splat_import import method_of, read_splats
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import Mesh
@@ -277,16 +277,21 @@ def load(run: str | Path, *, write: bool = True) -> Reconstruction:
 
 
 def import_splats(
-    path: str | Path, *, linear: bool = False, box: Sequence[float] | None = None
+    path: str | Path,
+    *,
+    linear: bool = False,
+    box: Sequence[float] | None = None,
+    light: AnyLight | None = None,
 ) -> Reconstruction:
-    """Read a PLY file of 3DGS or 2DGS into memory, as `refgs import` does; `save` writes the run folder.
+    """Read a splat file of 3DGS or 2DGS into memory, as `refgs import` does; `save` writes the run folder.
 
     linear: its colours are linear radiance, as this package fits them; otherwise they are display-encoded, as
-    3DGS and 2DGS write them. box: two corners (6,); surfels whose centre is outside are left out. It has
-    neither light nor mesh, and its cameras are around the object, z up. Raises InputError for any other file,
-    a box without surfels, and without a supported Mitsuba variant."""
+    3DGS and 2DGS write them. box: two corners (6,); surfels whose centre is outside are left out. light: of a
+    file with materials, such as those of Ref-Gaussian (default: constant). It has no mesh, and its cameras
+    are around the object, z up. Raises InputError for any other file, a box without surfels, a light that
+    changes nothing, and without a supported Mitsuba variant."""
     require_supported_variant("mi_refgs.import_splats")
-    trained = read_splats(Path(path), linear)
+    trained = read_splats(Path(path), linear, None if light is None else any_light(light, False, 0.0, 0.0))
     if box is not None:
         try:
             trained = apply(trained, ~select(trained, Selection(box=box)), cut=True)

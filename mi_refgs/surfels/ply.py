@@ -12,6 +12,7 @@ r, g, b, then all others of r, of g, of b. The column order of a surfel model is
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -33,32 +34,36 @@ def read_ply(path: str | Path) -> Surfels:
             vertices = read_vertices(path, file)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
-    names = vertices.dtype.names or ()
-    arrays = {}
+    return decode_ply(path, {name: vertices[name] for name in vertices.dtype.names or ()})
+
+
+def decode_ply(path: Path, columns: Mapping[str, np.ndarray]) -> Surfels:
+    """Surfels from columns (N,) of a PLY file by name; `path` and errors as in `read_ply`."""
+    names, arrays = (*columns,), {}
     for name, attribute in ATTRIBUTES.items():
         if attribute.harmonics:
             prefix = attribute.properties[0]
             if any(found.startswith(f"{prefix}_") for found in names):
                 degree = _sh_degree(path, names, prefix)
-                arrays[name] = _columns(path, vertices, _sh_properties(prefix, degree))
+                arrays[name] = _columns(path, columns, _sh_properties(prefix, degree))
         elif there := [i for i, found in enumerate(attribute.properties) if found in names]:
             width = min(width for width in attribute.widths if width > max(there))
-            arrays[name] = _columns(path, vertices, attribute.properties[:width])
+            arrays[name] = _columns(path, columns, attribute.properties[:width])
     primitive, missing = nearest_primitive(arrays)
     for name in missing:  # raises InputError that names the property
-        _columns(path, vertices, ATTRIBUTES[name].properties[: primitive.widths[name]])
+        _columns(path, columns, ATTRIBUTES[name].properties[: primitive.widths[name]])
     return Surfels.from_numpy(arrays)
 
 
-def _columns(path: Path, vertices: np.ndarray, properties: tuple[str, ...]) -> np.ndarray:
+def _columns(path: Path, columns: Mapping[str, np.ndarray], properties: tuple[str, ...]) -> np.ndarray:
     """The named properties as an (N, D) float32 array, all present and finite."""
-    table = np.empty((len(vertices), len(properties)), dtype=np.float32)
+    table = np.empty((len(next(iter(columns.values()))), len(properties)), dtype=np.float32)
     for column, name in enumerate(properties):
-        if name not in (vertices.dtype.names or ()):
+        if name not in columns:
             remedy = f"export the file again with all of {', '.join(sorted(properties))}"
             raise InputError("the property is missing", path, name, remedy)
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
-            table[:, column] = vertices[name]
+            table[:, column] = columns[name]
         bad = int(np.count_nonzero(~np.isfinite(table[:, column])))
         if bad:
             remedy = "remove those surfels or export it again"

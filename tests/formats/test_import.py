@@ -15,7 +15,7 @@ from mi_refgs.cli import main
 from mi_refgs.constants import GAUSSIAN_LOW_PASS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.formats.cameras import read_cameras
-from mi_refgs.formats.gaussian_ply import read_splats
+from mi_refgs.formats.splat_import import read_splats
 from mi_refgs.io.exr import read_exr
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import PinholeCamera
