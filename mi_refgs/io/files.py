@@ -170,10 +170,14 @@ def read_json(path: str | Path) -> dict[str, Any]:
 def require_file(path: Path) -> None:
     """Raise InputError unless this is a file with its content."""
     if is_file(path):
-        with contextlib.suppress(OSError), path.open("rb") as file:
-            if file.read(len(LFS)) == LFS:
-                what = "a Git LFS pointer in place of the file"
-                raise InputError(what, path, "file", "fetch it with `git lfs pull`")
+        try:
+            with path.open("rb") as file:
+                pointer = file.read(len(LFS)) == LFS
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
+        if pointer:
+            what = "a Git LFS pointer in place of the file"
+            raise InputError(what, path, "file", "fetch it with `git lfs pull`")
         return
     if os.path.isdir(path):  # unlike Path.is_dir, False for an impossible name
         raise InputError("is a folder", path, "file", "name a file in it")

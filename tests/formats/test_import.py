@@ -117,7 +117,7 @@ def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path) -> None:
     other = mi_refgs.import_splats(theirs, linear=True)
     assert other.trained.shading == Shading("surfel", "radiance")
     assert np.abs(other.render(1, size=32) - picture).max() > 0.05
-    refused(lambda: mi_refgs.import_splats(tmp_path / "no.ply"), "cannot be read")
+    refused(lambda: mi_refgs.import_splats(tmp_path / "no.ply"), "missing")
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -155,9 +155,10 @@ def broken(kind: str, whole: bytes) -> bytes:
         "missing": whole.replace(b"float rot_3\n", b"float other\n"),
         "colourless": header.replace(b"f_dc_", b"a_dc_").replace(b"f_rest_", b"a_rest_") + end + body,
         "materials": whole.replace(b"float nx\n", b"float metallic\n"),
-        "compressed": b"ply\nformat binary_little_endian 1.0\nelement chunk 0\nproperty float min_x\n"
-        b"element vertex 1\nproperty uint packed_position\nproperty uint packed_rotation\nend_header\n"
-        + bytes(8),
+        "anchors": whole.replace(b"float nx\n", b"float f_anchor_feat_0\n"),
+        "zeros": header + end + bytes(len(body)),
+        "points": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar red\nend_header\n0\n",
+        "page": b"<!DOCTYPE html>\n",
         "mesh": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         b"property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n",
         "empty": header.replace(b"vertex 40", b"vertex 0") + end,
@@ -172,7 +173,10 @@ def broken(kind: str, whole: bytes) -> bytes:
         ("missing", "rot_3: the property is missing"),
         ("colourless", "f_dc_0: the property is missing"),
         ("materials", "metallic: materials of a run"),
-        ("compressed", "packed_position: a compressed PLY"),
+        ("anchors", "f_anchor_feat_0: materials of a run, which require its light and shading, or features"),
+        ("zeros", "unusable are 40 of 40 rows: 0 with NaN or infinity, 40 with zero rotation"),
+        ("points", "vertex: points with colours, no Gaussians"),
+        ("page", "not a PLY file but a web page"),
         ("mesh", "vertex: a mesh, no Gaussians"),
         ("empty", "there are none"),
         ("degree", "f_rest_*: 44 properties"),

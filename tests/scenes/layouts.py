@@ -91,7 +91,10 @@ def change_transforms(data: Path, change: Callable[[dict[str, Any]], object], sp
 
 def ply_bytes(columns: dict[str, np.ndarray], kind: str = "binary_little_endian") -> bytes:
     """A PLY file by hand, as another program would write it; properties have the types of the columns."""
-    count, names = len(next(iter(columns.values()))), {"f4": "float", "f8": "double", "u1": "uchar"}
+    count, names = (
+        len(next(iter(columns.values()))),
+        {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"},
+    )
     header = f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {count}\n"
     header += "".join(f"property {names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
     if kind == "ascii":

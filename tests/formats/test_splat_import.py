@@ -1,0 +1,193 @@
+"""Splat files as other programs write them: what is left out, replaced or refused, with the right values."""
+
+from __future__ import annotations
+
+import gzip
+import importlib.util
+import json
+from pathlib import Path
+
+import gaussforge
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refgs.formats.cameras import read_cameras
+from mi_refgs.formats.splat_import import read_splats
+from mi_refgs.io.images import linear_from_srgb, read_png
+from mi_refgs.shade.brdf import split_sum
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light_file import read_radiance
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
+from tests.helpers import refused
+from tests.scenes.layouts import ply_bytes
+from tests.scenes.splat_file import COUNT, ball_columns
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1234\n"
+SIZE, FILTER = np.log(0.06), 0.05  # of the ball's Gaussians; of Mip-Splatting
+FUSED = 0.06**2 + FILTER**2
+
+
+def changed(kind: str) -> dict[str, np.ndarray]:
+    """The columns of the ball as another program writes them."""
+    columns = ball_columns()
+    if kind == "Mip-Splatting":
+        columns["filter_3D"] = np.full(COUNT, FILTER, np.float32)
+    elif kind == "degree 4":
+        columns |= {f"f_rest_{i}": np.full(COUNT, i, np.float32) for i in range(72)}
+    elif kind == "activated":
+        columns |= {f"scale_{i}": np.exp(columns[f"scale_{i}"]) for i in range(3)}
+        columns["opacity"] = sigmoid(columns["opacity"]).astype(np.float32)
+    elif kind == "half floats":
+        columns = {name: column.astype("f2").view("u2") for name, column in columns.items()}
+    elif kind == "8 bits":
+        for i, name in enumerate(("red", "green", "blue")):
+            columns[name] = np.full(COUNT, 51 * i, "u1")
+            del columns[f"f_dc_{i}"]
+    elif kind == "zeros":
+        columns = {name: np.where(np.arange(COUNT) > 0, column, 0) for name, column in columns.items()}
+    return {
+        name: column.astype(np.float32 if column.dtype == float else column.dtype)
+        for name, column in columns.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "words", "attribute", "expected"),
+    [
+        ({"opacity": -np.inf}, "opacity: 1 infinite", "opacity", -20),
+        ({"scale_2": -np.inf}, "scale_2: 1 infinite", "scale", [SIZE, SIZE, -20]),
+        ({"x": np.nan}, "left out 1 of 300 rows: 1 with NaN or infinity, 0", "", None),
+        ({"scale_0": np.inf}, "left out 1 of 300 rows: 1 with NaN", "", None),
+        ("zeros", "left out 1 of 300 rows: 0 with NaN or infinity, 1 with zero rotation", "", None),
+        ("Mip-Splatting", "antialiasing filter", "scale", 0.5 * np.log(FUSED)),
+        ("Mip-Splatting", "", "opacity", logit(sigmoid(4.0) * (0.06**2 / FUSED) ** 1.5)),
+        ("activated", "are activated", "scale", SIZE),
+        ("activated", "", "opacity", 4),
+        ("degree 4", "SH degree 4 is cut to 3", "radiance_sh", 38),  # f_rest_{24 + 14}
+        ("half floats", "", "opacity", 4),
+        ("8 bits", "", "radiance_sh", (0.2 - 0.5) / SH_DC),
+    ],
+)
+def test_splats_of_others_are_read(
+    given: str | dict[str, float],
+    words: str,
+    attribute: str,
+    expected: object,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    columns = changed(given) if isinstance(given, str) else ball_columns(**given)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    raw = read_splats(tmp_path / "a.ply").surfels.to_numpy()
+    assert words in capsys.readouterr().err
+    if attribute:
+        value = (
+            raw[attribute][0, -2] if attribute == "radiance_sh" else raw[attribute][0]
+        )  # the last of green
+        np.testing.assert_allclose(value, expected, atol=1e-4)
+    else:
+        np.testing.assert_array_equal(
+            raw["position"], np.stack([columns[name][1:] for name in "xyz"], axis=1)
+        )
+
+
+@pytest.mark.parametrize(
+    "comment", ["SplatRenderMode: mip", "antialiased 1", "train_flags antialiasing", "default"]
+)
+def test_antialiasing_is_said(comment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for said in (comment, comment.replace("mip", "default").replace("1", "0").replace("aliasing", "")):
+        content = ply_bytes(ball_columns()).replace(b"comment by hand", f"comment {said}".encode())
+        (tmp_path / "a.ply").write_bytes(content)
+        read_splats(tmp_path / "a.ply")
+        assert ("antialiasing filter" in capsys.readouterr().err) == (said == comment != "default")
+
+
+def pixel(path: Path, light: float | None = None, **given: bool) -> np.ndarray:
+    """Radiance (3,) of an opaque surfel at the origin, seen along z."""
+    scene = read_splats(path, light=None if light is None else EnvironmentLight.constant(light), **given)
+    pose = np.eye(4)
+    pose[2, 3] = -3
+    frame = scene.renderer()(Camera.from_pose(8, 8, -8, -8, 4, 4, pose, 0.01))
+    return np.array([plane.numpy()[8 * 4 + 4] for plane in frame.radiance]) / frame.alpha.numpy()[8 * 4 + 4]
+
+
+@pytest.mark.parametrize("scales", [2, 3])
+def test_materials_of_others_are_lit(scales: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two scales: Ref-Gaussian, three: 3DGS-DR. Diffuse surfels keep their display colour without light, and
+    metals reflect it with their display colour."""
+    dc, tint, path = np.array([0.3, -0.2, 0.5]), np.array([1.0, 0.0, -1.0]), tmp_path / "a.ply"
+    values = dict.fromkeys("xyz", 0.0) | {f"rot_{i}": float(i == 0) for i in range(4)} | {"opacity": 20.0}
+    values |= {f"scale_{i}": 0.0 for i in range(scales)} | {f"f_dc_{i}": x for i, x in enumerate(dc)}
+    if scales == 2:
+        values |= {f"ori_color_{i}": x for i, x in enumerate(tint)} | {f"ind_dc_{i}": 0.0 for i in range(3)}
+        values |= {"metalness": 0.0, "roughness": -20.0, "diffuse_color_0": 3.0}
+
+    def write(metal: float) -> Path:
+        content = values | {"refl_strength": metal}
+        path.write_bytes(ply_bytes({name: np.array([x], np.float32) for name, x in content.items()}))
+        return path
+
+    shown = 0.5 + SH_DC * dc
+    np.testing.assert_allclose(pixel(write(-20), 0.0), linear_from_srgb(shown), atol=1e-3)
+    np.testing.assert_allclose(pixel(path, 0.0, linear=True), shown, atol=1e-3)
+    scale, bias = (float(x[0]) for x in split_sum(mi.Float(1), mi.Float(0)))
+    mirrored = linear_from_srgb(sigmoid(tint)) * scale + bias if scales == 2 else np.ones(3)
+    np.testing.assert_allclose(pixel(write(20), 0.5), 0.5 * mirrored, atol=3e-3)
+    assert not capsys.readouterr().err
+    np.testing.assert_allclose(pixel(path), mirrored, atol=6e-3)
+    assert "its light is in another file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["spz", "sog", "ksplat", "splat", "compressed.ply"])
+def test_compressed_splats_are_converted(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = gaussforge.GaussForge().convert(ply_bytes(ball_columns()), "ply", kind)["data"]
+    path = tmp_path / (f"a.{kind}" if "splat" in kind else "a.ply")  # others are known by their first bytes
+    path.write_bytes(content)
+    raw = read_splats(path).surfels.to_numpy()
+    assert not capsys.readouterr().err
+    np.testing.assert_allclose(raw["scale"], SIZE, atol=0.04)
+    colours = SH_DC * raw["radiance_sh"] / np.linalg.norm(SH_DC * raw["radiance_sh"], axis=1, keepdims=True)
+    np.testing.assert_allclose(raw["position"], 0.5 * colours, atol=0.02)
+    if kind == "spz":
+        flagged = bytearray(gzip.decompress(content))
+        flagged[14] |= 1
+        path.write_bytes(gzip.compress(flagged))
+        read_splats(path)
+        assert "antialiasing" in capsys.readouterr().err
+        path.write_bytes(content[:60])
+        refused(
+            ["import", path, "-o", tmp_path / "run"], path, "compressed splats (spz), which cannot be read"
+        )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    path.write_bytes(content)
+    refused(["import", path, "-o", tmp_path / "run"], f"({kind}); pip install", "`splat-transform a.")
+
+
+def test_pointers_of_git_lfs_are_named(tmp_path: Path) -> None:
+    for name, read in {
+        "a.ply": read_splats,
+        "a.exr": read_radiance,
+        "a.hdr": read_radiance,
+        "a.png": read_png,
+    }.items():
+        (tmp_path / name).write_bytes(LFS)
+        refused(
+            lambda read=read, name=name: read(tmp_path / name), name, "a Git LFS pointer", "`git lfs pull`"
+        )  # type: ignore[misc]
+
+
+def test_cameras_of_3dgs_are_read(tmp_path: Path) -> None:
+    turn = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # of a camera that looks along the world's x
+    own = {"id": 0, "img_name": "0", "width": 64, "height": 48, "fx": 70.0, "fy": 71.0, "position": [1, 2, 3]}
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([{**own, "rotation": turn}]))
+    (camera,) = read_cameras(path)
+    point = camera.to_camera(mi.Point3f(5, 2.4, 3.8))  # 4 ahead, 0.4 to the right, 0.8 down
+    x, y = camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy
+    np.testing.assert_allclose([x[0], y[0]], [32 + 70 * 0.1, 24 + 71 * 0.2], rtol=1e-5)
+    path.write_text(json.dumps([own]))
+    refused(lambda: read_cameras(path), path, "[0]: no camera of 3DGS")
