@@ -28,14 +28,13 @@ from scipy.spatial import cKDTree
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
-from mi_refgs.io.files import write_bytes
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_basis
 from mi_refgs.splat import Camera, Tables, splat, surfel_count
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
-from mi_refgs.surfels.ply import encode_ply
+from mi_refgs.surfels.ply import write_ply as write_surfels
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
@@ -56,7 +55,7 @@ def write_ply(
         x y z  nx ny nz  f_dc_0..2  f_rest_0..  opacity  scale_0..2  rot_0..3      little-endian float32
 
     Logits, logarithms and display-encoded colours, as in `surfels.ply`. The colours are fitted to renders."""
-    write_bytes(target, encode_ply(gaussians(trained, shots, degree, object)))
+    write_surfels(target, gaussians(trained, shots, degree, object))
     return [target]
 
 
