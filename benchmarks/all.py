@@ -7,8 +7,7 @@
 
 FOLDER contains chair_400/ (NeRF-Synthetic), meshes/bob_tri.obj and lat-long maps in envmaps/. A part whose
 result, benchmarks/results/NAME.json, is of the present commit is not repeated, nor is a finished fit: the
-same command continues an interrupted run.
-"""
+same command continues an interrupted run."""
 
 from __future__ import annotations
 
@@ -40,8 +39,7 @@ class Part:
     """A data file, and the module with arguments that measures it.
 
     {data} is --data, {run} the run of TIMED. Modules of `tables.PAGES` write their file themselves;
-    others print JSON, which becomes `result`. Groups of fits have no module.
-    """
+    others print JSON, which becomes `result`. Groups of fits have no module."""
 
     name: str
     minutes: float  # on an idle machine with two cores

@@ -6,8 +6,7 @@
 The surfels have the shape and the materials of the mesh: nothing is fitted. Errors are ‖x - ref‖ / ‖ref‖, of
 the frame against the converged path tracer, of gradients against `prb`. The error of shading is that of the
 product's shading at the mesh's own hits, averaged over each pixel; the rest is geometry and sampling.
-Writes endtoend.json; `python -m benchmarks.pages` makes the tables.
-"""
+Writes endtoend.json; `python -m benchmarks.pages` makes the tables."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Times of images of a run at three sizes, without derivatives.
 
-python -m benchmarks.frames RUN
-"""
+python -m benchmarks.frames RUN"""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Everything that a machine with a GPU is asked, in order of worth: python -m benchmarks.gpu OUT [STEP ...]
 
 Each step is a process of its own with a time limit, and yields rows; OUT/gpu.json is rewritten with each row,
-and has the error of a step that fails. `gpu.sh` sets up a bare machine. `--small`: a minute on a CPU.
-"""
+and has the error of a step that fails. `gpu.sh` sets up a bare machine. `--small`: a minute on a CPU."""
 
 from __future__ import annotations
 
@@ -216,12 +215,8 @@ def main(arguments: list[str] | None = None) -> int:
         for row in names[options.only](options.small):
             print(json.dumps(row), flush=True)
         return 0
-    card = subprocess.run(
-        "nvidia-smi --query-gpu=name,driver_version --format=csv,noheader",
-        shell=True,
-        capture_output=True,
-        text=True,
-    )
+    query = "nvidia-smi --query-gpu=name,driver_version --format=csv,noheader"
+    card = subprocess.run(query, shell=True, capture_output=True, text=True)
     result = recorded(dict) | {"card": card.stdout.strip(), "steps": {}}
     passed = [str(options.output), "--variant", options.variant, *["--small"] * options.small]
     options.output.mkdir(parents=True, exist_ok=True)

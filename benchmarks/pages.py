@@ -2,8 +2,7 @@
 
 A marker <!-- FILE.NAME --> … <!-- / --> contains what FILE.json says: a table with its caption, or a number.
 <!-- caption.FILE.FILE --> is the caption of a table whose cells contain markers. Where FILE.json is missing,
-the text stays. results/settings.toml lists, by page, the numbers that nothing measures, such as bounds.
-"""
+the text stays. results/settings.toml lists, by page, the numbers that nothing measures, such as bounds."""
 
 from __future__ import annotations
 
@@ -52,8 +51,7 @@ def names_of(file: str) -> set[str]:
 def filled(text: str, folder: Path) -> str:
     """Return a page with the markers filled whose data files are in a folder.
 
-    Raises InputError for an unknown name, and for captions of several builds.
-    """
+    Raises InputError for an unknown name, and for captions of several builds."""
 
     def replaced(found: re.Match[str]) -> str:
         names = files_of(found[0])

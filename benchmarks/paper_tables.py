@@ -4,8 +4,7 @@
     python -m benchmarks.paper_tables 1 -o runs/paper
 
 The figures of paper_tables.json are the paper's: nothing here measured them. A data set counts as a scene of
-the paper by the name of its folder.
-"""
+the paper by the name of its folder."""
 
 from __future__ import annotations
 
@@ -84,8 +83,7 @@ def place_of(folder: Path, figures: Figures) -> Place | None:
 
     The folder's name is the scene's, with nothing but numbers and the data set's words beside it: `ball`,
     `chair_400`, `teapot_glossy`. Where two data sets have a scene of that name, a word of one of them must
-    be in the folder's name or in its parent's.
-    """
+    be in the folder's name or in its parent's."""
     tokens = {token for token in re.split(r"[^a-z0-9]+", folder.name.lower()) if token}
     found = []
     for name, about in figures.data_sets.items():

@@ -110,8 +110,7 @@ TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]
 def fits(group: str, result: Result) -> Values:
     """Return the table of a group, and its numbers as SOURCE_METHOD_KEY, of the first row of both.
 
-    budget_CLASS_KEY are the shares of the error budget of the first row.
-    """
+    budget_CLASS_KEY are the shares of the error budget of the first row."""
     if {row["build"] for row in result["rows"]} != {result["build"]["commit"]}:
         raise InputError(f"{group}.json: build: rows are of several builds; measure the group again")
     rows = [_flat(row) for row in result["rows"]]

@@ -47,8 +47,7 @@ def commit() -> str:
 def recorded(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return a result with its `build` and its `seconds` of wall time, unless it states its own.
 
-    Raises InputError if the code changes meanwhile.
-    """
+    Raises InputError if the code changes meanwhile."""
     before, load, begin = commit(), os.getloadavg()[0], time.perf_counter()
     result = measure()
     if commit() != before:
@@ -84,8 +83,7 @@ def text_of(build: dict[str, Any]) -> str:
 def write_result(path: Path, result: dict[str, Any]) -> dict[str, Any]:
     """Write a data file, a line per row; returns its content. Raises InputError if it cannot be written.
 
-    Rows of the same keys are lists of values, whose keys are in `columns`.
-    """
+    Rows of the same keys are lists of values, whose keys are in `columns`."""
     text = json.dumps(result, allow_nan=False)
     whole = json.loads(text, parse_float=lambda x: float(f"{float(x):.{DIGITS}g}"))
     written = dict(whole)

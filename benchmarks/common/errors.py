@@ -25,8 +25,7 @@ def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = 
     """Errors of (P, 3) values, over all points or those of a mask (P,), each with the floor of the noise.
 
     bias: mean signed error over mean radiance; relmse: mean of (x - ref)² / (ref² + ε), ε = (0.01 mean)²;
-    below_floor: relMSE may be the reference's noise alone.
-    """
+    below_floor: relMSE may be the reference's noise alone."""
     scale = float(reference.mean.mean())
     chosen = np.ones(len(values), bool) if where is None else where
     x, mean, noise = values[chosen], reference.mean[chosen], reference.error[chosen]
@@ -43,8 +42,7 @@ def compare(values: np.ndarray, reference: Estimate, where: np.ndarray | None = 
 def mean_score(values: np.ndarray, reference: Estimate) -> float:
     """Mean error in its own standard errors, seen from the scatter over points (P, 3).
 
-    Standard normal for an unbiased renderer, whatever it renders; the colours of a point count as one.
-    """
+    Standard normal for an unbiased renderer, whatever it renders; the colours of a point count as one."""
     difference = ((values - reference.mean) * np.sqrt(weight(reference.mean))).sum(-1)
     return float(difference.sum() / np.sqrt((difference**2).sum()))
 
@@ -60,8 +58,7 @@ def decompose(steps: Sequence[Step]) -> Row:
     """Budget of a chain of at least two steps, the last of which is the reference.
 
     parts, in the order of the chain: relmse alone, and share of the total, the projection on the whole error
-    e_k·e / e·e, negative where it cancels others.
-    """
+    e_k·e / e·e, negative where it cancels others."""
     reference = steps[-1].values
     root = np.sqrt(weight(reference))
     differences = [before.values - after.values for before, after in itertools.pairwise(steps)]

@@ -20,8 +20,7 @@ Colour = Callable[[np.ndarray, np.ndarray], np.ndarray]
 def ball_data(size: int, focal: float, shots: Iterable[tuple[np.ndarray, Colour]]) -> Dataset:
     """Views of size × size pixels of a unit ball, for each direction towards the camera and its colour.
 
-    `Colour` maps x and y, in pixels from the centre, to the image (H, W, 3) where the ball is seen.
-    """
+    `Colour` maps x and y, in pixels from the centre, to the image (H, W, 3) where the ball is seen."""
     y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
     alpha = (np.hypot(x, y) / focal < np.tan(np.arcsin(0.25))).astype(np.float32)
     views = []

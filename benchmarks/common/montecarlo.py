@@ -3,8 +3,7 @@
 Nothing of `mi_refgs.shade` is used. A `Lobe` names a way to draw directions and the weights whose integrals
 against the light are wanted. `integrate` combines each lobe with samples of the light (balance heuristic)
 over randomly shifted Fibonacci lattices; the shifts are independent, so batches give their own standard
-error. [Veach 1997, §9; Cranley and Patterson 1976]
-"""
+error. [Veach 1997, §9; Cranley and Patterson 1976]"""
 
 from __future__ import annotations
 
@@ -80,8 +79,7 @@ def exact_table(n_dot_v: np.ndarray, roughness: float) -> tuple[np.ndarray, np.n
 def brdf_lobe(points: Points, α: Any) -> Lobe:
     """GGX reflectance in two parts, (1 - Fc) f cosθ and Fc f cosθ, for F = F0 (1 - Fc) + Fc.
 
-    f cosθ without Fresnel = D G₂ / (4 n·v), with Smith's height-correlated 1/G₂ = 1/G₁(v) + 1/G₁(l) - 1.
-    """
+    f cosθ without Fresnel = D G₂ / (4 n·v), with Smith's height-correlated 1/G₂ = 1/G₁(v) + 1/G₁(l) - 1."""
     frame = mi.Frame3f(points.normal)
     view, ggx = frame.to_local(points.view), mi.MicrofacetDistribution(mi.MicrofacetType.GGX, α)
 
@@ -167,8 +165,7 @@ def integrate(
     Args:
         emitter: an environment emitter of a loaded scene.
         samples: of the lobe, and as many of the light; a member of LATTICES.
-        occluder: a scene that blocks light, or None.
-    """
+        occluder: a scene that blocks light, or None."""
     lane = dr.arange(mi.UInt32, batches * points.count)
     every = points.gather(lane % points.count)
     lobe = make_lobe(every)

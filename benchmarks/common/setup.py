@@ -57,15 +57,8 @@ class Setup:
 
     def integrate(self, lobe: Any, emitter: Any, occluder: Any = None, seed: int = 0) -> list[np.ndarray]:
         """`montecarlo.integrate` at the points: batches (B, P, 3) of each weight of the lobe."""
-        return mc.integrate(
-            lobe,
-            self.points,
-            emitter,
-            samples=self.settings.lattice,
-            batches=self.settings.batches,
-            seed=seed,
-            occluder=occluder,
-        )
+        counts = {"samples": self.settings.lattice, "batches": self.settings.batches}
+        return mc.integrate(lobe, self.points, emitter, **counts, seed=seed, occluder=occluder)
 
     def with_primary_rays(self, shader: Callable[[Points], Any]) -> Callable[[], Any]:
         """A call that meets the surface at the centre of every pixel of the timed image and shades it."""

@@ -25,8 +25,7 @@ def milliseconds(
 
     All calls run once in each round, so that a machine that slows down slows all of them: ratios of these
     times stay true. Rounds go on until `seconds` have passed for each call, at least five and at most `most`.
-    `slow` calls run in the first rounds only, each as often as it says, and their time does not count.
-    """
+    `slow` calls run in the first rounds only, each as often as it says, and their time does not count."""
     slow = slow or {}
     for call in [*calls.values(), *(call for call, _ in slow.values())]:
         once(call)

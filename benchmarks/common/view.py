@@ -3,8 +3,7 @@
 An ordinary render spreads its samples over the pixel, so its image is the integral of radiance over the
 pixel; a shader called once at the pixel's centre would be charged for that difference. Here Mitsuba's own
 integrators are given a sensor that moves each of their samples to the centre of its pixel, the film has a box
-filter, and the points to shade are the hits of the same rays: two images differ by shading only.
-"""
+filter, and the points to shade are the hits of the same rays: two images differ by shading only."""
 
 from __future__ import annotations
 
@@ -44,9 +43,8 @@ class Light:
 
     def environment(self, height: int) -> EnvironmentLight:
         """The product's light, averaged down to `height` rows."""
-        rows = (
-            self.radiance if height == len(self.radiance) else lobe_matrices.resample(self.radiance, height)
-        )
+        same = height == len(self.radiance)
+        rows = self.radiance if same else lobe_matrices.resample(self.radiance, height)
         return EnvironmentLight.from_radiance(rows)
 
     def prefiltered(self, height: int) -> Any:
@@ -79,9 +77,8 @@ def _sunsky(height: int) -> np.ndarray:
     """Mitsuba's `sunsky`, turned from z up to y up and averaged over texels, energy kept."""
     e, a = np.radians([SUN_ELEVATION, SUN_AZIMUTH])
     sun = (np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a))
-    emitter = mi.load_dict(
-        {"type": "sunsky", "sun_direction": [float(sun[0]), float(-sun[2]), float(sun[1])]}
-    )
+    up = [float(sun[0]), float(-sun[2]), float(sun[1])]  # z up
+    emitter = mi.load_dict({"type": "sunsky", "sun_direction": up})
     emitter.set_scene(mi.load_dict({"type": "scene", "ball": {"type": "sphere"}}))
     out = np.empty((height, 2 * height, 3))
     d = directions(height, SUBSAMPLES)
@@ -115,16 +112,14 @@ def _built_in(name: str, height: int) -> np.ndarray:
 def make_light(name: str, height: int) -> Light:
     """A built-in light, or the lat-long image file of that name, on `height` rows and scaled to a mean of 1.
 
-    Raises InputError for a name that is neither.
-    """
+    Raises InputError for a name that is neither."""
     if name in BUILT_IN:
         radiance = _built_in(name, height)
     elif Path(name).exists():
         radiance = EnvironmentLight.from_file(name, height).radiance().numpy().astype(np.float64)
     else:
-        raise InputError(
-            f"{name}: light: neither one of {', '.join(BUILT_IN)} nor a file; give an EXR or HDR file"
-        )
+        what = f"neither one of {', '.join(BUILT_IN)} nor a file"
+        raise InputError(what, name, "light", "give an EXR or HDR file")
     mean = float(np.average(radiance.mean((1, 2)), weights=lobe_matrices.row_areas(height)))
     radiance = np.maximum(radiance / mean, RADIANCE_FLOOR)
     return Light(Path(name).stem, radiance.astype(np.float32))

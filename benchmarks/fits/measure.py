@@ -82,8 +82,8 @@ def _fitted(fit: Fit, data: Path, run: Path, place: Workplace) -> Row:
         refgs("train", data, "-o", run.with_name("rehearsal"), "--preset", REHEARSAL, *options)
     preset = SMALL_PRESET if place.small else fit.preset
     options += ["--resume"] if run.exists() else []
-    row: Row = {"decisions": refgs("train", data, "-o", run, "--preset", preset, *options)}
-    row["decisions"] = row["decisions"].get("decisions", [])
+    trained = refgs("train", data, "-o", run, "--preset", preset, *options)
+    row: Row = {"decisions": trained.get("decisions", [])}
     if fit.samples is not None:
         scores = refgs("eval", run, "--samples", fit.samples, *threads)
         row |= {"psnr_samples": scores["psnr"], "error_budget_samples": scores["error_budget"]}

@@ -27,8 +27,7 @@ class Mutant(NamedTuple):
 def read_mutants() -> list[Mutant]:
     """Mutants of mutants/*.toml, one file per folder of the package.
 
-    Under the name of each source file: name = [text that occurs there once, replacement, failing test].
-    """
+    Under the name of each source file: name = [text that occurs there once, replacement, failing test]."""
     return [
         Mutant(name, f"mi_refgs/{file}", before, after, f"tests/{test}")
         for folder in sorted(Path(__file__).with_name("mutants").glob("*.toml"))

@@ -4,8 +4,7 @@
     python -m benchmarks.mutation --only splat       mutants whose name contains the word
     python -m benchmarks.mutation --list             names, files and tests
 
-First all named tests run without a mutant: they must pass, or a failure would prove nothing.
-"""
+First all named tests run without a mutant: they must pass, or a failure would prove nothing."""
 
 from __future__ import annotations
 

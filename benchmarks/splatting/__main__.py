@@ -3,8 +3,7 @@
     python -m benchmarks.splatting                     every case, in five minutes on 2 cores
     python -m benchmarks.splatting --small -o out      a small instance, below a minute
 
-Writes splatting.json; `python -m benchmarks.pages` makes the tables and the plot of docs/splatting.md.
-"""
+Writes splatting.json; `python -m benchmarks.pages` makes the tables and the plot of docs/splatting.md."""
 
 from __future__ import annotations
 

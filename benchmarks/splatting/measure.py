@@ -3,8 +3,7 @@
 FLOPs of a contributing pair, counted by hand from the formulas, an exponential as 12: forward about 36 for
 the footprint and 24 for compositing; forward and backward 260, where the footprint is evaluated twice.
 Evaluations that do not contribute, sorting and memory are not included, so `contributing · flops / peak` is a
-lower bound of the time of any renderer of these surfels.
-"""
+lower bound of the time of any renderer of these surfels."""
 
 from __future__ import annotations
 
@@ -85,8 +84,7 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
 
     order: largest relative depth difference of two surfels in the wrong order where they show; left_out:
     share of the pixels in the float64 reference's declared band; image: largest error of radiance and alpha;
-    gradient_…: of each class of parameters.
-    """
+    gradient_…: of each class of parameters."""
     around = crop(workload, size, MARGIN)
     lists = list_by_tile(project(around.surfels(), around.camera()), around.camera())
     near = np.unique(np.array(lists.surfel_from_pair))
@@ -158,8 +156,7 @@ def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
 
     Surfels cover a unit sphere; about half of them are seen. Each phase is timed between barriers, in steps
     of their own; `step_ms` is the wall time of undisturbed steps, less than the sum of the phases because
-    kernels fuse across them; `splat_ms` that of the step's splat and its gradients by themselves.
-    """
+    kernels fuse across them; `splat_ms` that of the step's splat and its gradients by themselves."""
     trainer = make_trainer(surfels, sphere_data(size, 8, np.random.default_rng(0)))
     result = {}
     for name, stage in trainer.method.stages():
@@ -219,8 +216,7 @@ def case(workload: Workload, settings: Settings, gflops: float) -> Row:
 def plane(rows: Sequence[Row], target: str, names: Sequence[str]) -> dict[str, float]:
     """row[target] = constant + Σ c row[name], no coefficient negative; R², and the worst relative residual.
 
-    Squares of relative residuals are summed, so that small cases count as much as large ones.
-    """
+    Squares of relative residuals are summed, so that small cases count as much as large ones."""
     values = np.array([float(row[target]) for row in rows])
     design = np.array([[1.0, *(float(row[name]) for name in names)] for row in rows])
     scale = design.max(axis=0)  # keeps the solver's columns of one size

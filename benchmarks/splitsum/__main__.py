@@ -4,8 +4,7 @@
     python -m benchmarks.splitsum --small -o out       a small instance, below a minute
     python -m benchmarks.splitsum --envmap sky.exr -o out   your light beside the built-in ones
 
-Writes splitsum.json; `python -m benchmarks.pages` makes the tables and the plot of docs/splitsum.md.
-"""
+Writes splitsum.json; `python -m benchmarks.pages` makes the tables and the plot of docs/splitsum.md."""
 
 from __future__ import annotations
 

@@ -65,8 +65,7 @@ def speed_ups(rows: list[Row], times: Times) -> list[dict[str, Any]]:
     """One record for each convex shape, light and material with the finest light: samples, ratio of times.
 
     Where the split sum's error is below the noise floor the ratio is a lower bound, taken at the floor. The
-    path tracer cannot take less than one sample.
-    """
+    path tracer cannot take less than one sample."""
     found = []
     split = where(rows, method=METHOD, n_dot_v="all", shape=CONVEX)
     finest = max(row["setting"] for row in split)
@@ -79,15 +78,8 @@ def speed_ups(rows: list[Row], times: Times) -> list[dict[str, Any]]:
         spp = error_times_samples(paths) / max(row["relmse"], CLEAR * row["relmse_floor"])
         path_ms = line(times[row["shape"], row["light"], "path"])(max(spp, 1))
         split_ms = times[row["shape"], row["light"], METHOD][row["setting"]]
-        found.append(
-            case
-            | {
-                "lower_bound": row["below_floor"],
-                "path_spp": spp,
-                "speed_up": path_ms / split_ms,
-                "path_exponent": exponent(paths),
-            }
-        )
+        gain = {"path_spp": spp, "speed_up": path_ms / split_ms, "path_exponent": exponent(paths)}
+        found.append(case | {"lower_bound": row["below_floor"]} | gain)
     return found
 
 

@@ -108,8 +108,7 @@ class Integrals:
     def radiance(self, metallic: float) -> Estimate:
         """Outgoing radiance: the integrals do not depend on F0 and albedo: one set is used for every metal.
 
-        Both specular integrals come from the same samples: their errors add, not the squares.
-        """
+        Both specular integrals come from the same samples: their errors add, not the squares."""
         f0, scale, bias = reflectance(metallic), self.scale, self.bias
         specular = Estimate(f0 * scale.mean + bias.mean, f0 * scale.error + bias.error)
         return specular + self.irradiance.scaled(diffuse(metallic, self.table))
@@ -162,8 +161,7 @@ class Exact(Setup):
     def _bounces(self, roughness: float, metallic: float) -> np.ndarray:
         """Radiance (P, 3) that the shape reflects onto itself, by the path tracer.
 
-        The same random numbers with and without further bounces: the difference is those bounces alone.
-        """
+        The same random numbers with and without further bounces: the difference is those bounces alone."""
         self.set_material(metallic, roughness)
         full, direct = (self.render(path_tracer(n), self.settings.full_depth_spp, 1) for n in (FULL_DEPTH, 2))
         return full - direct

@@ -5,8 +5,7 @@
     python -m benchmarks.stability --only light -o out cases whose name contains a word; repeatable
 
 Writes stability.json; `python -m benchmarks.pages` makes the tables and the plot of docs/stability.md. The
-exit code is 1 if a case fails.
-"""
+exit code is 1 if a case fails."""
 
 from __future__ import annotations
 
@@ -57,8 +56,7 @@ FITS: dict[str, dict[str, Any]] = {
 def fit(name: str) -> dict[str, Any]:
     """STEPS steps in each stage of the full method: first and last loss, values that are not finite.
 
-    Images change after the start, which needs masks.
-    """
+    Images change after the start, which needs masks."""
     trainer = make_trainer(SURFELS, sphere_data(SIZE, VIEWS, np.random.default_rng(0)))
     case = FITS[name]
     if "view" in case:

@@ -1,7 +1,6 @@
 """Error of the method, not of its implementation: what each rule of sorting and cutting does to an image.
 
-Everything here is float64: the same scene with one rule replaced by what it stands for.
-"""
+Everything here is float64: the same scene with one rule replaced by what it stands for."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from benchmarks.common.scenes import discs, facing
 from benchmarks.stability.cases import Array, Case, Raw, camera, filled, plain, sky
-from benchmarks.stability.exact import light_of
+from benchmarks.stability.exact import light_of, scene_of
 from mi_refgs.reference import image as reference
 from mi_refgs.reference.camera import camera_frame
 from mi_refgs.reference.splat import sorted_rows
@@ -78,13 +77,10 @@ def _rules(case: Case) -> Iterator[dict[str, Any]]:
     depth = camera_frame(base.raw, base.camera)[0][:, 2]
     by_centre = np.broadcast_to(np.argsort(depth, kind="stable")[:, None], base.order.shape)
     exact = reference.render(pixel_sorted)
+    centred = replace(base, order=by_centre)
     pairs: list[tuple[str, Callable[[], reference.Image], Callable[[], reference.Image]]] = [
         ("sorted by tile → by pixel", lambda: reference.render(base), lambda: exact),
-        (
-            "sorted by centre → by pixel",
-            lambda: reference.render(replace(base, order=by_centre)),
-            lambda: exact,
-        ),
+        ("sorted by centre → by pixel", lambda: reference.render(centred), lambda: exact),
     ]
     for name, change in (
         ("ALPHA_MIN 1/255 → 0", {"alpha_min": 0.0}),
@@ -114,11 +110,9 @@ def _difference(ours: reference.Image, truth: reference.Image) -> dict[str, floa
 
 
 def _scene(case: Case, light: reference.Light | None) -> reference.Scene:
-    c = case.camera
-    pixels = np.arange(c.width * c.height)
+    pixels = np.arange(case.camera.width * case.camera.height)
     raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
-    order = sorted_rows([raw], c, pixels)
-    return reference.Scene(raw, c, pixels, order, case.at, case.reflectance, case.diffuse, light)
+    return scene_of(case, pixels, sorted_rows([raw], case.camera, pixels), light)
 
 
 def _by_pixel(scene: reference.Scene) -> Array:
@@ -133,14 +127,11 @@ def _supersampled(case: Case, light: reference.Light | None) -> reference.Image:
         c, width=SAMPLES * c.width, height=SAMPLES * c.height, fx=SAMPLES * c.fx, fy=SAMPLES * c.fy,
         cx=SAMPLES * c.cx, cy=SAMPLES * c.cy,
     )  # fmt: skip
-    raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
     maps: dict[str, list[Array]] = {"radiance": [], "alpha": []}
     for row in range(c.height):  # a row of pixels at a time: memory
         pixels = np.arange(SAMPLES * fine.width) + row * SAMPLES * fine.width
-        scene = reference.Scene(
-            raw, fine, pixels, np.empty((0, 0), int), case.at, case.reflectance, case.diffuse, light,
-            rules=reference.Rules(low_pass=None),
-        )  # fmt: skip
+        scene = scene_of(replace(case, camera=fine), pixels, np.empty((0, 0), int), light)
+        scene = replace(scene, rules=reference.Rules(low_pass=None))
         image = reference.render(replace(scene, order=_by_pixel(scene)))
         for name, found in maps.items():
             blocks = image.maps[name].reshape(SAMPLES, c.width, SAMPLES, -1)

@@ -50,8 +50,7 @@ def light_gradient(raw: Array, light: Light, δflat: Array) -> Array:
 def product_order(case: Case, pixels: Array, around: dict[str, Array] | None = None) -> Array:
     """The product's order (N, P) of surfels at pixels; those that the tile does not list come last.
 
-    `around`: raw attributes of a background, which is numbered after the surfels of the case.
-    """
+    `around`: raw attributes of a background, which is numbered after the surfels of the case."""
     camera = fast_camera(case)
     tables = [Surfels.from_numpy(raw) for raw in (case.raw, around) if raw is not None]
     count = surfel_count(tables)

@@ -206,8 +206,7 @@ def gradient_errors(
     """‖g - g₆₄‖ / ‖g₆₄‖ of every class, ‖g₆₄‖ no smaller than NEGLIGIBLE says.
 
     Columns are weighed by what they are measured in: positions by the scene's extent, quaternions
-    by their length.
-    """
+    by their length."""
     sizes, difference = _sizes(exact, raw), {n: found[n].astype(np.float64) - x for n, x in exact.items()}
     errors, least = _sizes(difference, raw), NEGLIGIBLE * max(sizes.values(), default=0.0)
     return {n: e / s if (s := max(sizes[n], least)) > 0 else e for n, e in errors.items()}

@@ -4,8 +4,7 @@
     python -m benchmarks.visibility --small -o out        a small instance, below a minute
     python -m benchmarks.visibility --mesh bob.obj -o out your closed mesh beside the built-in scenes
 
-Writes visibility.json; `python -m benchmarks.pages` makes the tables and the plot of docs/visibility.md.
-"""
+Writes visibility.json; `python -m benchmarks.pages` makes the tables and the plot of docs/visibility.md."""
 
 from __future__ import annotations
 

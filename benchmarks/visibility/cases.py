@@ -173,8 +173,7 @@ def _file(name: str) -> Concave:
 def make_scene(name: str, detail: int) -> Concave:
     """A built-in scene (a bowl or "plates"), or the mesh file of that name.
 
-    Raises InputError if that cannot be read.
-    """
+    Raises InputError if that cannot be read."""
     if name in BOWLS:
         return _bowl(name, detail)
     return _plates(detail) if name == "plates" else _file(name)

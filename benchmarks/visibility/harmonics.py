@@ -1,8 +1,7 @@
 """The best spherical harmonics for the indirect light of each point: least squares of path-traced radiance.
 
 They are an upper bound of what an indirect channel of the product's degree can represent along the mirror
-direction, as the paper's rule looks it up.
-"""
+direction, as the paper's rule looks it up."""
 
 from __future__ import annotations
 
@@ -53,8 +52,7 @@ def traced(scene: Any, points: Points, depth: int, directions: int, seed: int) -
     """Trace one path of Mitsuba's `path` into each direction of a lattice that every point shifts at random.
 
     `depth` is the `max_depth` of the image that this light is a part of: one reflection, at the point, is
-    behind the path already. `directions` is one of `montecarlo.LATTICES`.
-    """
+    behind the path already. `directions` is one of `montecarlo.LATTICES`."""
     path = mi.load_dict({"type": "path", "max_depth": depth - 1, "rr_depth": 1000, "hide_emitters": True})
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, points.count * directions)

@@ -68,8 +68,7 @@ def tradeoffs(rows: list[Row]) -> list[Row]:
     The setting is chosen on the other scenes: of those within the budget here, the one of the least mean
     logarithm of relMSE there, over all roughness. With one scene only, it is chosen on that scene. Errors are
     those against the path tracer at full depth; `gain` is the ratio of relMSE of the paper's rule and of the
-    setting, `best_gain` that of the best setting in hindsight, `price` the ratio of times.
-    """
+    setting, `best_gain` that of the best setting in hindsight, `price` the ratio of times."""
     found = []
     names = list(dict.fromkeys(row["scene"] for row in rows))
     for scene, roughness in dict.fromkeys((row["scene"], row["roughness"]) for row in rows):

@@ -34,7 +34,7 @@ class View:
         from mi_refgs.viewer.serve import serve
 
         require_viser()
-        page = serve(Run(self.run_folder), (self.host, self.port), self.output, self.data, say)
+        page = serve(Run(self.run_folder), (self.host, self.port), self.output, self.data)
         say(f"open {page.url} in a browser; Ctrl-C ends it")
         try:
             page.loop.run()

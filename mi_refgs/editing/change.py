@@ -54,12 +54,9 @@ def assignments(given: Assignments) -> tuple[Assignment, ...]:
 
 
 def apply(
-    scene: TrainedScene,
-    chosen: np.ndarray,  # (N,) bool
-    made: Sequence[Assignment] = (),
-    cut: bool = False,
+    scene: TrainedScene, chosen: np.ndarray, made: Sequence[Assignment] = (), cut: bool = False
 ) -> TrainedScene:
-    """Return the scene with the chosen surfels changed, or `cut`, and their triangles; others stay exactly.
+    """Return the scene with surfels (N,) bool changed, or `cut`, and their triangles; others stay exactly.
     Raises InputError for values that cannot be set, a cut of what is set, and if no surfel would be left."""
     if cut and made:
         raise InputError("what is removed cannot be changed, too", "--cut", remedy="leave the rest out")

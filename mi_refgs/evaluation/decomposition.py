@@ -13,7 +13,7 @@ import numpy as np
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.images import RenderedView
+from mi_refgs.evaluation.images import Maps, RenderedView
 from mi_refgs.evaluation.surface import NO_SURFACE
 from mi_refgs.io.images import psnr_of
 from mi_refgs.runs.relightable import relightable
@@ -111,15 +111,13 @@ def _mean(parts: list[np.ndarray]) -> float | None:
     return float(np.mean(values, dtype=np.float64)) if len(values) else None
 
 
-def material_maps(
-    fitted: TrainedScene, samples: int = 1
-) -> Callable[[Camera, RenderedView], dict[str, np.ndarray]]:
+def material_maps(fitted: TrainedScene, samples: int = 1) -> Callable[[Camera, RenderedView], Maps]:
     """Return a function from a camera and its render to maps of materials, (H, W) or (H, W, 3) by name. Where
     the diffuse part was fitted as a colour, albedo is rendered from the materials that `relightable` makes of
     it, with `samples` per pixel: the fitted attribute is only the colour of metals."""
     if "radiance_sh" not in fitted.shading.required_attributes:
 
-        def comparable(camera: Camera, rendered: RenderedView) -> dict[str, np.ndarray]:
+        def comparable(camera: Camera, rendered: RenderedView) -> Maps:
             """Convert MATERIALS by `Reflectance.textures`; leave them out if it does not convert them."""
             others = {name: shown for name, shown in rendered.maps.items() if name not in MATERIALS}
             return others | (fitted.shading.model.textures(rendered.maps) or {})

@@ -18,7 +18,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.decomposition import Decomposition, material_maps
 from mi_refgs.evaluation.error_budget import ErrorBudget, classify
-from mi_refgs.evaluation.images import RenderedView, contact_sheet, light_panels, over_colour, panels
+from mi_refgs.evaluation.images import Maps, RenderedView, contact_sheet, light_panels, over_colour, panels
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.image_error import displayed_image, with_gain
@@ -81,7 +81,7 @@ def evaluate(
     object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
     in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
     scores: list[dict[str, Any]] = []
-    shown: list[tuple[RenderedView, View, dict[str, np.ndarray]]] = []  # in the sheet, with more images
+    shown: list[tuple[RenderedView, View, Maps]] = []  # in the sheet, with more images
 
     def image_of(view: View) -> np.ndarray:
         return displayed_image(plain(view.camera()), view, views)
@@ -104,7 +104,7 @@ def evaluate(
         budget.add(rendered, view, classify(view, surface))
         write_png(run.path / renders[index], rendered.image)
         if index in in_sheet:
-            more: dict[str, np.ndarray] = {}
+            more: Maps = {}
             if concave is not None:
                 more["concave"] = over_colour(concave[..., None] * ORANGE, view.covered())
             if object_only is not None:
@@ -177,7 +177,7 @@ def render_names(views: Sequence[View]) -> list[str]:
     return [f"{FOLDER}/{index:03d}_{stem}.png" for index, stem in enumerate(stems)]
 
 
-def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
+def _light(fitted: TrainedScene, data: Dataset) -> tuple[dict[str, Any], Maps | None]:
     """Return the env_ keys, and the panels of the environment map."""
     nothing: dict[str, Any] = dict.fromkeys(("env_scale", "env_mae", "env_psnr", "env_correlation"))
     if fitted.light is None:

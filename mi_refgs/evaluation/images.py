@@ -20,6 +20,7 @@ from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.attributes import ATTRIBUTES
 
+Maps = dict[str, np.ndarray]  # images by title, or maps by name
 LIGHT_KEY = 0.36  # average luminance of a displayed environment before the tone curve, which maps it to 0.55
 CELL_MIN = 128  # pixels: smaller images are enlarged by a whole factor
 MARGIN = 4  # pixels between images
@@ -47,7 +48,7 @@ class RenderedView:
     image: np.ndarray  # (H, W, 3) display-encoded, over the data's background
     alpha: np.ndarray  # (H, W) of the object, which has the normals and maps
     normal: np.ndarray  # (H, W, 3) unit, or 0 where there is no surface
-    maps: dict[str, np.ndarray]  # (H, W) or (H, W, 3), linear
+    maps: Maps  # (H, W) or (H, W, 3), linear
 
     @staticmethod
     def of(frame: Frame, data: Dataset, view: View) -> RenderedView:
@@ -63,12 +64,12 @@ class RenderedView:
         )
 
     @staticmethod
-    def maps_of(frame: Frame, height: int, width: int) -> dict[str, np.ndarray]:
+    def maps_of(frame: Frame, height: int, width: int) -> Maps:
         """Copy only the maps of a frame."""
         return {name: image_array(m, height, width) for name, m in frame.maps.items()}
 
 
-def panels(rendered: RenderedView, view: View, scale: np.ndarray | float = 1.0) -> dict[str, np.ndarray]:
+def panels(rendered: RenderedView, view: View, scale: np.ndarray | float = 1.0) -> Maps:
     """Return fitted maps next to the ground truth that a loaded view has, by title; albedo after a scale."""
     pairs = {"image": [rendered.image, view.displayed]}
     pairs["normals"] = [normal_colours(rendered.normal, rendered.alpha)]
@@ -108,7 +109,7 @@ def over_colour(image: np.ndarray, alpha: np.ndarray, colour: np.ndarray | float
     return alpha * image + (1 - alpha) * colour
 
 
-def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def light_panels(light: np.ndarray, truth: np.ndarray | None = None) -> Maps:
     """Tone-map a fitted map (h, w, 3), scaled per channel, and the ground truth at one exposure, by title."""
     if truth is None:
         return {"fitted environment": light_image(light)}
@@ -137,9 +138,7 @@ def upright(image: np.ndarray) -> np.ndarray:
     return np.stack(planes, axis=-1)
 
 
-def contact_sheet(
-    rows: Sequence[dict[str, np.ndarray]], footer: dict[str, np.ndarray] | None = None
-) -> np.ndarray:
+def contact_sheet(rows: Sequence[Maps], footer: Maps | None = None) -> np.ndarray:
     """Arrange titled images in a sheet: one row per view, and `footer` (environment maps) below."""
     titles = list(dict.fromkeys(title for row in rows for title in row))
     factor = -(-CELL_MIN // min(next(iter(rows[0].values())).shape[:2]))
@@ -157,7 +156,7 @@ def contact_sheet(
     return np.concatenate([_padded(line, MARGIN, width - line.shape[1]) for line in lines])
 
 
-def _line(cells: dict[str, np.ndarray], size: int) -> np.ndarray:
+def _line(cells: Maps, size: int) -> np.ndarray:
     """Place images with titles of a size side by side."""
     font = ImageFont.load_default(size)
     title_height = round(1.2 * size) + 2

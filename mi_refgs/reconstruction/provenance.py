@@ -86,9 +86,8 @@ class Provenance:
     def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
         """Cameras on a circle around the object at the test views' distance; InputError below 1."""
         if count < 1:
-            raise InputError(
-                f"{count} is out of range", "turntable", remedy="give a number of cameras from 1"
-            )
+            remedy = "give a number of cameras from 1"
+            raise InputError(f"{count} is out of range", "turntable", remedy=remedy)
         cameras, region = [shot.camera for shot in self.shots(trained, "test")], None
         if trained.surroundings is not None:  # the mesh contains the background, too
             trained, region = replace(trained, mesh=None), self.region

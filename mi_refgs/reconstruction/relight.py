@@ -21,7 +21,7 @@ from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
-from mi_refgs.evaluation.images import contact_sheet, displayed_over, encoded_over_black, light_image
+from mi_refgs.evaluation.images import Maps, contact_sheet, displayed_over, encoded_over_black, light_image
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
@@ -139,7 +139,7 @@ def _true_views(method: Method, folder: Path, views: Dataset) -> Dataset:
 
 def _rows(
     ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], scale: np.ndarray, background: np.ndarray
-) -> list[dict[str, np.ndarray]]:
+) -> list[Maps]:
     """Return the rows of the sheet: relit, relit after the scale, and ground truth; or all frames."""
     if truth:
         titles = "relit", "relit, per-channel scale", "ground truth"

@@ -53,8 +53,7 @@ def traced(
     views: list[View] = []
     for tracer, view, seed in with_bar(jobs, "views", unit="view", disable=not progress):
         image = tracer.image(view.to_world, seed).astype(np.float32)
-        covered = image[..., 3] > 0 if image.shape[-1] == 4 else np.array(True)
-        found = tracer.maps(view.to_world, covered) if maps else {}
+        found = tracer.maps(view.to_world, image) if maps else {}
         found = {name: values.astype(np.float32) for name, values in found.items()}
         normal, depth = found.pop("normal", None), found.pop("depth", None)
         view = replace(view, name=f"r_{len(views):03d}", pixels=compose(image, WHITE), normal=normal)

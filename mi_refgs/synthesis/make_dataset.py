@@ -158,6 +158,6 @@ def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: d
     write_exr(linear, rgba)
     write_png(shown, straight_srgb(rgba) if rgba.shape[-1] == 4 else srgb_from_linear(rgba))
     if maps:
-        found = tracer.maps(pose, rgba[..., -1] > 0 if rgba.shape[-1] == 4 else np.array(True))
+        found = tracer.maps(pose, rgba)
         for name, file in files.items():
             write_exr(file, found[name], names=maps[name])

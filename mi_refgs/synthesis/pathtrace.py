@@ -10,6 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.random import Generator
 
 from mi_refgs.constants import GOLDEN_ANGLE, MAX_NUMBER
 from mi_refgs.data.poses import poses_around
@@ -17,7 +18,7 @@ from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
 from mi_refgs.shade.light.latlong import OVERSAMPLING, lat_long
 from mi_refgs.splat.camera import Camera
 from mi_refgs.synthesis.ground_truth import materials_at, triangles
-from mi_refgs.synthesis.options import DatasetOptions
+from mi_refgs.synthesis.options import DatasetOptions, Range
 from mi_refgs.types import Color3f, Scene, Vector3f
 
 SAMPLES_PER_LAUNCH = 1 << 24  # most paths per launch; the path tracer keeps about 100 bytes for each
@@ -71,19 +72,14 @@ def all_but(shapes: Sequence[Any], others: Sequence[Any]) -> list[Any]:
     return [shape for shape in shapes if not any(shape is other for other in others)]
 
 
-def distances(options: DatasetOptions, radius: float) -> tuple[float, float]:
+def distances(options: DatasetOptions, radius: float) -> Range:
     """Of the nearest and the farthest camera from the centre of an object of this radius, scene units."""
     filling = radius / (FILL * math.sin(math.radians(options.fov) / 2))
     return options.distance or (filling, filling)
 
 
 def camera_poses(
-    count: int,
-    centre: np.ndarray,
-    distance: tuple[float, float],
-    elevation: tuple[float, float],
-    rng: np.random.Generator,
-    azimuth: tuple[float, float] = (0.0, 360.0),
+    count: int, centre: np.ndarray, distance: Range, elevation: Range, azimuth: Range, rng: Generator
 ) -> np.ndarray:
     """World-from-camera matrices (count, 4, 4) in Mitsuba's frame that look at `centre`, z up: a jittered
     spherical Fibonacci lattice over the ranges of elevations and azimuths (degrees)."""
@@ -124,14 +120,14 @@ class Cameras:
     objects: Sequence[Any] = ()  # the object's shapes in an open scene
 
     @property
-    def distance(self) -> tuple[float, float]:
+    def distance(self) -> Range:
         return distances(self.options, self.radius)
 
     def of(self, split: str) -> list[tuple[np.ndarray, int]]:
         """Pose and seed of each view of a split, from independent random streams."""
         options, index = self.options, ("train", "test").index(split)
         rng, count = np.random.default_rng([options.seed, index]), options.count(split)
-        poses = camera_poses(count, self.centre, self.distance, options.elevation, rng, options.azimuth)
+        poses = camera_poses(count, self.centre, self.distance, options.elevation, options.azimuth, rng)
         streams = (np.random.SeedSequence([options.seed, index, i]) for i in range(count))
         return [(p, int(stream.generate_state(1)[0])) for p, stream in zip(poses, streams, strict=True)]
 
@@ -179,8 +175,8 @@ class Tracer:
                 image += np.array(mi.render(self.scene, seed=int(s), **options)) / self.passes
         return image
 
-    def maps(self, pose: np.ndarray, covered: np.ndarray) -> dict[str, np.ndarray]:
-        """The maps of MAPS at pixel centres, where `covered` (H, W), which excludes hidden emitters."""
+    def maps(self, pose: np.ndarray, image: np.ndarray) -> dict[str, np.ndarray]:
+        """The maps of MAPS at pixel centres, where `image` shows something: not at hidden emitters."""
         self._look(pose)
         width, height = self.width, self.height
 
@@ -196,7 +192,7 @@ class Tracer:
             wanted = si.is_valid() if not self.objects else mi.Bool(False)
             for shape in self.objects:
                 wanted |= si.shape == mi.ShapePtr(shape)
-            hit = plane(wanted).astype(bool) & covered
+            hit = plane(wanted).astype(bool) & (image[..., 3] > 0 if image.shape[-1] == 4 else True)
             depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(height, width)
             found = {"normal": np.array(normal).T.reshape(height, width, 3), "depth": depth[..., None]}
             for name, (value, known) in materials_at(self.scene, si)._asdict().items():

@@ -80,9 +80,7 @@ def scene_of(parts: Sequence[Any]) -> Any:
     return scene
 
 
-def prepare_folder(
-    out: Path, wanted: dict[str, Any], overwrite: bool, relight: Sequence[LightFile] = ()
-) -> None:
+def prepare_folder(out: Path, wanted: dict[str, Any], overwrite: bool, relight: Sequence[LightFile]) -> None:
     """Make the folders and record the settings; InputError if others are there, unless `overwrite`."""
     names = [light.name for light in relight]
     if len({*names}) < len(names):

@@ -46,10 +46,8 @@ def require_free(host: str, port: int) -> None:
     except (OSError, OverflowError) as error:
         is_host = isinstance(error, socket.gaierror) or getattr(error, "errno", 0) == errno.EADDRNOTAVAIL
         option = "--host" if is_host else "--port"
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"{host}:{port} cannot be used ({reason})", option, remedy=f"give another {option}"
-        ) from error
+        what = f"{host}:{port} cannot be used ({getattr(error, 'strerror', None) or error})"
+        raise InputError(what, option, remedy=f"give another {option}") from error
 
 
 class Page:

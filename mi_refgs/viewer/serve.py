@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
+from mi_refgs.io.progress import say
 from mi_refgs.runs.export import newest
 from mi_refgs.runs.run import DATASET, Run
 from mi_refgs.runs.views import views_of_run, with_poses
@@ -23,23 +23,15 @@ from mi_refgs.viewer.region_panel import RegionPanel
 USUAL_SHAPES, WARM = (1.0, 1.6), 4
 """Aspect ratios of desktop windows less the panel, and number of levels, that are compiled beforehand."""
 
-Tell = Callable[[str], None]
 
-
-def serve(
-    run: Run,
-    address: tuple[str, int],
-    output: Path | None = None,
-    data: Path | None = None,
-    tell: Tell = print,
-) -> Page:
+def serve(run: Run, address: tuple[str, int], output: Path | None, data: Path | None) -> Page:
     """Return the page of a run, with the views of its data set, or of that in `data`; writes nothing. Raises
     InputError for a folder that is no run or has no fit, for a port that is taken, and without viser."""
-    found = splits_of(run, data, tell)
+    found = splits_of(run, data)
     some = found.get("train") or found.get("test")
     scene = ReconstructionView(newest(run, run.method()), None if some is None else some.region)
     page = Page(scene, found, run.path.resolve().name, address, output or run.path / "views")
-    warm_up(page, tell)
+    warm_up(page)
     add_display(page)
     add_light(page, scene)
     if scene.materials:
@@ -52,8 +44,8 @@ def serve(
     return page
 
 
-def splits_of(run: Run, data: Path | None, tell: Tell) -> dict[str, Dataset]:
-    """Return the splits of a run's data set, or of that in `data`; tells which cannot be read."""
+def splits_of(run: Run, data: Path | None) -> dict[str, Dataset]:
+    """Return the splits of a run's data set, or of that in `data`; says which cannot be read."""
     method, found = run.method(), dict[str, Dataset]()
     if data is not None or (run.path / DATASET).is_file():
         for split in ("train", "test"):
@@ -62,13 +54,13 @@ def splits_of(run: Run, data: Path | None, tell: Tell) -> dict[str, Dataset]:
             except InputError as error:
                 if data is not None:
                     raise
-                tell(f"{error}; shown without {split} views")
+                say(f"{error}; shown without {split} views")
     return found
 
 
-def warm_up(page: Page, tell: Tell) -> None:
+def warm_up(page: Page) -> None:
     """Compile the kernels of images during motion; choose their first level."""
-    tell("preparing: compiling for each image size")
+    say("preparing: compiling for each image size")
     for shape, side in itertools.product(USUAL_SHAPES, resolution.SIDES[:WARM]):
         camera = page.start().camera(*resolution.size_of(side, shape))
         for _ in range(2):

@@ -159,30 +159,21 @@ def test_the_background_stays(change: Any) -> None:
     ("given", "message"),
     [
         ({"set": ["shininess=1"]}, "'shininess' cannot be set of these surfels; use one of opacity, albedo"),
-        ({"set": ["x=1"]}, "'x' cannot be set"),
         ({"set": ["roughness=1.5"]}, "--set: roughness=1.5: out of range; give 0 to 1"),
         ({"set": ["colour=-1"]}, "give 0 or more"),
         ({"set": ["albedo=1,2"]}, "2 values; give 1 or 3"),
-        ({"set": ["roughness"]}, "--set: 'roughness': no assignment of numbers; write it like roughness=0.3"),
-        ({"set": ["roughness==1"]}, "no assignment"),
         ({"set": ["roughness=0.2 albedo=1"]}, "no assignment"),
         ({"set": ["roughness=x"]}, "no assignment"),
         ({"set": {"roughness": None}}, "no assignment"),
         ({"set": ["roughness=nan"]}, "not finite"),
         ({"where": "shine > 1", "cut": True}, "--where: 'shine' is no value of these surfels; use one of"),
-        ({"where": "albedo > 1", "cut": True}, "--where: 'albedo' is no value"),
-        ({"where": "x >", "cut": True}, "--where: 'x >': no comparison; write it like metallic > 0.5"),
         ({"where": "x > 1 and", "cut": True}, "--where: '': no comparison"),
         ({"where": "x > __import__('os')", "cut": True}, "no comparison"),
         ({"where": "x > 100", "cut": True}, "none of the 6000 surfels is in it; choose a wider one"),
         ({"cut": True}, "--cut: no surfel would be left"),
         ({"cut": True, "where": "x>0", "set": ["roughness=1"]}, "what is removed cannot be changed"),
         ({"set": None}, "nothing to do"),
-        (
-            {"box": (1e30, 0, 0, 1, 1, 1), "cut": True},
-            "--box: 6 finite numbers are needed, none beyond 1e+09",
-        ),
-        ({"box": (0, 0, 0, 1, 1, float("inf")), "cut": True}, "--box: 6 finite numbers"),
+        ({"box": (1e30, 0, 0, 1, 1, 1), "cut": True}, "6 finite numbers are needed, none beyond 1e+09"),
         ({"wehre": "x > 0", "set": ["roughness=1"]}, "edit: wehre: unknown option; use some of where, box"),
     ],
 )
@@ -295,9 +286,3 @@ def test_a_bad_command_writes_nothing(finished: Path, tmp_path: Path) -> None:
     nowhere = ["--set", "roughness=0.5", "--where", "x > 1e9"]
     refused(["edit", finished, "-o", tmp_path / "new", *nowhere], "choose a wider one")
     assert not any(tmp_path.iterdir())
-
-
-def test_an_existing_output_is_refused(finished: Path, tmp_path: Path) -> None:
-    (tmp_path / "something").touch()
-    for taken in (finished, tmp_path):
-        refused(["edit", finished, "-o", taken, "--cut"], "choose an empty folder")

@@ -49,7 +49,6 @@ def run(finished: Path, tmp_path: Path) -> Run:
 
 @pytest.fixture
 def views(data: Path) -> Dataset:
-    """The test views."""
     return read_dataset(data, "test")
 
 

@@ -25,7 +25,6 @@ MOST_SECONDS = 60  # seconds of CPU time on an idle machine; a busy one counts u
 
 
 def cells(path: Path) -> list[Any]:
-    """The cells of code."""
     return [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
 
 

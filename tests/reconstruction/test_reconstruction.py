@@ -29,7 +29,6 @@ from tests.scenes.tiny import SETTINGS
 
 @pytest.fixture(scope="module")
 def balls(known: Path) -> Reconstruction:
-    """The perfect reconstruction."""
     return mi_refgs.load(known / "run")
 
 
@@ -194,8 +193,6 @@ def test_fit_equals_the_command(data: Path, method: Path, finished: Path, tmp_pa
 
 def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path) -> None:
     class Heard(mi_refgs.Progress):
-        """Counts steps."""
-
         steps, said = 0, ""
 
         def say(self, message: str) -> None:

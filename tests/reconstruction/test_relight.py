@@ -20,7 +20,7 @@ from mi_refgs.formats import orbits
 from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.images import read_png
-from mi_refgs.reconstruction.new_light import NewLight, any_light
+from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.reconstruction.relight import common_scale, relight
 from mi_refgs.runs.export import export
@@ -28,7 +28,7 @@ from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.shading import Shading
 from tests.helpers import refused
-from tests.scenes.known import SIZE, other_sky, write_known_run
+from tests.scenes.known import SIZE, write_known_run
 
 SAMPLES = 4
 
@@ -187,14 +187,10 @@ def test_relight_warns_of_fitted_diffuse_colour(known: Path, tmp_path: Path) -> 
 
 def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
     run, light = Run(known / "run"), NewLight(known / "dusk.exr")
-    (tmp_path / "bad.exr").write_text("no image")
     refused(lambda: relight(run, light, known / "run"), "belongs to a run")
     refused(lambda: relight(run, light, known / "data"), "has other files")
     refused(lambda: relight(run, light, turntable=-1), "turntable: -1 is out of range")
-    refused(lambda: relight(run, NewLight(tmp_path / "bad.exr"), tmp_path / "out"), "bad.exr")
-    refused(lambda: NewLight(tmp_path / "none.exr"), "none.exr")
     refused(lambda: NewLight(light.path, rotate=float("nan")), "light: rotation: nan is no angle")
-    refused(lambda: any_light(other_sky(), False, 0, 50.0), "light: exposure: 50.0 is out of range")
     bare = Run(shutil.copytree(run.path, tmp_path / "bare"))
     changes: dict[str, Any] = {"light": None, "mesh": None, "shading": Shading("surfel", "radiance")}
     colour = replace(TrainedScene.read(run.path), **changes)

@@ -198,5 +198,4 @@ def test_bad_preset_is_refused_before_views_are_rendered(ball: Path, tmp_path: P
     argv = ["import", ball, "-o", tmp_path / "run", "--relightable"]
     refused([*argv, "--preset", "fast"], "--preset: fast: unknown")
     refused([*argv, "--for", "fun"], "--for: fun: no method is for that")
-    refused([*argv[:-1], "--preset", "quick"], "--preset: ", "add --relightable")
     assert not (tmp_path / "run").exists()

@@ -118,7 +118,9 @@ def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
 
 def test_camera_poses_are_seeded_and_evenly_spread() -> None:
     def poses(seed: int) -> np.ndarray:
-        return pathtrace.camera_poses(60, CENTRE, (4.0, 4.0), (-30, 80), np.random.default_rng(seed))
+        return pathtrace.camera_poses(
+            60, CENTRE, (4.0, 4.0), (-30, 80), (0, 360), np.random.default_rng(seed)
+        )
 
     first = poses(1)
     np.testing.assert_array_equal(first, poses(1))
@@ -173,7 +175,7 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
 
 def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
-    pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), np.random.default_rng(0))[0]
+    pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), (0, 360), np.random.default_rng(0))[0]
     options = DatasetOptions(size=8, fov=30, spp=64, max_depth=3)
     cameras = pathtrace.Cameras(options, CENTRE, RADIUS, RADIUS)
     whole = pathtrace.Tracer(scene, cameras).image(pose, 5)

@@ -179,4 +179,3 @@ def test_size_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for size in ("10x6", "12"):
         assert main(["dataset", "room.xml", "-o", str(tmp_path), "--size", size]) == 0
     assert made == [(10, 6), 12]
-    refused(["dataset", "room.xml", "-o", tmp_path, "--size", "10x"], "WIDTHxHEIGHT")

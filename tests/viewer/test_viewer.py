@@ -142,7 +142,6 @@ class Plain(ReconstructionView):
         return [mi.Float(self.grey)] * 3 + [mi.Float(1)]
 
     def fovs(self) -> list[float]:
-        """The vertical fields of view of the requests."""
         return [2 * math.atan(camera.height / 2 / abs(camera.fy[0])) for camera in self.cameras]
 
 
@@ -171,7 +170,6 @@ class Loop(RenderLoop):
         return seen
 
     def move(self, number: int = 7, fov: float = 0.7) -> None:
-        """Move a client's camera."""
         self.change(number, pose=Pose(np.eye(4), fov, 1.0), window=(640, 400))
 
     def steps(self, count: int, seconds: float = 0.0) -> None:

@@ -111,7 +111,6 @@ class Tab:
         return self.until(lambda image: bool(np.abs(image - before).mean() > mean), what)
 
     def returns(self, before: np.ndarray, what: str) -> np.ndarray:
-        """Wait until the canvas is as before."""
         return self.until(lambda image: bool(np.abs(image - before).mean() < 0.5), what)
 
     def still(self) -> np.ndarray:
@@ -132,18 +131,15 @@ class Tab:
         return found.locator("input")
 
     def type(self, label: str, value: str) -> None:
-        """Type into a control."""
         field = self.row(label).last
         field.fill(value)
         field.press("Enter")
 
     def choose(self, label: str, value: str) -> None:
-        """Choose in a drop-down."""
         self.row(label).first.click()
         self.page.get_by_role("option", name=value, exact=True).click()
 
     def press(self, label: str) -> None:
-        """Press a button."""
         self.page.get_by_role("button", name=label, exact=True).click()
 
     def check(self, label: str) -> None:
