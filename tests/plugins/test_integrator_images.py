@@ -78,16 +78,6 @@ def test_depth_is_that_of_mitsuba() -> None:
     np.testing.assert_allclose(depth, reference, rtol=1e-2)  # the noise of the reference's jitter
 
 
-def test_supersampling_is_a_box_filter_over_pixel_centres() -> None:
-    fine = image(scene(sensor(film={"width": 3 * WIDTH, "height": 3 * HEIGHT})))
-    mean = fine.reshape(HEIGHT, 3, WIDTH, 3, 3).mean((1, 3))
-    of = scene()
-    for spp in (5, 9):
-        np.testing.assert_allclose(image(of, spp=spp), mean, atol=2e-5)
-    np.testing.assert_array_equal(image(of), image(of, spp=1, seed=7))
-    assert np.abs(image(of) - mean).max() > 1e-3
-
-
 @pytest.mark.parametrize(
     ("kind", "options"),
     [("thinlens", {"fov": 45, "aperture_radius": 0.1, "focus_distance": 3.0}), ("orthographic", {})],

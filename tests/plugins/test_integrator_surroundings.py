@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.export import export
 from mi_refgs.runs.trained_scene import AROUND_FILE, BACKGROUND_MAP, TrainedScene
@@ -25,21 +24,6 @@ from tests.scenes import integrator as scenes
 
 def camera() -> Camera:
     return Camera.from_sensor(mi.load_dict(scenes.sensor()))
-
-
-def test_image_matches_the_renderer() -> None:
-    """All over what is behind, opaque; and without both the object alone, transparent."""
-    rgba = scenes.sensor(film={"pixel_format": "rgba"})
-    seen = scenes.image(scenes.open_scene(rgba))
-    surfels, light = Surfels.from_numpy(scenes.raw_channels()), EnvironmentLight.from_radiance(scenes.sky())
-    around = Surroundings(Surfels.from_numpy(scenes.far_channels()), scenes.background_light())
-    shading = Shading()
-    frame = render(SurfelScene(surfels, shading, shading.light_of(light), surroundings=around), camera())
-    expected = frame.radiance + (1 - frame.alpha) * frame.background
-    np.testing.assert_allclose(seen[..., :3].reshape(-1, 3), expected.numpy().T, atol=1e-5)
-    np.testing.assert_array_equal(seen[..., 3], 1)
-    transparent = scenes.image(scenes.scene(rgba))
-    assert transparent[..., 3].min() < 0.5 and np.abs(transparent[..., :3] - seen[..., :3]).max() > 0.1
 
 
 def test_values_that_cannot_be_used_are_told_of_and_left_out() -> None:

@@ -10,18 +10,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.reference import image
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.models import sh_basis
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.scenes import splats
-from tests.scenes.integrator import HEIGHT, WIDTH, raw_channels, sky
-from tests.scenes.shading_points import exact_light
 
 COLOUR = Shading(at="surfel", reflectance="radiance")
 
@@ -38,27 +34,6 @@ def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:
 
 def channel(frame: Frame, name: str) -> np.ndarray:
     return np.array(getattr(frame, name), dtype=np.float64).T
-
-
-@pytest.mark.parametrize("diffuse", ["sh", "irradiance"])
-@pytest.mark.parametrize("at", ["pixel", "surfel"])
-def test_pixels_are_shaded_by_the_oracle(at: Any, diffuse: Any) -> None:
-    """Blend then shade, and shade then blend, both in float64."""
-    light = EnvironmentLight.from_radiance(sky(8)).prefilter()
-    raw = {name: values.astype(np.float64) for name, values in raw_channels().items()}
-    to_world = look_at(np.array([3.0, 1, 2]), np.zeros(3))
-    lens = (WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, to_world)
-    view, camera = oracle.PinholeCamera(*lens), Camera.from_pose(*lens)
-    frame = render(SurfelScene(Surfels.from_numpy(raw), Shading(at=at, diffuse=diffuse), light), camera)
-    pixels = np.arange(WIDTH * HEIGHT)
-    order = oracle.sorted_rows([raw], view, pixels)
-    exact = image.Scene(raw, view, pixels, order, at, "split_sum", diffuse, exact_light(light))
-    expected = image.render(exact)
-    alpha = expected.maps["alpha"][:, 0]
-    keep = ~expected.band & ((alpha > 2e-3) | (alpha < 5e-4))
-    assert keep.mean() > 0.9 and np.mean(alpha > 0.3) > 0.2
-    found = channel(frame, "radiance")
-    np.testing.assert_allclose(found[keep], expected.maps["radiance"][keep], atol=3e-4)
 
 
 @pytest.mark.parametrize("degrees", [0, 50, 80, 100, 115, 130, 180])
