@@ -15,6 +15,7 @@ from typing import Any, get_type_hints
 
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 import pytest
 from tyro.conf import Suppress
 
@@ -55,6 +56,12 @@ def refused(
     for word in words:
         assert str(word) in message, message
     return message
+
+
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """All channels of an EXR file by name, float32 (H, W) each."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels.astype(np.float32) for name, channel in file.channels().items()}
 
 
 def command_names() -> list[str]:

@@ -99,8 +99,7 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     import mitsuba as mi
     import numpy as np
 
-    from mi_refgs.io.exr import mitsuba_exr
-    from mi_refgs.io.files import replace_file
+    from mi_refgs.io.exr import write_exr_layers
     from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
     from mi_refgs.render.load_scene import reason
 
@@ -111,8 +110,8 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
     bitmap = sensor.film().bitmap()
     names = [channel.name for channel in bitmap.struct_()]
     if path.suffix.lower() == ".exr":
-        with mitsuba_exr():
-            replace_file(path, lambda temporary: bitmap.write(str(temporary)))
+        pixels = np.array(bitmap).reshape(*bitmap.size()[::-1], -1)
+        write_exr_layers(path, {name: pixels[..., index] for index, name in enumerate(names)})
         return names
     count = 4 if "A" in names else 3
     pixels = np.array(image, dtype=np.float32)[..., :count]

@@ -1,100 +1,198 @@
-"""EXR files as NumPy arrays, written atomically."""
+"""EXR files as NumPy arrays, read in a process of their own (`exr_process`), and written atomically."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Collection, Iterator, Mapping
+import atexit
+import json
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from subprocess import DEVNULL, PIPE
 from typing import Any
 
 import numpy as np
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import check_size, replace_file, require_file
+from mi_refgs.io.progress import note
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"  # first bytes of every EXR file
 SAMPLE_BYTES = 2  # bytes per sample at least: those of half floats; integers and floats have 4
 SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of R, G, B, white (BT.709)
 CHROMATICITY_TOLERANCE = 1e-3  # half the last digit in standards
-MITSUBA_EXR_THREADS = 2  # Mitsuba 3.9 uses a worker thread for EXR files: with one in all, it never returns
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of R, G, B (BT.709)
+_lock = threading.Lock()
+_processes: dict[int, subprocess.Popen[bytes]] = {}
+"""The process that reads files, by the id of the one that has started it: forks do not share it."""
 
 
-def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """All channels of an EXR file by name, float32 (H, W) each; raises InputError unless all are finite."""
-    import OpenEXR
+@dataclass(frozen=True)
+class Part:
+    """A part of an EXR file. Windows are left, top, right, bottom: the first and last column and row."""
 
-    path = Path(path)
-    exr_size(path)
-    with _readable(path), OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = {name: np.array(c.pixels, dtype=np.float32) for name, c in file.channels().items()}
-    for name, pixels in channels.items():
-        if len(bad := np.argwhere(~np.isfinite(pixels))):
-            what = f"{len(bad)} NaN or infinite values, the first at row {bad[0, 0]}, column {bad[0, 1]}"
-            raise InputError(what, path, f"channel {name}", "render the image again")
-    return channels
+    flat: bool  # not of deep pixels
+    channels: Mapping[str, Any]  # type, shape and bytes by name, or None if only the header was read
+    data: tuple[int, int, int, int]  # window of the pixels that are stored
+    display: tuple[int, int, int, int]  # window of the image
+    name: str
+    layout: str | None  # of an environment, "cube" or "lat-long", if the header says it
+    chromaticities: tuple[float, ...] | None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image."""
+        return self.display[2] - self.display[0] + 1, self.display[3] - self.display[1] + 1
+
+    def plane(self, name: str) -> np.ndarray:
+        """A channel (H, W) as it is stored, in the display window with 0 around it; the samples of a coarser
+        one, as of chroma, are repeated."""
+        (left, top, right, bottom), (x, y, _, _), (width, height) = self.data, self.display, self.size
+        kind, shape, data = self.channels[name]
+        stored = np.frombuffer(data, kind).reshape(shape)
+        for axis, wanted in enumerate((bottom - top + 1, right - left + 1)):
+            if shape[axis] < wanted:
+                stored = stored.repeat(-(-wanted // shape[axis]), axis).take(range(wanted), axis)
+        shown = stored[max(y - top, 0) : y + height - top, max(x - left, 0) : x + width - left]
+        plane = np.zeros((height, width), stored.dtype)
+        plane[max(top - y, 0) :, max(left - x, 0) :][: shown.shape[0], : shown.shape[1]] = shown
+        return plane
+
+
+def _ask(path: Path, pixels: bool) -> list[Part]:
+    """The parts of a file; raises InputError, also if the process that reads it ends."""
+    field, remedy = "pixels" if pixels else "header", "export it again"
+    with _lock:
+        process = _processes.get(os.getpid())
+        if process is None or process.poll() is not None:
+            script = [sys.executable, "-P", str(Path(__file__).with_name("exr_process.py"))]
+            places = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+            process = subprocess.Popen(
+                script, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, env=places, start_new_session=True
+            )
+            _processes[os.getpid()] = process
+        assert process.stdin and process.stdout
+        try:
+            process.stdin.write(json.dumps([str(path.absolute()), pixels]).encode() + b"\n")
+            process.stdin.flush()
+            answer = pickle.load(process.stdout)
+        except BaseException as error:  # also Ctrl-C: its answer must not be that of the next file
+            status = _end()
+            if not isinstance(error, Exception):
+                raise
+            what = f"reading it ended the process of the EXR library (status {status})"
+            raise InputError(what, path, field, remedy) from error
+    if isinstance(answer, str):
+        raise InputError(f"not a readable EXR file ({answer})", path, field, remedy)
+    return [Part(**fields) for fields in answer]
+
+
+@atexit.register
+def _end() -> int:
+    """End the process that reads files; returns its status."""
+    if process := _processes.pop(os.getpid(), None):
+        process.kill()
+        process.communicate()
+    return process.returncode if process else 0
+
+
+def _read(path: Path, vectors: bool = False, pixels: bool = True) -> tuple[Part, list[str]]:
+    """The first flat part of a file that has an image, and the names of its channels; raises InputError."""
+    require_file(path)
+    parts = _ask(path, pixels=False)
+    flat = [(index, part, _names(part.channels, vectors)) for index, part in enumerate(parts) if part.flat]
+    if not flat:
+        raise InputError("deep pixels" if parts else "no parts", path, "header", "flatten the image")
+    index, part, names = next((found for found in flat if found[2]), flat[0])
+    (left, top, right, bottom), (x0, y0, x1, y1) = part.data, part.display
+    if right < left or bottom < top or min(right, x1) < max(left, x0) or min(bottom, y1) < max(top, y0):
+        raise InputError("no pixel is in the display window", path, "dataWindow", "export it again")
+    check_size(path, right - left + 1, bottom - top + 1, SAMPLE_BYTES * len(part.channels))
+    check_size(path, *part.size, 1)
+    if not names:
+        remedy = f"export R, G, B (and A), {'X, Y, Z, ' if vectors else ''}or one channel (and A)"
+        raise InputError(f"found {', '.join(sorted(part.channels))}", path, "channels", remedy)
+    if len(names) > 2 and not np.allclose(part.chromaticities or SRGB, SRGB, atol=CHROMATICITY_TOLERANCE):
+        raise InputError("not those of sRGB", path, "chromaticities", "convert the image to linear sRGB")
+    if len(parts) > 1:
+        note(path, f"{len(parts)} parts, of which '{part.name}' is read")
+    if layer := names[0].rpartition(".")[0]:
+        note(path, f"{len(part.channels)} channels, of which those of the layer '{layer}' are read")
+    if part.data != part.display:
+        note(path, f"pixels {part.data} are placed in the display window {part.display}, with 0 around them")
+    if pixels:
+        parts = _ask(path, pixels=True)
+        if index >= len(parts) or parts[index].channels.keys() != part.channels.keys():
+            raise InputError("not a readable EXR file (broken pixels)", path, "pixels", "export it again")
+    return parts[index], names
+
+
+def _names(channels: Collection[str], vectors: bool) -> list[str]:
+    """The channels of an image, in order: of those without a layer, else of the first layer named Combined
+    (Blender's), else of the first one; [] if there are none."""
+    layers: dict[str, set[str]] = {}
+    for name in channels:
+        layer, _, channel = name.rpartition(".")
+        layers.setdefault(layer, set()).add(channel)
+    order = sorted(layers, key=lambda layer: (layer != "", not layer.endswith("Combined"), layer))
+    colour = ["R G B A", "R G B", *(["X Y Z"] if vectors else []), "Y RY BY"]
+    for layer, kind in [
+        (layer, kind) for kinds in (colour, ["Y A", "Y"]) for layer in order for kind in kinds
+    ]:
+        missing = set(kind.split()) ^ layers[layer]
+        if not missing or (kind in colour and missing < layers[layer]):
+            return [f"{layer}.{channel}" if layer else channel for channel in kind.split()]
+    return list(channels) if len(channels) == 1 else []
+
+
+def _image(path: Path, names: list[str], planes: list[np.ndarray]) -> np.ndarray:
+    """Channels (H, W) as an image (H, W, C) float32, luminance and chroma as R, G, B; raises InputError
+    unless all are finite."""
+    image = np.stack(planes, axis=-1).astype(np.float32)
+    if len(bad := np.argwhere(~np.isfinite(image))):
+        what = f"{len(bad)} NaN or infinite values, the first at row {bad[0, 0]}, column {bad[0, 1]}"
+        raise InputError(what, path, f"channel {names[bad[0, 2]]}", "render the image again")
+    if names[-1].endswith("BY"):
+        y, red, blue = image[..., 0], (image[..., 1] + 1) * image[..., 0], (image[..., 2] + 1) * image[..., 0]
+        green = (y - LUMINANCE[0] * red - LUMINANCE[2] * blue) / LUMINANCE[1]
+        image = np.stack([red, green, blue], axis=-1)
+    return image
 
 
 def read_exr_image(path: str | Path, vectors: bool = False) -> np.ndarray:
     """EXR file as float32 (H, W, C): RGBA, RGB, YA or one channel; with `vectors` also XYZ. Raises InputError
-    as `read_exr`, without such channels, and for primaries other than sRGB's."""
-    channels = read_exr(path)
-    names = _image_channels(Path(path), channels, _header(Path(path)), vectors)
-    return np.stack([channels[name] for name in names], axis=-1)
+    without such channels, unless all are finite, and for primaries other than sRGB's."""
+    part, names = _read(Path(path), vectors)
+    return _image(Path(path), names, [part.plane(name) for name in names])
+
+
+def read_exr_light(path: Path) -> tuple[np.ndarray, str | None]:
+    """Colour (H, W, 3) float32 of a light, and `Part.layout`; raises InputError as `read_exr_image`. Infinity
+    becomes the largest half float in half floats, which overflow, else the largest value."""
+    part, names = _read(path)
+    planes = [part.plane(name) for name in names]
+    if (infinite := np.isposinf(planes)).any():
+        half = planes[0].dtype == np.float16
+        largest = np.finfo(np.float16).max if half else np.max(planes, where=~infinite, initial=0)
+        planes = [*np.where(infinite, largest, planes)]
+        texels = counted(int(infinite.any(axis=0).sum()), "infinite texel")
+        note(path, f"{texels} set to {largest:g}, the largest {'half float' if half else 'value'}")
+    image = _image(path, names, planes)
+    return (image[..., :3] if len(names) > 2 else image[..., [0, 0, 0]]), part.layout
 
 
 def exr_has_alpha(path: Path) -> bool:
     """Whether `read_exr_image` returns colour with alpha, by the header; raises InputError as that does."""
-    exr_size(path)
-    header = _header(path)
-    return len(_image_channels(path, [channel.name for channel in header["channels"]], header, False)) == 4
+    return len(_read(path, pixels=False)[1]) == 4
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of an EXR file's data window; raises InputError as `read_exr`."""
-    require_file(path)
-    header = _header(path)
-    (left, top), (right, bottom) = header["dataWindow"]
-    width, height = int(right) - int(left) + 1, int(bottom) - int(top) + 1
-    check_size(path, width, height, SAMPLE_BYTES * len(header["channels"]))
-    return width, height
-
-
-def _header(path: Path) -> dict[str, Any]:
-    import OpenEXR
-
-    with _readable(path, "header"), OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-        header = dict(file.header())
-        if len(file.parts) > 1 or header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
-            raise ValueError("several parts, or deep pixels")
-        (left, top), (right, bottom) = header["dataWindow"]
-        if right < left or bottom < top:
-            raise ValueError("an empty data window")
-    return header
-
-
-def _image_channels(
-    path: Path, channels: Collection[str], header: Mapping[str, Any], vectors: bool
-) -> list[str]:
-    """The channels of an image, in order; raises InputError as `read_exr_image` does."""
-    primaries = header.get("chromaticities", SRGB)
-    if "R" in channels and not np.allclose(primaries, SRGB, atol=CHROMATICITY_TOLERANCE):
-        raise InputError("not those of sRGB", path, "chromaticities", "convert the image to linear sRGB")
-    for names in ("RGBA", "RGB", *(("XYZ",) if vectors else ()), "YA"):
-        if set(names) <= set(channels):
-            return list(names)
-    if len(channels) == 1:
-        return list(channels)
-    remedy = f"export R, G, B (and A), {'X, Y, Z, ' if vectors else ''}or one channel (and A)"
-    raise InputError(f"found {', '.join(sorted(channels))}", path, "channels", remedy)
-
-
-@contextlib.contextmanager
-def _readable(path: Path, field: str = "pixels") -> Iterator[None]:
-    """Turn what OpenEXR raises (RuntimeError, TypeError or its own types) into InputError."""
-    try:
-        yield
-    except Exception as error:
-        raise InputError(f"not a readable EXR file ({error})", path, field, "export it again") from error
+    """Width and height of an EXR file's display window; raises InputError as `read_exr_image`."""
+    return _read(path, pixels=False)[0].size
 
 
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
@@ -114,21 +212,3 @@ def write_exr_layers(path: str | Path, layers: Mapping[str, np.ndarray]) -> None
     channels = {name: np.ascontiguousarray(plane) for name, plane in layers.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     replace_file(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
-
-
-@contextlib.contextmanager
-def mitsuba_exr() -> Iterator[None]:
-    """Give Dr.Jit a second thread, if it has only one, while Mitsuba itself may read or write EXR files."""
-    import drjit as dr
-
-    before = dr.thread_count()
-    if before >= MITSUBA_EXR_THREADS:
-        yield
-        return
-    dr.sync_thread()
-    dr.set_thread_count(MITSUBA_EXR_THREADS)
-    try:
-        yield
-    finally:
-        dr.sync_thread()
-        dr.set_thread_count(before)

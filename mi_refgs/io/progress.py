@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 
 TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0  # seconds between refreshes of a bar: in a terminal, in a file
+_NOTED: set[tuple[Path, str]] = set()
 
 
 def say(message: str) -> None:
@@ -21,6 +23,13 @@ def warn(message: str) -> None:
     from tqdm import tqdm
 
     tqdm.write(f"refgs: warning: {message}", file=sys.stderr)
+
+
+def note(path: Path, what: str) -> None:
+    """Warn of how a file is read, once for all files of its folder of which this is to be said."""
+    if (path.parent, what) not in _NOTED:
+        _NOTED.add((path.parent, what))
+        warn(f"{path}: {what}")
 
 
 def progress_bar(total: int, what: str, **options: Any) -> Any:

@@ -9,19 +9,24 @@ from typing import Any
 import mitsuba as mi
 
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import mitsuba_exr
+from mi_refgs.shade.light.light_file import read_image, read_radiance
+
+IMAGES = {"envmap": read_radiance, "bitmap": lambda file: read_image(file)[0]}
+"""Readers of the files of Mitsuba's plugins."""
 
 
-def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) -> Any:
+def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False, optimize: bool = True) -> Any:
     """Load a scene, its `refgs` integrator with these AOVs (types, or `name:type`) after its own,
-    `object_only` without what surrounds the object. Raises InputError for what cannot be loaded, for a name
-    of two types, and for AOVs or `object_only` without that integrator."""
+    `object_only` without what surrounds the object, not to `optimize` with all its shapes and their ids.
+    Raises InputError for what cannot be loaded, for a name of two types, and for AOVs or `object_only`
+    without that integrator."""
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(str(path.parent.resolve()))
     mi.set_file_resolver(beside)
     try:
         config = mi.parser.ParserConfig(mi.variant())
+        config.merge_equivalent = config.merge_meshes = optimize
         state = mi.parser.parse_file(config, str(path))
         mi.parser.transform_all(config, state)
         if aovs or object_only:
@@ -37,8 +42,16 @@ def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False) 
             for name in ("surroundings", "background") if object_only else ():
                 if name in integrators[0]:
                     del integrators[0][name]
-        with mitsuba_exr():
-            loaded = mi.parser.instantiate(config, state)
+        for props in (node.props for node in state.nodes):
+            if props.plugin_name() in IMAGES and "filename" in props:
+                file = path.parent / str(beside.resolve(props["filename"]))
+                if file.suffix.lower() in (
+                    ".exr",
+                    ".hdr",
+                ):  # a broken one ends the process in Mitsuba's readers
+                    props["bitmap"] = mi.Bitmap(IMAGES[props.plugin_name()](file))
+                    del props["filename"]
+        loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
         raise InputError(reason(error), path, "scene") from error
     finally:

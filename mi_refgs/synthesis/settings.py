@@ -12,8 +12,8 @@ import numpy as np
 
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import mitsuba_exr
 from mi_refgs.io.files import make_folder, read_json, write_json
+from mi_refgs.render import load_scene as scenes
 from mi_refgs.shade.light.latlong import Z_UP
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.options import OPTIONS, LightFile
@@ -33,11 +33,7 @@ FILES = (
 
 def load_scene(scene: Path) -> Any:
     """Load a Mitsuba scene with all shapes and their ids: Mitsuba would merge meshes of one material."""
-    try:
-        with mitsuba_exr():
-            loaded = mi.load_file(str(scene), optimize=False)
-    except (RuntimeError, UnicodeError) as error:  # Mitsuba quotes bytes of the file
-        raise InputError(f"Mitsuba cannot load it: {error}", scene, "scene", "correct the scene") from error
+    loaded = scenes.load_scene(scene, optimize=False)
     for kind, there in (("shapes", loaded.shapes()), ("emitters", loaded.emitters())):
         if not there:
             raise InputError("the scene has none", scene, kind, "add an object and a light")

@@ -17,13 +17,12 @@ import pytest
 from mi_refgs.cli import demo, main
 from mi_refgs.fitting.runner import load_method
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.io.exr import read_exr
 from mi_refgs.io.images import read_png, srgb_from_linear
 from mi_refgs.io.ownership import MARK
 from mi_refgs.methods.read import PRESETS, load_resolved
 from mi_refgs.runs.views import sized
 from tests.errors import LIST, listed
-from tests.helpers import ROOT, command_names, command_options, refused
+from tests.helpers import ROOT, command_names, command_options, read_exr, refused
 from tests.scenes.tiny import SIZE, train_command
 
 ARTEFACTS = ("surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "config.toml", "metrics.jsonl")

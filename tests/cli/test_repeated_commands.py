@@ -19,11 +19,10 @@ from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.io.exr import read_exr
 from mi_refgs.io.files import BusyError
 from mi_refgs.reconstruction import fit as reconstruct
 from mi_refgs.runs.run import LOCK, Run
-from tests.helpers import refused
+from tests.helpers import read_exr, refused
 from tests.scenes.sphere import SCENE
 from tests.scenes.tiny import METHOD, SETTINGS, train_command
 

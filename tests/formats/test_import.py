@@ -16,7 +16,6 @@ from mi_refgs.constants import GAUSSIAN_LOW_PASS
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.formats.cameras import read_cameras
 from mi_refgs.formats.splat_import import read_splats
-from mi_refgs.io.exr import read_exr
 from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import PinholeCamera
 from mi_refgs.reference.models import harmonics
@@ -24,7 +23,7 @@ from mi_refgs.render.display import displayed, image_array
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera
-from tests.helpers import refused
+from tests.helpers import read_exr, refused
 from tests.scenes.layouts import ply_bytes
 
 SIZE, FOCAL, COUNT = 48, 60.0, 40

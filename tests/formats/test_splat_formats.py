@@ -16,7 +16,6 @@ import pytest
 from mi_refgs.formats import Shot, write
 from mi_refgs.formats.gaussians import THIN, gaussians
 from mi_refgs.formats.orbits import shots_around
-from mi_refgs.io.exr import read_exr
 from mi_refgs.render.display import display_image, image_array
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
@@ -28,7 +27,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import SH_DC, logit
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import refused
+from tests.helpers import read_exr, refused
 
 COUNT, SIZE = 1500, 64
 BACKWARDS = np.diag([-1.0, 1.0, -1.0, 1.0])  # half a turn about the camera's y axis

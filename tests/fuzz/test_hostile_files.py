@@ -13,7 +13,7 @@ import pytest
 from trimesh.resolvers import FilePathResolver
 
 from mi_refgs.errors import abbreviated
-from mi_refgs.io.exr import read_exr, write_exr
+from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.files import read_json
 from mi_refgs.io.images import image_size, read_png
 from mi_refgs.occlusion.mesh import read_mesh
@@ -78,7 +78,7 @@ def test_images_with_huge_sizes_are_refused(tmp_path: Path) -> None:
     assert window in good and image_size(tmp_path / "b.exr") == (6, 4)
     for corner in ((99_999, 99_999), (-5, 3), (2**31 - 1, 2**31 - 1)):
         other = good.replace(window, struct.pack("<4i", 0, 0, *corner))
-        refuse_file(read_exr, tmp_path / "a.exr", other)
+        refuse_file(read_exr_image, tmp_path / "a.exr", other)
         refuse_file(image_size, tmp_path / "a.exr", other)
 
 

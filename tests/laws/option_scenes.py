@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mi_refgs.io.exr import mitsuba_exr, write_exr
+from mi_refgs.io.exr import write_exr
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.plugins.aovs import suffixes
 from mi_refgs.render.load_scene import load_scene
@@ -184,8 +184,7 @@ def build(case: Case, found: Values, folder: Path) -> Built:
     if case["input"] == "xml":
         path = folder / "scene.xml"
         path.write_bytes(ElementTree.tostring(xml(scene, "")))
-        with mitsuba_exr():
-            loaded: Any = mi.load_file(str(path))
+        loaded: Any = mi.load_file(str(path))
     else:
         loaded = mi.load_dict(scene)
     return _built(loaded, loaded.sensors()[0], found)

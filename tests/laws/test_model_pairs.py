@@ -22,7 +22,7 @@ from mi_refgs.compare import execute
 from mi_refgs.compare.worker import fit_and_measure
 from mi_refgs.evaluation.evaluate import render_names
 from mi_refgs.evaluation.images import displayed_over
-from mi_refgs.io.exr import read_exr, write_exr
+from mi_refgs.io.exr import write_exr
 from mi_refgs.io.images import read_png
 from mi_refgs.methods.extensions import EVENTS, INITIALISERS, LOSSES
 from mi_refgs.runs.export import save
@@ -31,7 +31,7 @@ from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.viewer_scene import DisplayOptions, planes_of
-from tests.helpers import refused, slow
+from tests.helpers import read_exr, refused, slow
 from tests.scenes.integrator import raw_channels, sky, two_balls
 from tests.scenes.tiny import METHOD, train_command, write_data
 

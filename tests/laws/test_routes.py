@@ -21,7 +21,6 @@ from mi_refgs import Reconstruction, import_splats, load
 from mi_refgs.cli import main
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL
 from mi_refgs.formats import FORMATS, Shot
-from mi_refgs.io.exr import read_exr
 from mi_refgs.methods import read
 from mi_refgs.plugins.aovs import suffixes, values_of_planes
 from mi_refgs.reconstruction.provenance import Provenance
@@ -41,6 +40,7 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.viewer_scene import BACKGROUND, IMAGE, DisplayOptions, planes_of
+from tests.helpers import read_exr
 from tests.laws.covering import covering_array, marked
 from tests.laws.option_scenes import xml
 from tests.scenes.integrator import (

@@ -209,7 +209,7 @@ def test_settings_out_of_range(made: Path, tmp_path: Path, field: str, value: An
     [
         (None, "missing"),
         ("<scene", "not XML"),
-        ('<scene version="3.0.0"><shape type="blob"/></scene>', "cannot load"),
+        ('<scene version="3.0.0"><shape type="blob"/></scene>', "scene.xml: scene: "),
         ('<scene version="3.0.0"><shape type="sphere"/></scene>', "emitters: the scene has none"),
     ],
 )

@@ -1,45 +1,163 @@
-"""Lat-long images of lights."""
+"""Lights in image files: lat-long images, and cubes and angular maps, which become lat-long."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
-from mi_refgs.errors import InputError
-from mi_refgs.io.exr import EXR_MAGIC, read_exr_image
+from mi_refgs.errors import InputError, counted
+from mi_refgs.io.exr import EXR_MAGIC, read_exr_light
+from mi_refgs.io.files import require_file
 from mi_refgs.io.hdr import read_hdr
-from mi_refgs.io.images import linear_from_srgb, read_bytes
-from mi_refgs.shade.light.lobe_matrices import resample
+from mi_refgs.io.images import box_downscale, linear_from_srgb, read_bytes
+from mi_refgs.io.progress import note
+from mi_refgs.shade.light.lobe_matrices import map_directions, resample
 
 MAX_ROWS = 4096  # most rows that are kept of a map: 400 MB of float32
+CONVERTED_ROWS = 1024  # most rows of a map that was a cube or an angular map
+ASPECT = 0.05  # by which the aspect of a lat-long image differs from 2 without a word
+EVEN = 0.01  # range of values, by the median of the picture, where a cross or an angular map has no picture
+RIGHT, UP, FRONT = AXES = np.diag((-1.0, 1.0, 1.0))  # from inside; front is the middle of a lat-long image
+FACES = np.array(
+    [
+        [RIGHT, -FRONT, UP],
+        [-RIGHT, FRONT, UP],
+        [UP, RIGHT, -FRONT],
+        [-UP, RIGHT, FRONT],
+        [FRONT, RIGHT, UP],
+        [-FRONT, -RIGHT, UP],
+    ]
+)
+"""Of the faces of a cube in OpenGL's order: the middle, the directions along rows and up columns."""
+CROSSES = {
+    (4, 3): [(1, 2), (1, 0), (0, 1), (2, 1), (1, 1), (1, 3)],
+    (3, 4): [(1, 2), (1, 0), (0, 1), (2, 1), (1, 1), (3, 1)],
+}
+"""Row and column of each face, by columns and rows of the cross; below the bottom, the back is turned."""
 
 
 def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndarray:
-    """Linear radiance (h, w, 3) float32 ≥ 0 of a lat-long EXR, HDR, PNG or JPEG file, averaged to at most
-    `rows` rows and 2 · `rows` columns. Raises InputError for other images and above `files.MAX_PIXELS`."""
+    """Linear radiance (h, w, 3) float32 ≥ 0 of an EXR, HDR, PNG or JPEG file, averaged to at most `rows` rows
+    and 2 · `rows` columns: lat-long, or converted from a cube (EXR's `envmap`; six faces in a row, column or
+    cross) or an angular map (a square around a disc). Raises InputError for other images and above
+    `files.MAX_PIXELS`."""
     path = Path(path)
-    image = np.maximum(_read(path), 0)
+    image, layout = read_image(path)
+    if below := int(np.count_nonzero((image < 0).any(axis=-1))):
+        note(path, f"{counted(below, 'texel')} below 0 set to 0")
+        image = np.maximum(image, 0)
     height, width, _ = image.shape
+    size = f"{width} × {height} pixels"
     if min(height, width) < 2:
-        size = f"{width} × {height} pixels"
         raise InputError(f"{size} are no lat-long image", path, "environment", "give 2 × 2 at least")
+    limit, faces = min(rows, CONVERTED_ROWS), None if layout == "lat-long" else _faces(image, layout)
+    if layout == "cube" and faces is None:
+        remedy = "export six square faces in a column, or a lat-long image"
+        raise InputError(f"a cube, but of {width} × {height} pixels", path, "envmap", remedy)
+    if faces is not None:
+        if layout is None:
+            note(path, f"{size} are read as the faces of a cube, in OpenGL's order")
+        image = _from_cube(faces, limit, edges=layout == "cube")
+    elif layout is None and _is_disc(image):
+        note(path, f"{size} are read as an angular map (light probe), not as a photograph of a mirror ball")
+        image = _from_angular(image, limit)
+    elif abs(width / height - 2) > ASPECT and width != 2 * (height - 1):
+        note(path, f"{size} are stretched over the sphere; a lat-long image is twice as wide as high")
+    height, width, _ = image.shape
     return np.ascontiguousarray(resample(image, min(height, rows), min(width, 2 * rows)))
 
 
-def _read(path: Path) -> np.ndarray:
-    """Linear radiance (h, w, 3) float32 of a file, whose first bytes say which format it is."""
-    try:
-        with path.open("rb") as file:
-            first = file.read(4)
-    except OSError as error:
-        what = f"cannot be read ({error.strerror})"
-        raise InputError(what, path, "environment", "give an EXR or HDR file") from error
+def read_image(path: Path) -> tuple[np.ndarray, str | None]:
+    """Linear colour (h, w, 3) float32 of a file, whose first bytes say its format, and `exr.Part.layout`."""
+    require_file(path)
+    with path.open("rb") as file:
+        first = file.read(4)
     if first[:2] == b"#?":
-        return read_hdr(path)
+        return read_hdr(path), None
     if first == EXR_MAGIC:
-        image = read_exr_image(path)
-        return image[..., :3] if image.shape[2] > 2 else np.repeat(image[..., :1], 3, axis=-1)
+        return read_exr_light(path)
     pixels = read_bytes(path)[0][..., :3].astype(np.float32)
-    return np.asarray(linear_from_srgb(pixels / np.float32(255)))
+    return np.asarray(linear_from_srgb(pixels / np.float32(255))), None
+
+
+def _is_even(outside: np.ndarray, picture: np.ndarray) -> bool:
+    """Whether pixels (…, 3) outside of a picture have one colour, such as black."""
+    return bool(np.ptp(outside.reshape(-1, 3), axis=0).max() <= EVEN * np.median(picture))
+
+
+def _faces(image: np.ndarray, layout: str | None) -> np.ndarray | None:
+    """The faces (6, n, n, 3) of a cube as those of FACES; None for other images."""
+    height, width, _ = image.shape
+    if height == 6 * width or (width == 6 * height and layout is None):
+        faces = np.stack(np.split(image, 6, axis=0 if height > width else 1))
+        if layout == "cube":  # of OpenEXR (ImfEnvmap.h): the first two are swapped, the next two upside down
+            faces = np.concatenate([faces[1::-1], faces[2:4, ::-1, ::-1], faces[4:]])
+        return faces
+    for (columns, rows), cells in CROSSES.items():
+        n = width // columns
+        if (columns * n, rows * n) == (width, height) and layout is None:
+            grid = image.reshape(rows, n, columns, n, 3).swapaxes(1, 2)
+            faces = np.stack([grid[cell] for cell in cells])
+            faces[5] = faces[5, ::-1, ::-1] if rows > columns else faces[5]
+            rest = [grid[cell] for cell in np.ndindex(rows, columns) if cell not in cells]
+            return faces if _is_even(np.stack(rest), faces) else None
+    return None
+
+
+def _is_disc(image: np.ndarray) -> bool:
+    """Whether an image is square, and even outside of its largest disc."""
+    height, width, _ = image.shape
+    radius = np.hypot(*np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j])
+    return height == width and _is_even(image[radius > 1 + 4 / width], image[radius < 1])
+
+
+def _from_cube(faces: np.ndarray, limit: int, edges: bool) -> np.ndarray:
+    """A lat-long image of at most `limit` rows; with `edges`, the outer pixels of a face are on its edges."""
+    n = faces.shape[1]
+
+    def place(directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        face = (directions @ FACES[:, 0].T).argmax(axis=1)
+        depth, right, up = np.einsum("ij,ikj->ki", directions, FACES[face])
+        scale = (n - 1) / n / depth if edges else 1 / depth
+        return face, -up * scale, right * scale
+
+    return _lat_long(faces, place, min(2 * n, limit), 4 * n)
+
+
+def _from_angular(image: np.ndarray, limit: int) -> np.ndarray:
+    """A lat-long image of at most `limit` rows. The distance from the middle of the disc is proportional to
+    the angle from the front. [Debevec, "Rendering synthetic objects into real scenes", 1998]"""
+    n = len(image)
+
+    def place(directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        right, up, front = AXES @ directions.T
+        across = np.hypot(right, up)
+        radius = np.minimum(np.arctan2(across, front) / np.pi, 1 - 1.5 / n)  # no pixel beyond the disc
+        scale = radius / np.maximum(across, 1e-9)
+        return np.zeros(len(up), int), -up * scale, right * scale
+
+    return _lat_long(image[None], place, min(max(n // 2, 2), limit), n)
+
+
+def _lat_long(
+    pictures: np.ndarray, place: Callable[[np.ndarray], tuple[np.ndarray, ...]], height: int, turn: int
+) -> np.ndarray:
+    """A lat-long image of square pictures (k, n, n, 3) with `turn` pixels in 360°; `place` returns, for
+    directions (m, 3), the number of the picture, and the place in it from -1 to 1, down and to the right."""
+    n = pictures.shape[1]
+    factor = next(f for f in range(max(turn // (4 * height), 1), 0, -1) if n % f == 0)
+    pictures = np.stack([box_downscale(picture, factor) for picture in pictures])
+    n //= factor
+
+    def row(directions: np.ndarray) -> np.ndarray:
+        picture, down, right = place(directions)
+        at = picture, (n * (1 + down) - 1) / 2, (n * (1 + right) - 1) / 2
+        return np.stack(
+            [map_coordinates(pictures[..., c], at, order=1, mode="nearest") for c in range(3)], -1
+        )
+
+    return resample(np.stack([row(directions) for directions in map_directions(2 * height)]), height)
