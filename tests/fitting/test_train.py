@@ -157,53 +157,40 @@ def test_a_step_on_a_crop_has_its_gradient(method: Method, monkeypatch: pytest.M
     assert np.abs(gradients[0]["position"]).max() > 0
 
 
-def send_in_iteration_7(monkeypatch: pytest.MonkeyPatch, *numbers: int) -> list[int]:
-    """Send this process signals before the events of iteration 7; returns whether all were held."""
-    due, held = Densify.due, list[int]()
-
-    def interrupted(event: Densify, trainer: Trainer) -> bool:
-        if trainer.iteration == 7:
-            for number in numbers:
-                os.kill(os.getpid(), number)
-            held.append(7)
-        return due(event, trainer)
-
-    monkeypatch.setattr(Densify, "due", interrupted)
-    return held
-
-
 @pytest.mark.parametrize(
-    ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, TerminatedError)]
+    ("numbers", "raised", "saved"),
+    [
+        ([signal.SIGINT], KeyboardInterrupt, 7),
+        ([signal.SIGTERM], TerminatedError, 7),
+        ([signal.SIGTERM, signal.SIGINT], TerminatedError, 5),  # the second one is not held
+    ],
 )
 @pytest.mark.usefixtures("heard_interrupts")
 def test_signal_waits_for_step_in_hand(
-    number: int, raised: type, method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    numbers: list[int],
+    raised: type,
+    saved: int,
+    method: Method,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A signal inside iteration 7, before its events: the checkpoint contains the whole iteration."""
-    run = run_folder(tmp_path / "run", method)
-    trainer = Trainer(method, ball(), run)
-    send_in_iteration_7(monkeypatch, number)
-    before = signal.getsignal(number)
+    """Inside iteration 7, before its events: the newest checkpoint contains a whole iteration."""
+    run, due = run_folder(tmp_path / "run", method), Densify.due
+
+    def interrupted(event: Densify, trainer: Trainer) -> bool:
+        for number in numbers if trainer.iteration == 7 else ():
+            os.kill(os.getpid(), number)
+        return due(event, trainer)
+
+    monkeypatch.setattr(Densify, "due", interrupted)
+    trainer, before = Trainer(method, ball(), run), signal.getsignal(numbers[0])
     with pytest.raises(KeyboardInterrupt) as caught:
         trainer.train()
-    assert caught.type is raised and signal.getsignal(number) is before
+    assert caught.type is raised and signal.getsignal(numbers[0]) is before
     state = run.load_checkpoint()
-    assert state is not None and int(state["iteration"]) == 7
+    assert state is not None and int(state["iteration"]) == saved
     for name, value in trainer.state().items():
-        assert np.array_equal(state[name], value), name
-
-
-def test_second_signal_is_not_held(
-    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, heard_interrupts: None
-) -> None:
-    """Twice within iteration 7, which ends it there; what was saved before is whole."""
-    run = run_folder(tmp_path / "run", method)
-    trainer = Trainer(method, ball(), run)
-    held = send_in_iteration_7(monkeypatch, signal.SIGTERM, signal.SIGINT)
-    with pytest.raises(TerminatedError):
-        trainer.train()
-    state = run.load_checkpoint()
-    assert not held and state is not None and int(state["iteration"]) == 5
+        assert saved == 5 or np.array_equal(state[name], value), name
 
 
 def test_signal_that_was_ignored_stays_ignored() -> None:
