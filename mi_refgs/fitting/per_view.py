@@ -61,9 +61,3 @@ def corrected(setup: FitSetup, params: Mapping[str, TensorXf], view: int, camera
     rotation = dr.quat_to_matrix(mi.Matrix3f, dr.normalize(mi.Quaternion4f(*(0.5 * x for x in row[:3]), 1)))
     centre = mi.Point3f(*(dr.opaque(mi.Float, x) for x in setup.focus))
     return camera.displaced(rotation, centre, dr.opaque(mi.Float, setup.reach) * mi.Vector3f(*row[3:]))
-
-
-def camera_of(setup: FitSetup, params: Mapping[str, TensorXf], view: int) -> Camera:
-    """The corrected camera of a training view, without derivatives."""
-    with dr.suspend_grad():
-        return corrected(setup, params, view, setup.data.views[view].camera())

@@ -13,20 +13,13 @@ import numpy as np
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.data import checks
+from mi_refgs.data import object_region as regions
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.object_region import (
-    DENSE,
-    SPARSE,
-    camera_positions,
-    object_region,
-    seen_share,
-    shown_whole,
-)
 from mi_refgs.data.region import REGION_FILE, region_pixels
 from mi_refgs.data.stereo import stereo
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.decide import HOLDOUT, as_decided, differences, waiting
-from mi_refgs.fitting.per_view import camera_of, gains_of
+from mi_refgs.fitting.per_view import gains_of
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.resources import resource_dir
@@ -107,7 +100,6 @@ def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, pro
     else:
         run.require_none()
         method, views = chosen(data, choice, progress.say)
-        method.require_registered()
     if not views.has_alpha and (method.surroundings is None or views.region is None):
         what = "surfels start at random, and model the background too"
         progress.warn(f"{views.path}: images without alpha: {what}")
@@ -236,16 +228,16 @@ def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn
     if region is None or views.has_alpha:
         return views
     if region.estimated and points is not None:
-        seen, origins = partial(seen_share, views.views), camera_positions(views.views)
-        shown, scatter = points.position, SPARSE
+        seen, origins = partial(regions.seen_share, views.views), regions.camera_positions(views.views)
+        shown, scatter = points.position, regions.SPARSE
         if surfaces is not None:
-            shown, scatter = surfaces, DENSE
-        found = object_region(region, origins, shown, seen, scatter)
+            shown, scatter = surfaces, regions.DENSE
+        found = regions.object_region(region, origins, shown, seen, scatter)
         if found.planes:
             tell(f"{views.path}: region of interest: it ends above the plane that supports the object")
         if found.radius > region.radius:
             tell(f"{views.path}: region of interest: it has grown to {found.radius:.3g} units")
-        if not shown_whole(views.views, found, shown, scatter):
+        if not regions.shown_whole(views.views, found, shown, scatter):
             warn(f"{views.path}: no image shows the whole object; add some from farther away")
         region = found
     if not any(region_pixels(view, region).any() for view in views.views):
@@ -258,12 +250,11 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     """Save the state if no checkpoint contains it, and write the artefacts; returns a warning, if any."""
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
         run.save_checkpoint(trainer.iteration, trainer.state())
-    setup, params = trainer.setup, trainer.fit.params
-    names = [view.name for view in setup.data.views]
-    if (gains := gains_of(params)) is not None:
+    names = [view.name for view in trainer.data.views]
+    if (gains := gains_of(trainer.fit.params)) is not None:
         run.write_json(EXPOSURE, {"gain": dict(zip(names, gains.round(5).tolist(), strict=True))})
-    if POSE in params:
-        poses = [camera_of(setup, params, i).pose().tolist() for i in range(len(names))]
+    if POSE in trainer.fit.params:
+        poses = [trainer.camera(i).pose().tolist() for i in range(len(names))]
         run.write_json(CAMERAS, {"to_world": dict(zip(names, poses, strict=True))})
     if isinstance(light := trainer.fit.light, PlacedLight):
         scale = [1] * 3 if light.scale is None else np.exp(light.scale.numpy()[0]).tolist()
