@@ -19,7 +19,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.integrator import sky
+from tests.scenes import integrator as scenes
 
 COUNT, WIDTH, HEIGHT, FOCAL = 40, 24, 16, 26.0
 LIGHT_ROWS = 16
@@ -44,14 +44,9 @@ class View:
 
     def sensor(self) -> dict[str, Any]:
         """As Mitsuba's scenes have it."""
-        film = {"type": "hdrfilm", "width": self.width, "height": self.height, "pixel_format": "rgba"}
-        return {
-            "type": "perspective",
-            "fov": float(2 * np.degrees(np.arctan(self.width / 2 / FOCAL))),
-            "to_world": mi.ScalarTransform4f(self.to_world),
-            "film": film | {"rfilter": {"type": "box"}},
-            "sampler": {"type": "independent", "sample_count": 1},
-        }
+        film = {"width": self.width, "height": self.height, "pixel_format": "rgba"}
+        fov = float(2 * np.degrees(np.arctan(self.width / 2 / FOCAL)))
+        return scenes.sensor(fov=fov, to_world=mi.ScalarTransform4f(self.to_world), film=film)
 
     def moved(self, matrix: np.ndarray) -> View:
         return replace(self, to_world=matrix @ self.to_world)
@@ -109,7 +104,7 @@ DISCS = SCENES.filter(lambda scene: scene.raw["scale"].shape[1] == 2)
 
 @cache
 def light() -> Any:
-    return EnvironmentLight.from_radiance(sky(LIGHT_ROWS)).prefilter()
+    return EnvironmentLight.from_radiance(scenes.sky(LIGHT_ROWS)).prefilter()
 
 
 def draw(scene: Scene, shading: Shading = SHADINGS[0], by: Any = None) -> dict[str, np.ndarray]:

@@ -30,6 +30,7 @@ from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.laws.covering import Case
 from tests.laws.option_cases import ACCURACY, CROPS, FORMATS, FOV, HEIGHT, NEAR, WIDTH
+from tests.scenes import integrator as scenes
 from tests.scenes.integrator import raw_channels, sky
 
 Values = dict[str, np.ndarray]
@@ -128,19 +129,13 @@ def shading(case: Case) -> Shading:
 
 def sensor(case: Case) -> dict[str, Any]:
     x, y, width, height = CROPS[case["crop"]]
-    film: dict[str, Any] = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}
+    film: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "rfilter": {"type": case["rfilter"]}}
     film["pixel_format"] = FORMATS[case["colour"]] if case["alpha"] else case["colour"]
-    film |= {"component_format": case["component_format"], "filter": {"type": case["rfilter"]}}
+    film["component_format"] = case["component_format"]
     if case["crop"] != "none":
         film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
-    return {
-        "type": "perspective",
-        "fov": FOV,
-        "near_clip": NEAR,
-        "to_world": mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1]),
-        "film": film,
-        "sampler": {"type": "independent", "sample_count": case["samples"]},
-    }
+    sampler = {"type": "independent", "sample_count": case["samples"]}
+    return scenes.sensor(fov=FOV, near_clip=NEAR, film=film, sampler=sampler)
 
 
 def surfels_of(found: Values, prefix: str = "") -> Surfels:

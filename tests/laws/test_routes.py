@@ -43,14 +43,7 @@ from mi_refgs.viewer.viewer_scene import BACKGROUND, IMAGE, DisplayOptions, plan
 from tests.helpers import read_exr
 from tests.laws.covering import covering_array, marked
 from tests.laws.option_scenes import xml
-from tests.scenes.integrator import (
-    OTHER_OPTIONS,
-    background_light,
-    far_channels,
-    raw_channels,
-    sky,
-    two_balls,
-)
+from tests.scenes import integrator as scenes
 
 WIDTH, HEIGHT, FOV, NEAR = 16, 12, 40.0, 0.05
 CROP = (4, 3, 9, 7)  # offset and size of a crop window, pixels
@@ -72,7 +65,9 @@ def shadings() -> list[tuple[Shading, str]]:
             found[Shading(Shading(order, name).shaded_at, name), "surfel"] = None
         plain = Shading(Shading(model.shaded_at[0], name).shaded_at, name, diffuse="irradiance")
         traced = replace(plain, occlusion=plain.traceable)
-        options = {key: OTHER_OPTIONS[key] for key in model.honoured if traced.occlusion or key not in TRACED}
+        options = {
+            key: scenes.OTHER_OPTIONS[key] for key in model.honoured if traced.occlusion or key not in TRACED
+        }
         if options:
             found[replace(traced, **options), "surfel"] = None
     return [*found]
@@ -82,13 +77,12 @@ SHADINGS = shadings()
 
 
 def lens(crop: bool) -> dict[str, Any]:
-    film: dict[str, Any] = {"type": "hdrfilm", "pixel_format": "rgba", "component_format": "float32"}
-    film |= {"width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
+    film: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
+    film |= {"pixel_format": "rgba", "component_format": "float32"}
     if crop:
         names = "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"
         film |= dict(zip(names, CROP, strict=True))
-    to_world = mi.ScalarTransform4f().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1])
-    return {"type": "perspective", "fov": FOV, "near_clip": NEAR, "to_world": to_world, "film": film}
+    return scenes.sensor(fov=FOV, near_clip=NEAR, film=film)
 
 
 def sensor(crop: bool = False) -> Any:
@@ -98,23 +92,23 @@ def sensor(crop: bool = False) -> Any:
 def trained(shading: Shading, primitive: str, around: str, meshed: bool, bare: bool) -> TrainedScene:
     """Few surfels with sharp and with soft outlines, of every channel or with their colours alone."""
     rng = np.random.default_rng(3)
-    raw = raw_channels()
+    raw = scenes.raw_channels()
     raw["scale"] = raw["scale"] - 0.7
     raw["opacity"] = raw["opacity"] + rng.uniform(0, 5, raw["opacity"].shape).astype(np.float32)
     raw["tint"] = rng.normal(size=raw["albedo"].shape).astype(np.float32)
     raw["normal_offset"] = 0.1 * rng.normal(size=raw["albedo"].shape).astype(np.float32)
-    others = far_channels()
+    others = scenes.far_channels()
     for table in (raw,) * (primitive == "gaussian") + (others,):  # surroundings are Gaussians, as in a fit
         table["scale"] = np.concatenate([table["scale"], table["scale"][:, :1] - 1], axis=1)
     if bare:
         raw = {name: raw[name] for name in ("position", "rotation", "scale", "opacity", "radiance_sh")}
-    map_behind = background_light() if around == "surroundings and a map" else None
-    lit = EnvironmentLight.from_radiance(sky()) if "albedo" in raw else None
+    map_behind = scenes.background_light() if around == "surroundings and a map" else None
+    lit = EnvironmentLight.from_radiance(scenes.sky()) if "albedo" in raw else None
     near = NearField(np.array([0.1, -0.2, 0.3]), rng.uniform(0, 0.5, (8, 16)).astype(np.float32))
     return TrainedScene(
         Surfels.from_numpy(raw),
         lit,
-        two_balls() if meshed or shading.occlusion else None,
+        scenes.two_balls() if meshed or shading.occlusion else None,
         shading,
         7,
         1.5,
