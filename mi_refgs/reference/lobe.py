@@ -93,13 +93,11 @@ def normal_reflectance(albedo: Array, metallic: float | Array) -> Array:
     return 0.04 * (1 - metallic) + albedo * metallic
 
 
-def diffuse_reflectance(
-    albedo: Array, metallic: float, roughness: float, n_dot_v: float, nodes: int = 400
-) -> Array:
+def diffuse_reflectance(albedo: Array, metallic: float, roughness: float, n_dot_v: float) -> Array:
     """(1 - F0 A - B) (1 - metallic) albedo, (3,): what the base reflects of the rest; 0 from behind."""
     if n_dot_v <= 0:
         return np.zeros(3)
-    a, b = split_sum_entry(n_dot_v, roughness, nodes)
+    a, b = split_sum_entry(n_dot_v, roughness, 400)
     return (1 - normal_reflectance(albedo, metallic) * a - b) * (1 - metallic) * albedo
 
 
@@ -122,22 +120,15 @@ def brdf_cosine(
 
 
 def reflected_radiance(
-    incoming: Incoming,
-    albedo: Array,
-    metallic: float,
-    roughness: float,
-    normal: Array,
-    view: Array,
-    *,
-    nodes: int = 400,
+    incoming: Incoming, albedo: Array, metallic: float, roughness: float, normal: Array, view: Array
 ) -> Array:
     """∫ L f cosθ dω (3,) under `brdf_cosine`, by midpoints: the diffuse part over cos²θ."""
-    s, turn = (x.ravel() for x in np.meshgrid(*[(np.arange(nodes) + 0.5) / nodes] * 2))
+    s, turn = (x.ravel() for x in np.meshgrid(*[(np.arange(400) + 0.5) / 400] * 2))
     φ = 2 * math.pi * turn
     local = np.stack([np.sqrt(1 - s) * np.cos(φ), np.sqrt(1 - s) * np.sin(φ), np.sqrt(s)], axis=1)
     base = diffuse_reflectance(albedo, metallic, roughness, float(normal @ view))
     diffuse = base * incoming(local @ frame(normal)).mean(0)
-    return diffuse + reflected(incoming, normal, view, roughness, normal_reflectance(albedo, metallic), nodes)
+    return diffuse + reflected(incoming, normal, view, roughness, normal_reflectance(albedo, metallic), 400)
 
 
 def traced_fraction(

@@ -89,10 +89,10 @@ def half_metal(metallic: Array, alpha: Array) -> float:
     return float(np.mean(alpha * metallic * (1 - metallic)))
 
 
-def irradiances(level: Array, count: int = 256) -> Array:
-    """Colours (count, 3) of an irradiance map in the directions of a spherical Fibonacci lattice around y."""
-    i = np.arange(count)
-    z = 1 - (2 * i + 1) / count
+def irradiances(level: Array) -> Array:
+    """Colours (256, 3) of an irradiance map in the directions of a spherical Fibonacci lattice around y."""
+    i = np.arange(256)
+    z = 1 - (2 * i + 1) / 256
     φ, ring = i * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - z * z)
     return radiance_of(level, np.stack([ring * np.cos(φ), ring * np.sin(φ), z], axis=1))
 
@@ -114,14 +114,12 @@ def light_difference(
     return float(np.sum(area[:, None] * each) / 3)
 
 
-def adam(
-    parameter: Array, gradients: list[Array], rates: list[Array | float], epsilon: float = 1e-15
-) -> Array:
-    """Adam in the form of its Algorithm 1 (bias-corrected moments); ε as in the efficient order."""
+def adam(parameter: Array, gradients: list[Array], rates: list[Array | float]) -> Array:
+    """Adam in the form of its Algorithm 1 (bias-corrected moments); ε = 1e-15 as in the efficient order."""
     θ, m, v = parameter.astype(np.float64), np.zeros(parameter.shape), np.zeros(parameter.shape)
     for t, (g, rate) in enumerate(zip(gradients, rates, strict=True), start=1):
         m = 0.9 * m + 0.1 * g
         v = 0.999 * v + 0.001 * g**2
         corrected_m, corrected_v = m / (1 - 0.9**t), v / (1 - 0.999**t)
-        θ = θ - rate * corrected_m / (np.sqrt(corrected_v) + epsilon / math.sqrt(1 - 0.999**t))
+        θ = θ - rate * corrected_m / (np.sqrt(corrected_v) + 1e-15 / math.sqrt(1 - 0.999**t))
     return θ

@@ -23,7 +23,6 @@ VOXEL = 1e-4  # so small that the offset of the rays' origins does not matter
 FLOOR, WALL, EYE = 2.0, 1.5, np.array([1.4, 1.2, 0.3])
 """A floor (y = 0) of depth FLOOR and twice that width, a wall (x = 0) WALL high on it, and the camera."""
 LOW_EYE = np.array([1.4, 0.3, 0.3])  # its mirror rays are so flat that they meet several walls of a `channel`
-WALL_COLOUR = (0.9, 0.6, 0.3)
 
 
 def corner(cells: int = 8) -> Mesh:
