@@ -21,6 +21,7 @@ from mi_refgs.reference.light import clip
 
 Array = np.ndarray
 Corner = tuple[int, int]
+Raw = dict[str, Array]  # channels by name
 GEOMETRY = ("position", "rotation", "scale", "opacity")
 
 
@@ -49,14 +50,14 @@ class Surfel:
     """Ray-plane intersection with a low-pass. [2DGS, Huang 2024, §4]"""
 
     @staticmethod
-    def culled(raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
+    def culled(raw: Raw, camera: PinholeCamera, rules: Rules) -> Array:
         centre, axes = camera_frame(raw, camera)
         facing = np.abs(np.sum(centre * axes[:, 2], axis=1))
         out = ~(centre[:, 2] > camera.near) | ~(facing > rules.edge_on * np.linalg.norm(centre, axis=1))
         return out | (sigmoid(raw["opacity"][:, 0]) < rules.alpha_min)
 
     @staticmethod
-    def footprint(raw: dict[str, Array], camera: PinholeCamera, rules: Rules, x: Array, y: Array) -> Sample:
+    def footprint(raw: Raw, camera: PinholeCamera, rules: Rules, x: Array, y: Array) -> Sample:
         p, axes = camera_frame(raw, camera)
         σ = np.exp(raw["scale"])
         ray = ray_slopes(camera, x, y)
@@ -77,12 +78,12 @@ class Surfel:
         return Sample(alpha, z, unclamped.real, jump)
 
     @staticmethod
-    def normal(raw: dict[str, Array]) -> Array:
+    def normal(raw: Raw) -> Array:
         """The third axis."""
         return np.full(len(raw["position"]), 2)
 
     @staticmethod
-    def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
+    def sort_key(raw: Raw, camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
         """The depth of the plane at the tiles' centres, SORT_REACH σ from its own at most."""
         p, axes = camera_frame(raw, camera)
         σ = np.exp(raw["scale"])
@@ -103,12 +104,12 @@ class Gaussian:
     [Zwicker 2001, eq. 31; 3DGS, Kerbl 2023, eq. 5]"""
 
     @staticmethod
-    def culled(raw: dict[str, Array], camera: PinholeCamera, rules: Rules) -> Array:
+    def culled(raw: Raw, camera: PinholeCamera, rules: Rules) -> Array:
         depth = camera_frame(raw, camera)[0][:, 2]
         return ~(depth > camera.near) | (sigmoid(raw["opacity"][:, 0]) < rules.alpha_min)
 
     @staticmethod
-    def footprint(raw: dict[str, Array], camera: PinholeCamera, rules: Rules, x: Array, y: Array) -> Sample:
+    def footprint(raw: Raw, camera: PinholeCamera, rules: Rules, x: Array, y: Array) -> Sample:
         p, axes = camera_frame(raw, camera)
         σ, z = np.exp(raw["scale"]), p[:, 2]
         along = []  # pixels on the screen of one standard deviation along each axis, (N, 3) in x and in y
@@ -135,12 +136,12 @@ class Gaussian:
         return Sample(alpha, depth, unclamped.real, np.full(alpha.shape, np.inf))
 
     @staticmethod
-    def sort_key(raw: dict[str, Array], camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
+    def sort_key(raw: Raw, camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
         """The depth of the centre, in every tile."""
         return np.repeat(camera_frame(raw, camera)[0][:, 2:], len(pixels), axis=1)
 
     @staticmethod
-    def normal(raw: dict[str, Array]) -> Array:
+    def normal(raw: Raw) -> Array:
         """The shortest axis, the third of equal ones."""
         shortest = np.argmin(raw["scale"], axis=1)
         return np.where(raw["scale"][:, 2] <= raw["scale"].min(axis=1), 2, shortest)

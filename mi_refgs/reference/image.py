@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from mi_refgs import constants as c
 from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, ray_slopes, rotation_axes, sigmoid
-from mi_refgs.reference.footprint import Rules
+from mi_refgs.reference.footprint import Raw, Rules
 from mi_refgs.reference.light import Light, radiance_of
 from mi_refgs.reference.models import MATERIALS, MODELS, Options, Points, Taps, harmonics, positive, unit
 from mi_refgs.reference.splat import STEP, Blend, primitive_of
@@ -29,7 +29,7 @@ TERMS = ("diffuse", "specular", "indirect")
 class Scene:
     """What an image is rendered from. `order` (N, P): surfels from front to back at each pixel."""
 
-    raw: dict[str, Array]
+    raw: Raw
     camera: PinholeCamera
     pixels: Array  # (P,) raster indices
     order: Array
@@ -42,7 +42,7 @@ class Scene:
     options: Options = field(default_factory=Options)  # but its `diffuse`, which is the one above
     antialias: bool = False  # the mean over each pixel; of all pixels of the camera, and without gradients
     terms: bool = False  # also the terms of the radiance, premultiplied; these give the light no gradient
-    around: dict[str, Array] | None = None  # M rows, last in `order` (N + M, P); no gradients
+    around: Raw | None = None  # M rows, last in `order` (N + M, P); no gradients
     background: Array | None = None  # (h, 2h, 3) raw, seen behind both; radiance is log(1 + exp raw)
 
 
@@ -128,7 +128,7 @@ def sample_depth(scene: Scene) -> Array:
 class Features:
     """Features (N, K) of raw columns (N, D), by `layout`: normal, then what is blended besides."""
 
-    def __init__(self, scene: Scene, raw: dict[str, Array]) -> None:
+    def __init__(self, scene: Scene, raw: Raw) -> None:
         self.scene, self.normal = scene, primitive_of(raw).normal(raw)
         self.names = [name for name in raw if name not in ("scale", "opacity")]
         self.columns = np.concatenate([raw[name] for name in self.names], axis=1)

@@ -13,6 +13,7 @@ import numpy as np
 
 Array = np.ndarray
 Shape = Callable[[Array], Array]
+View = tuple[Array, float, int]
 
 HIT_DISTANCE = 1e-5  # a ray this close to a shape of unit size has hit it
 TRACE_STEPS, TRACE_FAR = 200, 20.0
@@ -73,16 +74,9 @@ def visible(shape: Shape, points: Array, direction: Array, clearance: float) -> 
 
 
 def fuse_point(
-    point: Array,
-    depths: list[Array],
-    views: list[tuple[Array, float, int]],
-    voxel: float,
-    *,
-    truncation_voxels: float,
-    unseen_vote: float,
+    point: Array, depths: list[Array], views: list[View], voxel: float, truncation: float, unseen_vote: float
 ) -> float:
     """Fused signed distance of one point, in truncations, by the table at the top of `occlusion.tsdf`."""
-    truncation = truncation_voxels * voxel
     total = weight = covered = 0.0
     for depth, (to_world, focal, size) in zip(depths, views, strict=True):
         x, y, z = to_world[:3, :3].T @ (point - to_world[:3, 3])

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.reference.camera import PinholeCamera
-from mi_refgs.reference.footprint import GEOMETRY, Gaussian, Rules, Sample, Surfel
+from mi_refgs.reference.footprint import GEOMETRY, Corner, Gaussian, Raw, Rules, Sample, Surfel
 
 Array = np.ndarray
 STEP = 1e-40
 
 
-def primitive_of(raw: dict[str, Array]) -> Any:
+def primitive_of(raw: Raw) -> Any:
     return Gaussian if raw["scale"].shape[1] == 3 else Surfel
 
 
@@ -39,7 +39,7 @@ class Maps:
 class Blend:
     """Footprints (N, P) of all tables, blended front to back."""
 
-    tables: Sequence[dict[str, Array]]  # raw channels
+    tables: Sequence[Raw]  # raw channels
     camera: PinholeCamera
     rules: Rules
     order: Array  # (N, P): rows from front to back at each pixel
@@ -57,12 +57,7 @@ class Blend:
 
     @staticmethod
     def of(
-        tables: Sequence[dict[str, Array]],
-        camera: PinholeCamera,
-        order: Array,
-        x: Array,
-        y: Array,
-        rules: Rules,
+        tables: Sequence[Raw], camera: PinholeCamera, order: Array, x: Array, y: Array, rules: Rules
     ) -> Blend:
         """Blend tables of raw channels at pixel centres x, y."""
         culled = np.concatenate([primitive_of(raw).culled(raw, camera, rules) for raw in tables])
@@ -121,30 +116,28 @@ class Blend:
         return gradients, self.weight @ δsums[:, :-2]
 
 
-def splat(raw: dict[str, Array], features: Array, camera: PinholeCamera, band: float = 1e-3) -> Maps:
+def splat(raw: Raw, features: Array, camera: PinholeCamera, band: float = 1e-3) -> Maps:
     """Render raw channels with features (N, K); `band` is the relative width of the declared band."""
     blend, shape = _whole_image(raw, camera), (camera.height, camera.width)
     sums = blend.sums(features).reshape(*shape, -1)
     return Maps(sums[..., :-2], sums[..., -2], sums[..., -1], blend.band(band).reshape(shape))
 
 
-def differentiate(
-    raw: dict[str, Array], features: Array, camera: PinholeCamera, weights: Array
-) -> dict[str, Array]:
+def differentiate(raw: Raw, features: Array, camera: PinholeCamera, weights: Array) -> dict[str, Array]:
     """Gradients of Σ weights · maps, for `weights` (K + 2, P): as the raw channels, and "features" (N, K)."""
     gradients, δfeatures = _whole_image(raw, camera).adjoint(features, weights.T)
     return gradients | {"features": δfeatures}
 
 
 def sorted_rows(
-    tables: Sequence[dict[str, Array]], camera: PinholeCamera, pixels: Array, corner: tuple[int, int] = (0, 0)
+    tables: Sequence[Raw], camera: PinholeCamera, pixels: Array, corner: Corner = (0, 0)
 ) -> Array:
     """Rows (N, P) of all tables from front to back at pixels (raster indices); `corner` as in `sort_key`."""
     keys = [primitive_of(raw).sort_key(raw, camera, pixels, corner) for raw in tables]
     return np.argsort(np.concatenate(keys), axis=0, kind="stable")
 
 
-def _whole_image(raw: dict[str, Array], camera: PinholeCamera) -> Blend:
+def _whole_image(raw: Raw, camera: PinholeCamera) -> Blend:
     pixels = np.arange(camera.width * camera.height)
     x, y = pixels % camera.width + 0.5, pixels // camera.width + 0.5
     return Blend.of([raw], camera, sorted_rows([raw], camera, pixels), x, y, Rules())

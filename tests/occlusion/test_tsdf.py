@@ -87,8 +87,8 @@ def test_matches_the_float64_specification() -> None:
     index = np.random.default_rng(2).integers(0, fused.volume.shape, (2500, 3))
     points = fused.origin + fused.voxel * index
     cameras = [(pose, FOCAL, SIZE) for pose in poses]
-    votes = {"truncation_voxels": tsdf.TRUNCATION_VOXELS, "unseen_vote": tsdf.UNSEEN_VOTE}
-    expected = np.array([ref.fuse_point(point, depths, cameras, fused.voxel, **votes) for point in points])
+    limits = fused.voxel, tsdf.TRUNCATION_VOXELS * fused.voxel, tsdf.UNSEEN_VOTE
+    expected = np.array([ref.fuse_point(point, depths, cameras, *limits) for point in points])
     wrong = np.abs(fused.volume[tuple(index.T)] - expected) > 1e-4
     # Points within rounding of a texel border or of a threshold may fall on its other side.
     assert wrong.mean() < 0.003, wrong.mean()

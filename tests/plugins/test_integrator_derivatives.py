@@ -61,24 +61,6 @@ def test_derivatives_by_parameters_that_are_not_used_are_zero(key: str) -> None:
     assert not np.any(np.array(dr.grad(params[key])))
 
 
-def test_camera_and_environment_are_found_by_descent() -> None:
-    """A rotation of the environment by 2° and a principal point that is off by 1 % of the image."""
-    camera = scenes.sensor(film={"width": 32, "height": 32})
-    of = scenes.scene(camera, diffuse="irradiance")
-    params, target = mi.traverse(of), mi.render(of)
-    optimiser = mi.ad.Adam(lr=0.5, beta_1=0.5, beta_2=0.9)
-    optimiser["angle"], optimiser["shift"] = mi.Float(2), mi.Float(1)  # degrees, %
-    for step in range(30):
-        optimiser.set_learning_rate(0.5 * 0.88**step)
-        turned = mi.Transform4f().rotate([0.6, 0, 0.8], optimiser["angle"])
-        params["integrator.light_to_world"] = turned
-        params["sensor.principal_point_offset_x"] = 0.01 * optimiser["shift"]
-        params.update()
-        dr.backward(dr.mean(dr.square(mi.render(of, params) - target), axis=None))
-        optimiser.step()
-    assert abs(optimiser["angle"][0]) < 0.01 and abs(optimiser["shift"][0]) < 0.01
-
-
 def test_resampled_environments_have_derivatives_by_their_scale_only(tmp_path: Path) -> None:
     mi.Bitmap(scenes.sky()[:, :48]).write(str(tmp_path / "odd.exr"))  # 32 x 48
     of = scenes.lit_scene({"type": "envmap", "filename": str(tmp_path / "odd.exr")})
