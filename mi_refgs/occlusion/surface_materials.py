@@ -90,9 +90,8 @@ class VertexSurfels:
             mi.Vector3f(*(upload(row) for row in arrays["normals"])),
         )
 
-    def surface(self, surfels: Surfels, names: Sequence[str]) -> Surface:
-        """The mesh with present values of attributes at the vertices, under AD, to look up at hits; raises
-        InputError for an attribute or a number of surfels that is not there."""
+    def values(self, surfels: Surfels, names: Sequence[str]) -> dict[str, list[Float]]:
+        """Present values at the vertices, by attribute: columns (V,), under AD; raises InputError."""
         for name in names:
             if not surfels.has(name):
                 remedy = "add it, or trace nothing"
@@ -100,15 +99,22 @@ class VertexSurfels:
         if surfels.count != self.count:
             numbers = f"there are {surfels.count}, but the mesh was given {self.count}"
             raise InputError(numbers, "occluder", "surfels", "call Occluder.set_materials after each change")
-        columns, near = list[Float](), (self.surfel, self.weight)
+        found = {}
         for name in names:
             value = surfels.value(name)
-            for column in [value] if surfels.raw[name].shape[1] == 1 else value:
-                around = (w * dr.gather(mi.Float, column, i) for i, w in zip(*near, strict=True))
-                columns.append(sum(around, mi.Float(0)))
-        columns += [*self.normal]
+            columns = [value] if surfels.raw[name].shape[1] == 1 else [*value]
+            mixed = found[name] = [mi.Float(0) for _ in columns]
+            for surfel, weight in zip(self.surfel, self.weight, strict=True):
+                for i, column in enumerate(columns):
+                    mixed[i] += weight * dr.gather(mi.Float, column, surfel)
+        return found
+
+    def surface(self, surfels: Surfels, names: Sequence[str]) -> Surface:
+        """The mesh with the present `values`, to look up at hits."""
+        values = self.values(surfels, names)
+        columns = [column for own in values.values() for column in own] + [*self.normal]
         columns += [mi.Float(0)] * (-len(columns) % GROUP)
-        widths = {name: int(surfels.raw[name].shape[1]) for name in names}
+        widths = {name: len(own) for name, own in values.items()}
         return Surface(self, dr.ravel(mi.ArrayXf(columns)), widths)
 
 
