@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import require_file
 from mi_refgs.io.images import linear_from_srgb
@@ -45,6 +46,8 @@ CONVERT = "import sys, gaussforge as g; data = open(sys.argv[2], 'rb').read(); \
 open(sys.argv[3], 'wb').write(g.GaussForge().convert(data, sys.argv[1], 'ply')['data'])"
 SECONDS, BYTES_PER_SECOND = 30, 10**6  # that a conversion may take: damaged files can hang it
 ENDS = 20.0  # logit for an infinite opacity, and minus the log of a deviation of 0: other programs' limit
+ODD = (0, 1, 3, 6, 8, 10, 11, 13)  # SH functions from degree 1 on that half a turn around x negates
+BRIGHTEST = 1e6  # display-encoded colour whose linear radiance fits float32
 
 
 def read_splats(path: Path, linear: bool = False, light: EnvironmentLight | None = None) -> TrainedScene:
@@ -52,12 +55,16 @@ def read_splats(path: Path, linear: bool = False, light: EnvironmentLight | None
     linear radiance, as ours. `light`: of materials (Ref-Gaussian, 3DGS-DR); otherwise it is constant."""
     require_file(path)
     with tempfile.TemporaryDirectory(prefix="refgs_") as folder:
-        plain, antialiased = _plain(path, Path(folder) / "plain.ply")
+        plain, flags = _plain(path, Path(folder) / "plain.ply")
         with plain.open("rb") as file:
             header = read_header(path, file, EXPECTED)
             columns = _columns(path, header, read_rows(path, file, header))
     notes = _repair(path, columns)
-    if antialiased or "filter_3D" in columns or any(map(ANTIALIASED.search, header.comments)):
+    if flags is not None:  # SPZ has +y up and +z backward: half a turn around x
+        each = sum(name.startswith("f_rest_") for name in columns) // 3
+        turned = [f"f_rest_{c * each + k}" for c in range(3) for k in ODD if k < each]
+        columns |= {name: -columns[name] for name in ("y", "z", "rot_2", "rot_3", *turned)}
+    if (flags or 0) & 1 or "filter_3D" in columns or any(map(ANTIALIASED.search, header.comments)):
         notes.append("fitted with an antialiasing filter and drawn without: small Gaussians are too opaque")
     surfels = decode_ply(path, columns)
     shading = Shading("surfel", "radiance") if linear else Shading("pixel", "displayed")
@@ -76,9 +83,9 @@ def read_splats(path: Path, linear: bool = False, light: EnvironmentLight | None
     return TrainedScene(surfels, light, None, shading, iteration=0, seconds=0.0)
 
 
-def _plain(path: Path, target: Path) -> tuple[Path, bool]:
+def _plain(path: Path, target: Path) -> tuple[Path, int | None]:
     """The file, or `target` written from a compressed one by another process, since the library may crash;
-    and whether an SPZ file says that it is antialiased."""
+    and the flags of an SPZ file, whose lowest bit is its antialiasing filter."""
     with path.open("rb") as file:
         first = file.read(4096)
     kind = next((kind for magic, kind in MAGIC.items() if first.startswith(magic)), None)
@@ -87,7 +94,7 @@ def _plain(path: Path, target: Path) -> tuple[Path, bool]:
     if first.startswith(b"ply"):
         kind = "compressed.ply" if b"packed_position" in first else None
     if kind is None:
-        return path, False
+        return path, None
     what, remedy = f"compressed splats ({kind})", f"convert it: `splat-transform {path.name} plain.ply`"
     if importlib.util.find_spec("gaussforge") is None:
         raise InputError(what, path, "header", f'pip install "mi_refgs[splats]", or {remedy}')
@@ -96,7 +103,7 @@ def _plain(path: Path, target: Path) -> tuple[Path, bool]:
     try:
         head = gzip.open(path).read(15) if first.startswith(b"\x1f\x8b") else first
         subprocess.run(command, check=True, capture_output=True, timeout=limit)
-        return target, kind == "spz" and bool(head[14] & 1)
+        return target, head[14] if kind == "spz" else None
     except (OSError, EOFError, IndexError, zlib.error, subprocess.SubprocessError) as error:
         remedy = f"export it again, or {remedy}"
         raise InputError(f"{what}, which cannot be read", path, "header", remedy) from error
@@ -132,6 +139,7 @@ def _float(column: np.ndarray) -> np.ndarray:
     return column.astype(np.float32)
 
 
+@np.errstate(all="ignore")  # unusable rows
 def _repair(path: Path, columns: dict[str, np.ndarray]) -> list[str]:
     """Make columns usable: leave out rows, fuse filters, cut SH; return what a user should know of it.
 
@@ -143,14 +151,20 @@ def _repair(path: Path, columns: dict[str, np.ndarray]) -> list[str]:
     if all((columns[name] > 0).all() for name in scales) and (abs(columns["opacity"] - 0.5) <= 0.5).all():
         notes.append("scales and opacities are activated: their logarithms and logits are used")
         columns |= {name: np.log(columns[name]) for name in scales} | {"opacity": logit(columns["opacity"])}
-    # Infinite logits, logarithms of 0, and rows without position, size or rotation.
+    # Infinite logits, logarithms of 0.
     for name in ("opacity", *scales):
         most = ENDS if name == "opacity" else np.inf
         clamped = np.nan_to_num(columns[name], nan=np.nan, posinf=most, neginf=-ENDS)
         if changed := np.count_nonzero(np.isinf(columns[name]) & ~np.isinf(clamped)):
             notes.append(f"{name}: {changed} infinite values are clamped to {ENDS:g}")
         columns[name] = clamped
-    finite = np.all([np.isfinite(column) for column in columns.values()], axis=0)
+    if "filter_3D" in columns:
+        variance = np.exp([2.0 * columns[name] for name in scales])
+        filtered = variance + columns["filter_3D"].astype(np.float64) ** 2
+        columns["opacity"] = logit(sigmoid(columns["opacity"]) * np.sqrt(variance / filtered).prod(axis=0))
+        columns |= dict(zip(scales, 0.5 * np.log(filtered), strict=True))
+    # Rows without position, size or rotation.
+    finite = np.all([np.abs(column) < RAW_LIMIT for column in columns.values()], axis=0)
     kept = finite & np.any([columns[f"rot_{i}"] for i in range(4)], axis=0)
     if left_out := count - np.count_nonzero(kept):
         bad = count - np.count_nonzero(finite)
@@ -159,11 +173,6 @@ def _repair(path: Path, columns: dict[str, np.ndarray]) -> list[str]:
             raise InputError(f"unusable are {what}", path, "vertex", "export the file again")
         notes.append(f"left out {what}")
         columns |= {name: column[kept] for name, column in columns.items()}
-    if "filter_3D" in columns:
-        variance = np.exp([2.0 * columns[name] for name in scales])
-        filtered = variance + columns["filter_3D"].astype(np.float64) ** 2
-        columns["opacity"] = logit(sigmoid(columns["opacity"]) * np.sqrt(variance / filtered).prod(axis=0))
-        columns |= dict(zip(scales, 0.5 * np.log(filtered), strict=True))
     rest = sorted((name for name in columns if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
     each, most = len(rest) // 3, (MAX_SH_DEGREE + 1) ** 2 - 1  # per channel
     if each > most and math.isqrt(each + 1) ** 2 == each + 1:
@@ -179,7 +188,7 @@ def _linear(surfels: Surfels) -> Surfels:
     raw, step = surfels.to_numpy(), 1e-3
     for name, offset in (("radiance_sh", 0.5), ("indirect_sh", 0.0)):
         if name in raw:
-            mean = np.maximum(offset + SH_DC * raw[name][:, :3], 0)
+            mean = np.clip(offset + SH_DC * raw[name][:, :3], 0, BRIGHTEST)
             slope = (linear_from_srgb(mean + step) - linear_from_srgb(mean)) / step
             raw[name] *= np.tile(slope, raw[name].shape[1] // 3)
             raw[name][:, :3] = (linear_from_srgb(mean) - offset) / SH_DC
