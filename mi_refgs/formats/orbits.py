@@ -23,19 +23,24 @@ INSIDE = 0.98  # fraction of the surfels, by opacity, in the sphere that fills t
 SIGMAS = 2.0  # standard deviations around its centre up to which a surfel is in that sphere
 
 
+def sphere_around(surfels: Surfels) -> tuple[np.ndarray, float]:
+    """Return centre (3,) and radius of a sphere around the surfels without strays (INSIDE)."""
+    position, weight = _weighted(surfels)
+    middle = _middle(position, weight)
+    deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)
+    far = np.linalg.norm(position - middle, axis=1) + SIGMAS * deviation
+    return middle, max(weighted_quantile(far, weight, INSIDE), 1e-6)
+
+
 def shots_around(
     surfels: Surfels,
     counts: Mapping[str, int] = CAMERAS,  # by split
     size: int = SIZE,  # pixels per side
     elevation: tuple[float, float] = ELEVATION,  # degrees
 ) -> list[Shot]:
-    """Cameras on a sphere around the surfels without strays (INSIDE), z up, spread within each split."""
-    position, weight = _weighted(surfels)
-    middle = _middle(position, weight)
-    deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)
-    far = np.linalg.norm(position - middle, axis=1) + SIGMAS * deviation
-    radius = max(weighted_quantile(far, weight, INSIDE), 1e-6) * 1.1
-    distance = radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
+    """Cameras around `sphere_around` the surfels, z up, spread within each split."""
+    middle, radius = sphere_around(surfels)
+    distance = 1.1 * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
     focal = size / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     shots = []
     for split, count in counts.items():

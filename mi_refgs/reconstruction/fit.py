@@ -8,7 +8,6 @@ import warnings
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset
@@ -63,7 +62,7 @@ def fit(
     Raises InputError for bad input, and KeyboardInterrupt with a message that says where the checkpoints are.
     """
     require_supported_variant("mi_refgs.fit")
-    listener = progress if isinstance(progress, Progress) else ProgressBar() if progress else Previews()
+    listener = progress if isinstance(progress, Progress) else ProgressBar(quiet=not progress)
     temporary = None
     if output is None:
         if resume:
@@ -105,52 +104,47 @@ class _TemporaryFolder:
         self.remove = weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
 
-class Previews(Progress):
-    """Write previews/<iteration>.png into the run folder; warnings are Python's."""
+class ProgressBar(Progress):
+    """Write previews/<iteration>.png into the run folder, and show a progress bar and messages on standard
+    error; `quiet`: Python's warnings alone."""
 
-    def warn(self, message: str) -> None:
-        warnings.warn(message, stacklevel=2)
-
-    def step(self, trainer: Trainer) -> None:
-        """Write the first training view and the environment map, where a preview is due."""
-        iteration, method = trainer.iteration, trainer.method
-        is_due = iteration % method.preview_every == 0 or iteration == method.iterations
-        if trainer.run is None or not is_due:
-            return
-        view = trainer.data.views[0].load()
-        rendered = RenderedView.of(trainer.view(view.camera()), trainer.data, view)
-        map_ = None if trainer.fit.light is None else trainer.fit.light.environment()
-        light = None if map_ is None else light_panels(map_.radiance().numpy())
-        image = contact_sheet([panels(rendered, view)], light)
-        write_png(trainer.run.path / f"previews/{iteration:07d}.png", image)
-
-
-class ProgressBar(Previews):
-    """Show a progress bar and messages on standard error, and write previews."""
-
-    bar: Any = None
-    psnr: float | None = None
+    def __init__(self, quiet: bool = False) -> None:
+        self.quiet, self.bar = quiet, progress_bar(0, "", disable=True)
+        self.psnr: float | None = None
 
     def say(self, message: str) -> None:
-        say(message)
+        if not self.quiet:
+            say(message)
 
     def warn(self, message: str) -> None:
-        warn(message)
+        if self.quiet:
+            warnings.warn(message, stacklevel=2)
+        else:
+            warn(message)
 
     def begin(self, trainer: Trainer) -> None:
         super().begin(trainer)
-        method, begin = trainer.method, trainer.iteration
-        self.bar = progress_bar(method.iterations, method.name, initial=begin, smoothing=0.05)
+        method, options = trainer.method, {"initial": trainer.iteration, "smoothing": 0.05}
+        self.bar = progress_bar(method.iterations, method.name, disable=self.quiet, **options)
 
     def step(self, trainer: Trainer) -> None:
-        if trainer.iteration % trainer.method.log_every == 0:
+        iteration, method = trainer.iteration, trainer.method
+        if not self.quiet and iteration % method.log_every == 0:
             numbers = trainer.statistics()
             new = float(numbers["psnr"])
             self.psnr = new if self.psnr is None else 0.9 * self.psnr + 0.1 * new  # a running mean
             text = f"loss {numbers['loss']:.4f}, PSNR {self.psnr:.1f} dB, {numbers['surfels']} surfels"
             self.bar.set_postfix_str(text, refresh=False)
-        super().step(trainer)
-        self.bar.update(trainer.iteration - self.bar.n)  # the trial of a component takes many iterations
+        is_due = iteration % method.preview_every == 0 or iteration == method.iterations
+        if trainer.run is not None and is_due:
+            # The first training view and the environment map.
+            view = trainer.data.views[0].load()
+            rendered = RenderedView.of(trainer.view(view.camera()), trainer.data, view)
+            map_ = None if trainer.fit.light is None else trainer.fit.light.environment()
+            light = None if map_ is None else light_panels(map_.radiance().numpy())
+            image = contact_sheet([panels(rendered, view)], light)
+            write_png(trainer.run.path / f"previews/{iteration:07d}.png", image)
+        self.bar.update(iteration - self.bar.n)  # the trial of a component takes many iterations
 
     def end(self) -> None:
         self.bar.close()

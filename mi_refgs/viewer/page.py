@@ -13,19 +13,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.poses import poses_around
 from mi_refgs.errors import InputError
+from mi_refgs.formats.orbits import FIELD_OF_VIEW, shots_around
 from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, COARSEST, DONE
 
 STATUS_INTERVAL = 0.5  # seconds between updates of the status line
-START_DISTANCE, START_FOV = 3.4, math.radians(40)
-"""Of the first camera without a data set: in radii of the object, vertical field of view."""
 
 
 def require_viser() -> Any:
@@ -90,12 +86,11 @@ class Page:
         camera.fov, camera.near, camera.far = pose.fov, 1e-3 * self.scene.radius, 1e3 * self.scene.radius
 
     def start(self) -> Pose:
-        """Return the initial pose: the first test view, or one a little from above."""
+        """Return the initial pose: the first test view, or where `refgs render` is without a data set."""
         if self.views:
             return Pose.of_view(self.views[0])
-        outward = np.array([[0.8, 0.4, 0.2**0.5]])
-        poses = poses_around(outward, self.scene.centre, START_DISTANCE * self.scene.radius)
-        return Pose(poses[0], START_FOV, 1.0)
+        camera = shots_around(self.scene.original.surfels)[0].camera
+        return Pose(camera.pose(), math.radians(FIELD_OF_VIEW), 1.0)
 
     def go(self, client: Any, pose: Pose) -> None:
         """Move the camera of a page, a client of viser."""

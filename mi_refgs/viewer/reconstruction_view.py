@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.data.region import Region
+from mi_refgs.formats.orbits import sphere_around
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
@@ -34,17 +35,6 @@ Change = Callable[[TrainedScene], TrainedScene]
 """An edit of a scene that keeps number and order of its surfels."""
 
 
-def bounds_of(surfels: Surfels, region: Region | None = None) -> tuple[np.ndarray, float]:
-    """Return centre (3,) and radius of the object: its region, else where most of its surfels are."""
-    if region is not None:
-        return np.array(region.centre), region.radius
-    position = surfels.to_numpy()["position"].astype(np.float64)
-    if not len(position):
-        return np.zeros(3), 1.0
-    low, high = np.percentile(position, (2, 98), axis=0)  # without outliers
-    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
-
-
 def variables_of(surfels: Surfels, shading: Shading) -> tuple[str, ...]:
     """Return the image and the AOVs that such surfels have."""
     maps = [name for name in surfels.raw if ATTRIBUTES[name].aov]
@@ -60,7 +50,8 @@ class ReconstructionView:
     def __init__(self, scene: TrainedScene, region: Region | None = None) -> None:
         """Display a scene, whose data set may have a region of interest."""
         self.original = self._base = self.scene = scene
-        self.centre, self.radius = bounds_of(scene.surfels, region)
+        centre, radius = sphere_around(scene.surfels) if region is None else (region.centre, region.radius)
+        self.centre, self.radius = np.array(centre), radius  # of the object
         self.can_turn = scene.light is not None and scene.shading.model.light != "none"  # its environment map
         self.variables = variables_of(scene.surfels, scene.shading)
         background = (BACKGROUND,) if scene.surroundings is not None else ()

@@ -13,7 +13,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mi_refgs.cli import main
@@ -23,7 +22,7 @@ from mi_refgs.compare.table import write
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import decide
 from mi_refgs.io.ownership import RUN, own_folder
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import DECISIONS, Run
 from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS
 
@@ -242,15 +241,14 @@ def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:
     assert row.seeds == [1] and "future" in row.failed[0]
 
 
-def test_a_decided_run_is_accepted(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_decided_run_is_accepted(data: Path, tmp_path: Path) -> None:
     """A finished fit that went on with another method is not taken for one of other settings."""
     job = jobs.plan(tmp_path / "out", [data], ["auto"], [0], Shared("quick", threads=1))[0]
     rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x")]
     chosen = decide.as_decided(job.method(), rows)
     job.run.create(chosen, str(data))
     assert chosen.light is None and chosen.surfels.capacity == 2
-    state = {"decisions": np.frombuffer(json.dumps(rows).encode(), np.uint8)}
-    monkeypatch.setattr(Run, "load_checkpoint", lambda _: state)
+    job.run.write_json(DECISIONS, rows)
     jobs.require_same(job)
     job.run.write_method(replace(chosen, seed=3))
     with pytest.raises(InputError, match=r"seed: the run was made with 3"):

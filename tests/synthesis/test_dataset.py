@@ -118,9 +118,8 @@ def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
 
 def test_camera_poses_are_seeded_and_evenly_spread() -> None:
     def poses(seed: int) -> np.ndarray:
-        return pathtrace.camera_poses(
-            60, CENTRE, (4.0, 4.0), (-30, 80), (0, 360), np.random.default_rng(seed)
-        )
+        ranges = (4.0, 4.0), (-30, 80), (0, 360)
+        return pathtrace.camera_poses(60, CENTRE, *ranges, np.random.default_rng(seed))
 
     first = poses(1)
     np.testing.assert_array_equal(first, poses(1))
