@@ -47,9 +47,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Render the test views, measure them, and write metrics.json, renders and a contact sheet.
 
-    Evaluates the scene files in the run folder, which are written first if a checkpoint is newer.
-    Every key of the upper level is always present; a score that does not apply is null, and `NAME_reason`
-    says why.
+    Evaluates the scene files in the run folder, which are written first if a checkpoint is newer. Every key
+    of the upper level is present; a score that does not apply is null, and `NAME_reason` says why.
 
     `…_region`            pixels whose ray meets the data's region of interest; `region_share` of all
     `normal_…`            pixels with true alpha above ½ (where there is alpha) and a true normal
@@ -60,8 +59,7 @@ def evaluate(
                           corrected its cameras: all may have moved with the scene
     `exposure`, `cameras` whether the fit had gains of its training views, and corrected cameras
     `image_size`          of the test views as they are read, each pixel the mean of `downscale`² of the file
-    `ms_per_frame`        median over single synchronised frames of the displayed image without AOVs, with the
-                          environment map prefiltered beforehand
+    `ms_per_frame`        median over single frames of the displayed image, the environment map prefiltered
     `caption`             scale, mask and frame of these numbers
 
     Renders have `samples` per pixel, box filtered (`render.samples`). Raises InputError for a folder that is

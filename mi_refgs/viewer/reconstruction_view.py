@@ -22,10 +22,8 @@ from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.points import TERMS
-from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
-from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import SAMPLES
@@ -33,14 +31,6 @@ from mi_refgs.viewer.viewer_scene import BACKDROPS, BACKGROUND, ENVIRONMENT, IMA
 
 Change = Callable[[TrainedScene], TrainedScene]
 """An edit of a scene that keeps number and order of its surfels."""
-
-
-def variables_of(surfels: Surfels, shading: Shading) -> tuple[str, ...]:
-    """Return the image and the AOVs that such surfels have."""
-    maps = [name for name in surfels.raw if ATTRIBUTES[name].aov]
-    traced = ["visibility"] if shading.occlusion else []
-    terms = () if shading.model.light == "none" else TERMS if traced else TERMS[:2]
-    return (IMAGE, *maps, "normal", "depth", "alpha", *traced, *terms)
 
 
 class ReconstructionView:
@@ -53,7 +43,10 @@ class ReconstructionView:
         centre, radius = sphere_around(scene.surfels) if region is None else (region.centre, region.radius)
         self.centre, self.radius = np.array(centre), radius  # of the object
         self.can_turn = scene.light is not None and scene.shading.model.light != "none"  # its environment map
-        self.variables = variables_of(scene.surfels, scene.shading)
+        maps = [name for name in scene.surfels.raw if ATTRIBUTES[name].aov]
+        traced = ["visibility"] if scene.shading.occlusion else []
+        terms = () if scene.shading.model.light == "none" else TERMS if traced else TERMS[:2]
+        self.variables = (IMAGE, *maps, "normal", "depth", "alpha", *traced, *terms)
         background = (BACKGROUND,) if scene.surroundings is not None else ()
         # The first is the initial one.
         self.backdrops = (*background, *BACKDROPS, *((ENVIRONMENT,) if self.can_turn else ()))
