@@ -28,8 +28,8 @@ WHOLE = 400  # longer side of a file, pixels, below which both are less in propo
 OFF_VIEWS = 0.1  # share of views too far off from which a fit is refused: it would make fog of the scene
 AHEAD, HALF, CLOUD = 0.95, 0.5, 0.25  # shares in front: of keypoints all are; at random, and in a room, half
 STRETCHED, OFF_CENTRE = 0.05, 0.2  # fx / fy − 1, and distance from the centre over the size; lenses have 0.02
-STOPS = 1.0  # 90 % range of brightness against neighbours; up to 0.7 in sets of one exposure
-SHARP = 0.25  # of the neighbours' variance of the Laplacian; 0.5 in sharp sets, 0.1 at a blur of σ = 1 pixel
+STOPS = 1.5  # 90 % range of brightness against neighbours; up to 1.0 in sets of one exposure
+SHARP = 0.2  # of the neighbours' variance of the Laplacian; 0.5 in sharp sets, 0.1 at a blur of σ = 1 pixel
 OVERLAP, COSINE = 0.1, 0.5  # share of its points that another view shows, and of the angle of the two, 60°
 ALIKE, CONSTANT = 4 / 255, 0.9  # difference of colours of one background; share of the border that is it
 POINTS, NEIGHBOURS = 2_000, 4  # points of a scene that are projected; views with which one is compared
