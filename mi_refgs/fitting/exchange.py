@@ -1,9 +1,8 @@
 """Surfels that cross the border of the region of interest change tables.
 
 One of the object that is more than MARGIN radii outside becomes one of the background, with its geometry and
-the spherical harmonics of the background; one of the background that is as far inside becomes one of the
-object, whose other attributes start as the method says. Neither has a history in its new table. A table keeps
-at least one surfel, may become larger than its method allows, and does not grow then.
+SH; one of the background that is as far inside becomes one of the object, whose other attributes start as the
+method says. Neither has a history. A table keeps one surfel at least, and may exceed what its method allows.
 """
 
 from __future__ import annotations

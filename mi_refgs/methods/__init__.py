@@ -4,8 +4,6 @@ from mi_refgs.methods.build import plain as plain
 from mi_refgs.methods.fields import Window as Window
 from mi_refgs.methods.method import LossWeight as LossWeight
 from mi_refgs.methods.method import Method as Method
-from mi_refgs.methods.method import Stage as Stage
-from mi_refgs.methods.method import SurfelOptions as SurfelOptions
 from mi_refgs.methods.read import PRESETS as PRESETS
 from mi_refgs.methods.read import assignments as assignments
 from mi_refgs.methods.read import differences as differences

@@ -1,7 +1,4 @@
-"""Events of open scenes: the region follows the object, and the background becomes the light of photographs.
-
-The rendered depth of some training views gives points on all surfaces, without floaters that others hide.
-"""
+"""Events of open scenes: the region follows the object, the background becomes the light of photographs."""
 
 from __future__ import annotations
 
@@ -87,7 +84,7 @@ class PhotographLight(Event[Trainer]):
 
 
 def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.ndarray:
-    """World points (P, 3) of the pixels that show a surface; `radius` of the region, scene units."""
+    """World points (P, 3) of pixels that show a surface, not a hidden floater; `radius` of the region."""
     z, opaque = (np.array(x).reshape(view.height, view.width) for x in (depth, alpha))
     around = np.pad(z, 1, constant_values=np.inf)
     shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
