@@ -140,9 +140,7 @@ def _describe(row: Row, job: Job, table: Table) -> None:
     """Fill in the method's title and its deviations, as footnotes that rows share."""
     about = job.run.method().about
     row.name, row.paper_row = about.name or row.variant, about.paper_row
-    for text in about.deviations:
-        if text not in table.footnotes:
-            table.footnotes.append(text)
+    table.footnotes += [text for text in about.deviations if text not in table.footnotes]
     row.footnotes = [table.footnotes.index(text) + 1 for text in about.deviations]
 
 
