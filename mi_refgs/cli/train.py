@@ -39,6 +39,8 @@ class Train:
     light: Annotated[Path | None, optional("FILE")] = None
     """start with this lat-long map (EXR, HDR) as the light; its first row is straight up, +z"""
     light_fixed: Flag = False  # do not change the map of --light
+    turntable: Flag = False
+    """the object turned before a fixed camera and lamp: the light turns with the camera"""
     set: Settings = ()
     resume: Flag = False  # continue the run from its newest checkpoint
     force: Flag = False  # fit data that the checks before a fit refuse
@@ -53,6 +55,7 @@ class Train:
         given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
         given |= {"settings": joined(self.set), "purpose": self.purpose}
         given |= {"light": self.light, "light_fixed": self.light_fixed, "force": self.force}
+        given["turntable"] = self.turntable
         fit(self.data, self.method, progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None

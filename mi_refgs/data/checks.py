@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.images import CACHE_BYTES
+from mi_refgs.data.images import CACHE_BYTES, ImageSource
 from mi_refgs.data.region import region_of
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.errors import InputError
@@ -34,6 +34,9 @@ OVERLAP, COSINE = 0.1, 0.5  # share of its points that another view shows, and o
 ALIKE, CONSTANT = 4 / 255, 0.9  # difference of colours of one background; share of the border that is it
 POINTS, NEIGHBOURS = 2_000, 4  # points of a scene that are projected; views with which one is compared
 IMAGES, PIXELS = 200, 150  # images that are looked at, and samples along their shorter side, at most
+NOISE, ROUGH = 4.0, 3 * ALIKE  # tolerance in median deviations from a plain backdrop, and at most
+STILL, TURNED = 0.75, 0.87  # share of the border that stays before a turntable; cosine of its least turn, 30°
+UNMASKED = 8  # views whose background is looked at without their masks
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,25 @@ def heed(found: Sequence[Finding], warn: Callable[[str], None], force: bool) -> 
             warn(str(one.error))
 
 
+def border_of(image: np.ndarray) -> np.ndarray:
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+
+
+def off_backdrop(image: np.ndarray) -> np.ndarray:
+    """How far the colours of an encoded image are from a plain backdrop, a polynomial of degree 2 that fits
+    most of the border, in tolerances (H, W): the backdrop is where it is 1 at most."""
+    y, x = np.mgrid[-1 : 1 : len(image) * 1j, -1 : 1 : len(image[0]) * 1j].astype(np.float32)
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    at, colours = border_of(terms), border_of(image)
+    near = np.ones(len(at), bool)
+    for _ in range(4):  # what is something else at the border is left out
+        factors = np.linalg.lstsq(at[near], colours[near], rcond=None)[0].astype(np.float32)
+        off = abs(at @ factors - colours).max(axis=-1)
+        near = off <= np.quantile(off, CONSTANT)
+    tolerance = min(max(ALIKE, NOISE * float(np.median(off))), ROUGH)
+    return np.asarray(abs(terms @ factors - image).max(axis=-1) / tolerance)
+
+
 class _Look(NamedTuple):
     """What is seen of one image, as displayed."""
 
@@ -74,6 +96,7 @@ class _Look(NamedTuple):
     sharpness: float  # log2 of the variance of the Laplacian over the squared mean
     brightness: float  # log2 of the mean linear colour of what is covered; both are NaN if nothing is
     border: np.ndarray  # (N, 3)
+    plain: float  # share of it that a plain backdrop explains
 
 
 def _look(view: View) -> _Look:
@@ -84,8 +107,9 @@ def _look(view: View) -> _Look:
     colour = linear_from_srgb(np.clip(image[::step, ::step], 0, 1)).mean(axis=-1)
     sharp = bend.var() / max(grey.mean() ** 2, 1e-6) if weight.any() else np.nan
     bright = np.average(colour, weights=weight) if weight.any() else np.nan
-    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])[::step]
-    return _Look(view, float(np.log2(sharp + 1e-12)), float(np.log2(bright + 1e-6)), border)
+    off = np.inf if view.has_alpha else border_of(off_backdrop(image[::step, ::step]))
+    sharpness, brightness = float(np.log2(sharp + 1e-12)), float(np.log2(bright + 1e-6))
+    return _Look(view, sharpness, brightness, border_of(image)[::step], float(np.mean(off <= 1)))
 
 
 Measured = tuple[dict[str, Any], int, Sequence[View]]  # numbers, index of LEVELS, and the views that are odd
@@ -216,10 +240,32 @@ class Sight:
     def background(self) -> Measured | None:
         if self.data.has_alpha:
             return None
-        border = np.concatenate([look.border for look in self.looks])
-        colour = np.median(border, axis=0)
-        share = float(np.mean((abs(border - colour) <= ALIKE).all(axis=-1)))
+        colour = np.median(np.concatenate([look.border for look in self.looks]), axis=0)
+        share = float(np.mean([look.plain for look in self.looks]))
         return {"share": share, "colour": (255 * colour).round().tolist()}, share >= CONSTANT, ()
+
+    def turntable(self) -> Measured | None:
+        """Whether the background stays while the cameras turn, and is not the one colour of a cut-out."""
+        views, borders = self.views, [look.border for look in self.looks]
+        masked = [isinstance(v.pixels, ImageSource) and v.pixels.file.mask is not None for v in views]
+        if np.min(self.axes @ self.axes.T) > TURNED:
+            return None
+        if all(masked):
+            some = (_unmasked(views[i]) for i in evenly_spread(len(views), UNMASKED))
+            borders = [border_of(view.load().displayed) for view in some]
+        if len({len(border) for border in borders}) > 1:
+            return None
+        middle = np.median(borders, axis=0)
+        still = np.median(abs(borders - middle), axis=0).max(axis=-1) <= 2 * ALIKE
+        varied = still.any() and middle[still].std(axis=0).max() > ALIKE
+        return {"still": float(still.mean())}, bool(varied and still.mean() >= STILL), ()
+
+
+def _unmasked(view: View) -> View:
+    """A view as it was photographed, without the mask of another file."""
+    source = view.pixels
+    assert isinstance(source, ImageSource)
+    return replace(view, pixels=replace(source, file=replace(source.file, mask=None), has_alpha=False))
 
 
 WRONG = "another model's images file; images turned by EXIF, resized or cropped"
@@ -234,6 +280,8 @@ CHECKS: tuple[tuple[str, Callable[[Sight], Measured | None], str], ...] = (
     ("exposure", Sight.exposure, "neighbours differ by {stops} stops; fit gains: --set event.exposure={{}}"),
     ("blur", Sight.blur, "{which} are blurred: {least:.0%} as sharp as neighbours; leave them out"),
     ("overlap", Sight.overlap, "{which} share nearly nothing with others; add images between them"),
-    ("background", Sight.background, "{share:.0%} of the border is {colour}; doctor --masks cuts it out"),
+    ("background", Sight.background, "{share:.0%} of the border is plain; doctor --masks cuts it out"),
+    ("turntable", Sight.turntable, "{still:.0%} of the border stays while the cameras turn: seen from an "
+     "object on a turntable, the light turns, too; fit with --turntable, or move the camera"),
 )  # fmt: skip
 """Name, function and sentence of each check, in the order in which they are reported."""

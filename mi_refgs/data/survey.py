@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from mi_refgs.data.checks import ALIKE, FINE, SAID, examine
+from mi_refgs.data.checks import FINE, SAID, examine, off_backdrop
 from mi_refgs.data.dataset import read_dataset, reader_of
 from mi_refgs.data.images import IMAGES, MASKS
 from mi_refgs.data.view import View
@@ -61,11 +61,10 @@ def survey(folder: Path) -> dict[str, Any]:
 
 
 def write_masks(folder: Path, found: dict[str, Any]) -> int:
-    """Write masks of images with a constant background by their survey, without the pixels that mix it with
+    """Write masks of images with a plain backdrop by their survey, without the pixels that mix it with
     the object; returns their number. Raises InputError for other images, and for a folder that has masks."""
-    background = found["checks"].get("background", {})
-    if background.get("result") != SAID:
-        raise InputError("no constant background", folder, "--masks", "segment the object by another program")
+    if found["checks"].get("background", {}).get("result") != SAID:
+        raise InputError("no plain background", folder, "--masks", "segment the object by another program")
     files = list[Path]()
     for split in ("train", "test"):
         with contextlib.suppress(InputError):
@@ -75,8 +74,7 @@ def write_masks(folder: Path, found: dict[str, Any]) -> int:
     if (masks := folder / MASKS).exists():
         raise InputError("exists", masks, "--masks", "remove it")
     for file, name in zip(files, names, strict=True):
-        pixels = np.pad(read_bytes(file)[0][..., :3], ((1, 1), (1, 1), (0, 0)), mode="edge").astype(np.int16)
-        alike = (abs(pixels - background["colour"]) <= 255 * ALIKE).all(axis=-1)
+        alike = np.pad(off_backdrop(read_bytes(file)[0][..., :3] / np.float32(255)) <= 1, 1)
         alike[[0, -1]], alike[:, [0, -1]] = True, True
         label = ndimage.label(alike)[0]
         write_png(masks / name, ~ndimage.binary_dilation(label == label[0, 0])[1:-1, 1:-1])

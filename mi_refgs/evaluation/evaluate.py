@@ -73,8 +73,8 @@ def evaluate(
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)
     errors, budget = Decomposition(), ErrorBudget()
-    render, maps_of = fitted.renderer(samples=samples), material_maps(fitted, samples)
-    plain = fitted.renderer(aovs=False, samples=samples)
+    render, maps_of = fitted.renderer(samples=samples, turning=True), material_maps(fitted, samples)
+    plain = fitted.renderer(aovs=False, samples=samples, turning=True)
     around, corrected = fitted.surroundings is not None, bool(run.cameras())
     object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
     in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)

@@ -12,7 +12,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.extensions import INITIALISERS, Start, Wanted
-from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, Method
+from mi_refgs.methods.method import AROUND, BACKGROUND, LIGHT, TURNTABLE, Method
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.light.maps import Learnt
@@ -39,6 +39,8 @@ def initial_parameters(
     if open_scene and isinstance(method.light, Learnt):
         return params | {LIGHT: seen_around(data, method.light.rows).raw}
     placement = {f"{LIGHT}_{name}": upload_tensor(np.zeros((1, 3))) for name in method.light.placement}
+    if method.light.turntable:
+        placement[TURNTABLE] = upload_tensor(data.views[0].to_world[:3, :3])
     return params | {LIGHT: method.light.start()} | placement
 
 

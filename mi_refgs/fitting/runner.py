@@ -158,6 +158,9 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress, force: bo
         raise InputError(f"{error}{kept}") from error
     finally:
         progress.end()
+    if trainer.fit.turntable is not None:
+        first = trainer.whole.views[0].name
+        progress.say(f"{output}: the light turns with the camera; the files have the light of view '{first}'")
     if warning := finish(trainer, run):
         progress.warn(warning)
     options, count = trainer.method.surfels, trainer.surfels.count
@@ -189,7 +192,12 @@ def begin(
     if state is not None:
         method = as_decided(method, decisions_of(state))
     else:
-        found = checks.examine(views)
+        turns = method.light is not None and method.light.turntable
+        if turns and not views.has_alpha:
+            what = "images without alpha, whose background does not turn with the object"
+            remedy = "give masks: `refgs doctor DATA --masks` writes them before a plain backdrop"
+            raise InputError(what, views.path, "--turntable", remedy)
+        found = [one for one in checks.examine(views) if one.name != "turntable" or not turns]
         checks.heed(found, warn, force)
         for note in views.notes:
             tell(f"{views.path}: {note}")

@@ -28,6 +28,7 @@ from mi_refgs.methods.method import (
     LIGHT_SCALE,
     PER_VIEW,
     POSE,
+    TURNTABLE,
     Method,
     Rates,
 )
@@ -159,6 +160,7 @@ class FitSetup:
         if light is not None:
             wanted[LIGHT] = light.shape()[1:]
             wanted |= {f"{LIGHT}_{name}": (3,) for name in light.placement}
+            wanted |= {TURNTABLE: (3,)} if light.turntable else {}
         found = {
             name: values.shape if name in PER_VIEW else values.shape[1:]
             for name, values in part(state, PARAMS).items()

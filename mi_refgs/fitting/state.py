@@ -28,7 +28,7 @@ from mi_refgs.fitting.optim import Adam
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.schedule import FitSetup, SharedPrefilter
 from mi_refgs.kernels.device import upload
-from mi_refgs.methods.method import AROUND, Stage
+from mi_refgs.methods.method import AROUND, TURNTABLE, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexColours, VertexSurfels
 from mi_refgs.occlusion.visibility import Occluder
@@ -36,6 +36,7 @@ from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs import checkpoint
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, PHOTOGRAPHED
 from mi_refgs.shade.ambient import update_occluder_caches
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.kind import FittedLight, LightKind
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.shading import Shading
@@ -192,6 +193,11 @@ class FitState:
     def near(self) -> NearField | None:
         return None if self.photographed is None else self.photographed.near
 
+    @property
+    def turntable(self) -> TensorXf | None:
+        """Axes of the camera with which the light turns."""
+        return self.params.get(TURNTABLE)
+
     def shading(self, stage: Stage) -> Shading:
         """Shading options of a stage with the present occluder."""
         return Shading.resolve(stage.shading, not self.occluder.empty)
@@ -200,7 +206,8 @@ class FitState:
         """Compute the caches that the shading requires and the occluder lacks."""
         occluder = self.occluder
         if shading.ambient_rays and occluder.ambient is None:
-            update_occluder_caches(occluder, self.surfels, shading.light_of(self.light), shading)
+            light = shading.light_of(self.light if self.turntable is None else EnvironmentLight.constant())
+            update_occluder_caches(occluder, self.surfels, light, shading)
         if shading.traced_bounces and occluder.vertex_surfels is None:
             occluder.set_materials(self.surfels)
 

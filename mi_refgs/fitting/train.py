@@ -138,7 +138,8 @@ class Trainer:
             shading = self.shading().antialiased()
             self.fit.update_missing_caches(shading)
             light, around = shading.light_of(self.fit.light), self.fit.surroundings
-            scene = SurfelScene(self.surfels, shading, light, self.fit.occluder, around, self.fit.near)
+            given = (light, self.fit.occluder, around, self.fit.near, self.fit.turntable)
+            scene = SurfelScene(self.surfels, shading, *given)
             degree = self.setup.sh_degree(self.iteration)
             return render(scene, camera, Request(scene.all_aovs if aovs else (), not aovs, sh_degree=degree))
 
@@ -234,7 +235,8 @@ class Trainer:
         shading = fit.shading(stage)
         fit.update_missing_caches(shading)
         light = fit.prefilter.light(fit.light, shading)
-        scene = SurfelScene(fit.surfels, shading, light, fit.occluder, fit.surroundings, fit.near)
+        given = (light, fit.occluder, fit.surroundings, fit.near, fit.turntable)
+        scene = SurfelScene(fit.surfels, shading, *given)
         aovs = ("normal",) if any(loss.normals for loss in losses_in_use(weights)) else ()
         request = Request(aovs, sh_degree=setup.sh_degree(iteration), attribution=attribution)
         frame = render(scene, camera, request)

@@ -22,11 +22,12 @@ from mi_refgs.surfels.primitives import PRIMITIVES
 # Names among the parameters of a fit, beside the attributes of the surfels:
 LIGHT, BACKGROUND = "light", "background"  # the environment maps
 LIGHT_ROTATION, LIGHT_SCALE = "light_rotation", "light_scale"  # of a known light
+TURNTABLE = "light_turntable"  # axes (3, 3) of the first camera, with which the light turns
 GAIN = "gain"  # log exposure gains of the training views
 POSE = "pose"  # corrections of their cameras
 PER_VIEW = (GAIN, POSE)  # parameters with a row per training view, which a fit may lack
 AROUND = "surroundings/"  # prefix of the background Gaussians' attributes
-APART = (LIGHT, LIGHT_ROTATION, LIGHT_SCALE, BACKGROUND, *PER_VIEW)  # not attributes of surfels
+APART = (LIGHT, LIGHT_ROTATION, LIGHT_SCALE, TURNTABLE, BACKGROUND, *PER_VIEW)  # not attributes of surfels
 AT_ONCE = Window(0, 3, 1)  # one SH degree more in each of the first three iterations
 
 

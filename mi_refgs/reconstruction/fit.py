@@ -32,6 +32,7 @@ def fit(
     purpose: str | None = None,
     light: str | Path | None = None,
     light_fixed: bool = False,
+    turntable: bool = False,
     output: str | Path | None = None,
     resume: bool = False,
     force: bool = False,
@@ -51,7 +52,9 @@ def fit(
     light: a lat-long map (EXR, HDR, PNG, JPEG) with which the light starts, or which it is if `light_fixed`.
     Its first row is straight up, +z, unless it is the data set's environment.exr. The settings
     `light.world`, `light.rotate` and `light.exposure` are as in `Reconstruction.relight`; `light.learn`
-    is some of "rotation" and "scale", of a fixed map.
+    is some of "rotation" and "scale", of a fixed map. turntable: the object turned before a fixed camera and
+    lamp, so that the light turns with the camera; the result has the light of the first one. Images need
+    alpha or masks.
 
     output: the run folder. Without one a temporary folder is used, which is removed with the last
     `Reconstruction` of it; `save` keeps the result. resume: continue the run in `output`;
@@ -74,6 +77,7 @@ def fit(
         source = data if isinstance(data, Dataset) else Path(data)
         folder = source.path if isinstance(source, Dataset) else source
         settings = [*_light_settings(light, light_fixed, folder), *methods.assignments(settings)]
+        settings += ["light.turntable=true"] * turntable
         named = str(method) if isinstance(method, Path) else method
         choice = runner.Choice(named, preset, settings, purpose, force)
         runner.fit(source, Path(output), choice, resume=resume, progress=listener)

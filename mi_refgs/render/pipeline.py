@@ -23,7 +23,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.antialias import averaged
 from mi_refgs.render.gbuffer import OBJECT, SURROUNDINGS, GBuffer, features, inverse_alpha, joined_slots
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.shade.light.light import Light
+from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.light.near_field import LocalLight, NearField
 from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
@@ -32,7 +32,7 @@ from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives import primitive_of
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Color3f, Float, Point3f, Vector3f
+from mi_refgs.types import Color3f, Float, Point3f, TensorXf, Vector3f
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class SurfelScene:
     occluder: Occluder | None = None  # `traced_bounces` requires that it has the surfels' materials
     surroundings: Surroundings | None = None
     near: NearField | None = None  # distances of what the light shows; None: infinitely far
+    turntable: TensorXf | None = None  # axes (3, 3) of the camera that sees `light`; it turns with others
 
     @property
     def all_aovs(self) -> frozenset[str]:
@@ -57,6 +58,13 @@ class SurfelScene:
         if self.light is None or self.near is None:
             return self.light
         return LocalLight(self.light, self.near, position)
+
+    def lit_for(self, camera: Camera) -> SurfelScene:
+        """The scene as a camera sees it: on a turntable, the light is turned by its rotation."""
+        if self.light is None or self.turntable is None:
+            return self
+        axes = mi.Matrix3f(*(dr.gather(mi.Float, self.turntable.array, i) for i in range(9)))
+        return replace(self, light=RotatedLight(self.light, axes @ camera.rotation))
 
 
 @dataclass(frozen=True)
@@ -113,7 +121,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     require_supported_variant("mi_refgs.render_frame")
     primitive_of(scene.surfels.raw)
     scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
-    view = _View.of(*_without_empty_tables(scene, request), camera)
+    view = _View.of(*_without_empty_tables(scene.lit_for(camera), request), camera)
     frame = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
     return boundary(frame, "shade backward")
 

@@ -64,7 +64,9 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Ca
         write_scene_xml(folder / names.SCENE, files, fitted.shading, [camera, *more])
         # Written last: if it is there, the other files are complete.
         note = {"iteration": fitted.iteration, "seconds": fitted.seconds, "surfels": fitted.surfels.count}
-        about = {"files": written, "shading": asdict(fitted.shading)}
+        about: dict[str, Any] = {"files": written, "shading": asdict(fitted.shading)}
+        if fitted.turntable is not None:
+            about["turntable"] = fitted.turntable.numpy().tolist()
         write_json(folder / names.MODEL, note | about, indent=2)
     return [folder / name for name in written]
 

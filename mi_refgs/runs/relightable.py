@@ -37,6 +37,8 @@ def lacking(scene: TrainedScene) -> str:
         return f"reflectance: {fitted.reflectance} shows the light of the fit only"
     if fitted.required_attributes != shading.required_attributes and not isinstance(fitted.model, SplitSum):
         return f"diffuse: no albedo follows from what {fitted.reflectance} fitted to the light"
+    if scene.turntable is not None and "radiance_sh" in fitted.required_attributes:
+        return "diffuse: no albedo follows from a colour that was fitted to a light that turned"
     missing = [name for name in shading.required_attributes if not scene.surfels.has(name)]
     missing += ["light"] if scene.light is None else []
     return f"{', '.join(missing)}: the run has none" if missing else ""
@@ -54,7 +56,8 @@ def relightable(scene: TrainedScene) -> TrainedScene:
     if scene.shading.required_attributes != shading.required_attributes:
         surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
     kept = {name: raw for name, raw in surfels.raw.items() if name not in LIT}
-    return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, surroundings=None, near=None)
+    dropped: dict[str, Any] = {"surroundings": None, "near": None, "turntable": None}
+    return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, **dropped)
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:

@@ -13,8 +13,8 @@ import numpy as np
 
 from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.io.files import read_json
-from mi_refgs.kernels.device import require_supported_variant
-from mi_refgs.methods.method import Method
+from mi_refgs.kernels.device import require_supported_variant, upload_tensor
+from mi_refgs.methods.method import TURNTABLE, Method
 from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.registry import load_again
@@ -31,6 +31,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import TensorXf
 
 SURFELS, LIGHT_MAP, MESH, SCENE, MODEL = "surfels.ply", "envmap.exr", "mesh.ply", "scene.xml", "model.json"
 AROUND_FILE, BACKGROUND_MAP, NEAR_FIELD = "surroundings.ply", "background.exr", "near_field.npz"
@@ -50,6 +51,7 @@ class TrainedScene:
     seconds: float  # spent training
     surroundings: Surroundings | None = None  # background Gaussians and map, of images without alpha
     near: NearField | None = None  # distances of what the light shows; None: infinitely far
+    turntable: TensorXf | None = None  # as in `SurfelScene`; the first training camera's
 
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
@@ -68,6 +70,7 @@ class TrainedScene:
             float(state["seconds"]),
             surroundings=surroundings_of(params),
             near=near_field_of(state),
+            turntable=params.get(TURNTABLE),
         )
 
     @property
@@ -88,6 +91,7 @@ class TrainedScene:
                 attribute(name)  # is registered
             iteration, seconds = int(content["iteration"]), float(content["seconds"])
             files = {*content.get("files", ())}  # earlier versions did not write it
+            axes = np.array(content.get("turntable", []), np.float32).reshape(-1, 3, 3)
             if iteration < 0 or not 0 <= seconds < math.inf:
                 raise ValueError("iteration or seconds out of range")
         except UnknownNameError as error:
@@ -110,6 +114,7 @@ class TrainedScene:
             seconds,
             None if around is None else Surroundings.read(around, behind),
             None if near is None else NearField.read(near),
+            upload_tensor(axes[0]) if len(axes) else None,
         )
         try:
             shading.require_inputs(fitted.surfels.raw, fitted.light is not None)
@@ -119,14 +124,21 @@ class TrainedScene:
             raise InputError(f"{error}", folder, remedy=f"or {remedy}") from error
         return fitted
 
-    def renderer(self, aovs: bool | Collection[str] = True, samples: int = 1) -> Callable[[Camera], Frame]:
-        """A function that renders views, detached, with these AOVs (all, or by name), `samples` per pixel."""
+    def renderer(
+        self, aovs: bool | Collection[str] = True, samples: int = 1, turning: bool = False
+    ) -> Callable[[Camera], Frame]:
+        """A function that renders views, detached, with these AOVs (all, or by name), `samples` per pixel;
+        `turning`: a turntable's as they were photographed, others under the light of the first."""
         require_supported_variant("TrainedScene.renderer")
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
-        update_occluder_caches(occluder, self.surfels, light, self.shading)
-        scene = SurfelScene(self.surfels, self.shading, light, occluder, self.surroundings, self.near)
+        turntable, around = self.turntable if turning else None, light
+        if turntable is not None:
+            around = self.shading.light_of(EnvironmentLight.constant())
+        update_occluder_caches(occluder, self.surfels, around, self.shading)
+        given = (light, occluder, self.surroundings, self.near, turntable)
+        scene = SurfelScene(self.surfels, self.shading, *given)
         asked = aovs if not isinstance(aovs, bool) else scene.all_aovs if aovs else ()
         once = partial(render, scene, request=Request(asked, forward_only=True))
         averaged = partial(supersampled, once, samples=samples, details=bool(aovs))

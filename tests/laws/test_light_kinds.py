@@ -47,6 +47,7 @@ KINDS = {  # the table [light], and what else the method has
     "initial": FILE + "height = 8\n",
     "fixed": "every = 2\nradiance = 0.8\n",  # by options of the command line
     "placed": FILE + 'fixed = true\nrotate = 20\nlearn = ["rotation", "scale"]\n',
+    "turntable": "height = 8\nturntable = true\n",
     "photographed": "height = 8\n" + PHOTOGRAPHS,  # whose light is near, too
 }
 SKY = np.linspace(0.1, 2, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32)  # the map of the tiny data set
@@ -87,6 +88,12 @@ def test_a_run_saves_what_was_fitted(fitted: tuple[str, Path]) -> None:
     scene: Any = TrainedScene.from_state(run.method, state)
     np.testing.assert_allclose(saved, radiance(scene.light), rtol=1e-5)
     assert (run.trained.near is not None) == (scene.near is not None) == (kind == "photographed")
+    axes = None if scene.turntable is None else scene.turntable.numpy()
+    if kind == "turntable":
+        first = read_dataset(folder / "data", "train").views[0].to_world[:3, :3]
+        np.testing.assert_allclose([axes, run.trained.turntable.numpy()], [first, first], atol=1e-6)
+    else:
+        assert axes is run.trained.turntable is None
     if kind == "constant":
         np.testing.assert_allclose(saved, np.broadcast_to(saved[0, 0], saved.shape), rtol=1e-5)
     if kind == "fixed":
@@ -121,6 +128,9 @@ def test_commands_keep_the_light(fitted: tuple[str, Path], tmp_path: Path) -> No
     edited = run.edit(set={"roughness": 0.3}).save(tmp_path / "edited").trained
     np.testing.assert_allclose(radiance(edited.light), radiance(light), rtol=1e-5)
     assert (edited.near is not None) == (edited.surroundings is not None) == (kind == "photographed")
+    if kind == "turntable":  # whose light by view is in the SH colour
+        refused(lambda: run.relight(light), "a light that turned", "--for relighting")
+        return
     relit = run.relight(light).trained
     np.testing.assert_allclose(radiance(relit.light), radiance(light), rtol=1e-5)
     assert relit.near is None

@@ -14,10 +14,13 @@ from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.models import sh_basis
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
+from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.scenes import splats
+from tests.scenes.integrator import HEIGHT, WIDTH, raw_channels
 
 COLOUR = Shading(at="surfel", reflectance="radiance")
 
@@ -34,6 +37,25 @@ def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:
 
 def channel(frame: Frame, name: str) -> np.ndarray:
     return np.array(getattr(frame, name), dtype=np.float64).T
+
+
+@pytest.mark.parametrize(("at", "model"), [("pixel", "split_sum"), ("surfel", "monte_carlo")])
+def test_light_of_a_turntable_turns_with_the_camera(at: Any, model: str) -> None:
+    """A second camera sees the light rotated by what rotates the first camera into it."""
+    first, second = (look_at(np.array(origin), np.zeros(3)) for origin in ([3.0, 1, 2], [-2.0, 2, -1]))
+    direction, turn = map_directions(32), second[:3, :3] @ first[:3, :3].T
+    surfels = Surfels.from_numpy(raw_channels())
+    shading = Shading(at=at, reflectance=model, diffuse="irradiance")
+    camera = Camera.from_pose(WIDTH, HEIGHT, -19.0, -20.0, 8.3, 5.6, second)
+
+    def image_of(radiance: np.ndarray, **turntable: Any) -> np.ndarray:
+        light = shading.light_of(EnvironmentLight.from_radiance(0.6 + 0.3 * radiance))
+        return channel(render(SurfelScene(surfels, shading, light, **turntable), camera), "radiance")
+
+    axes = mi.TensorXf(first[:3, :3].astype(np.float32))
+    expected = image_of(direction @ turn)  # L(Rᵀ d)
+    np.testing.assert_allclose(image_of(direction, turntable=axes), expected, atol=4e-3)
+    assert np.abs(image_of(direction) - expected).max() > 0.05
 
 
 @pytest.mark.parametrize("degrees", [0, 50, 80, 100, 115, 130, 180])

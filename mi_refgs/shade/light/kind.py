@@ -17,6 +17,9 @@ class LightKind:
     # Iterations that share one prefiltered light, which then receives all their gradients.
     every: int = field(default=1, metadata={"allowed": (lambda n: n >= 1, "1 or more")})
 
+    # Whether the object turns before a fixed camera and lamp: in its frame, the light turns with the camera.
+    turntable: bool = False
+
     name: ClassVar[str] = ""
 
     @property

@@ -1,0 +1,70 @@
+"""Photographs of an object that turns: the background that stays is said, a plain one cut off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mi_refgs
+from mi_refgs.cli import main
+from mi_refgs.data.checks import FINE, SAID, examine
+from mi_refgs.data.dataset import read_dataset
+from mi_refgs.io.images import read_png, write_png
+from tests.helpers import refused
+from tests.scenes.tiny import SIZE, train_command, write_data, write_method, write_open_data
+
+Y, X = np.mgrid[-1 : 1 : SIZE * 1j, -1 : 1 : SIZE * 1j]
+BACKDROPS = {
+    "plain": np.stack([0.3 + 0.1 * X, 0.2 + 0.1 * Y**2, 0.2 + 0.05 * X * Y], axis=-1),
+    "white": np.ones((SIZE, SIZE, 3)),
+    "room": np.random.default_rng(1).uniform(0.2, 0.8, (SIZE, SIZE, 3)),
+}
+
+
+def write_turntable(folder: Path, backdrop: np.ndarray, masks: bool = False) -> Path:
+    """The ball of `write_data` before a backdrop that stays, without alpha, or with files of masks."""
+    for path in write_data(folder, truth=False).glob("*/r_*.png"):
+        rgba = read_png(path)
+        write_png(path, rgba[..., 3:] * rgba[..., :3] + (1 - rgba[..., 3:]) * backdrop)
+        if masks:
+            (folder / "masks" / path.parent.name).mkdir(parents=True, exist_ok=True)
+            write_png(folder / "masks" / path.parent.name / path.name, rgba[..., 3])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("backdrop", "masks", "plain", "stays"),
+    [("plain", 0, True, True), ("room", 0, False, True), ("white", 0, True, False), ("room", 1, None, True)],
+)
+def test_what_is_said_of_backgrounds(
+    backdrop: str, masks: int, plain: bool | None, stays: bool, tmp_path: Path
+) -> None:
+    data = write_turntable(tmp_path / "turn", BACKDROPS[backdrop], bool(masks))
+    found = {one.name: one.level == SAID for one in examine(read_dataset(data, "train"))}
+    assert (found.get("background"), found["turntable"]) == (plain, stays)
+
+
+def test_a_background_that_moves_is_no_turntable(tmp_path: Path) -> None:
+    found = examine(read_dataset(write_open_data(tmp_path / "open"), "train"))
+    assert {one.name: one.level for one in found}["turntable"] == FINE
+
+
+def test_fits_of_a_turntable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The ball is cut out before a plain backdrop, and evaluated under the light that turns."""
+    data, run = write_turntable(tmp_path / "turn", BACKDROPS["plain"]), tmp_path / "run"
+    command = [*train_command(data, run, write_method(tmp_path)), "--turntable"]
+    refused(command, "--turntable: images without alpha", "refgs doctor DATA --masks")
+    assert main(["doctor", str(data), "--masks"]) == 0
+    view, ball = (read_dataset(x, "test").views[0].load() for x in (data, write_data(tmp_path / "ball")))
+    assert np.all((view.alpha == 0) | (ball.alpha == 1)) and np.mean(view.alpha != ball.alpha) < 0.15
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "light of view 'train/r_0'" in (said := capsys.readouterr().err) and "stays" not in said
+    assert main(["eval", str(run)]) == 0
+    sky = mi_refgs.EnvironmentLight.from_radiance(np.linspace(0.1, 2, 384).reshape(8, 16, 3))
+    scene = replace(mi_refgs.load(run).trained, light=sky)
+    shown = [scene.renderer(turning=turning)(view.camera()).radiance.numpy() for turning in (True, False)]
+    assert np.abs(shown[0] - shown[1]).max() > 0.01
