@@ -6,17 +6,21 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import laplace
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
-from mi_refgs.data.images import mask_in
+from mi_refgs.data.images import MASK, image_files, mask_in
 from mi_refgs.errors import InputError, counted
-from mi_refgs.io.images import ENDINGS, exif_tags, image_size, open_image, read_mask, to_8_bits
+from mi_refgs.io.images import exif_tags, image_size, open_image, read_mask, to_8_bits
 
-OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .webp .avif".split()  # for a message
+VIDEOS = ".mp4 .mov .m4v .avi .mkv .webm .mts".split()
+FRAMES = 120  # of a video that are used, at most: with every pair matched, some minutes
+OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .avif".split()  # for a message
 FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point
 DIAGONAL_35MM = 43.2666  # mm, of a frame of 36 mm × 24 mm, to which EXIF's 35 mm equivalent relates
 ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405  # EXIF tags
@@ -28,6 +32,7 @@ class Photograph:
     """An image file, and the orientation of its pixels in the data set."""
 
     path: Path
+    name: str  # its path in the folder of photographs
     digest: str  # SHA-256 of the file
     size: tuple[int, int]  # width and height as displayed, pixels
     focal: float | None  # focal length over the image's diagonal, where EXIF tells it
@@ -36,10 +41,6 @@ class Photograph:
     orientation: int = 1  # EXIF's: how the stored pixels are turned for display
     lying: bool = False  # rotated by 90° anticlockwise in the data set, to have the sensor of the others
     number: int = 0  # index in the order of names
-
-    @property
-    def name(self) -> str:
-        return self.path.name
 
     @property
     def copy(self) -> str:
@@ -89,22 +90,48 @@ class Photograph:
 
 
 def find_photographs(folder: Path) -> list[Photograph]:
-    """The photographs of a folder by name, rotated as most of them are: so all have one size and one lens.
-    Raises InputError for a missing folder, too few images, many sizes, and unreadable files."""
+    """The photographs of a folder by name, or of its subfolders, rotated as most of them are: so all have one
+    size and one lens. Raises InputError for too few images, many sizes, and unreadable files."""
     if not folder.is_dir():
-        raise InputError("no such folder", folder, "photographs", "give one with JPEG or PNG files")
-    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    paths = [path for path in files if path.suffix.lower() in ENDINGS]
+        what = "is no video" if folder.exists() else "no such folder"
+        raise InputError(what, folder, "photographs", "give a folder with JPEG or PNG files")
+    paths = image_files(folder, "*")
     if len(paths) < FEWEST:
-        other = Counter(path.suffix for path in files if path.suffix.lower() in OTHER_ENDINGS).most_common(1)
+        inner = image_files(folder, "**/*")
+        paths = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
+    if len(paths) < FEWEST:
+        files = (path for path in folder.rglob("*") if path.suffix.lower() in OTHER_ENDINGS)
+        other = Counter(path.suffix for path in files).most_common(1)
         remedy = f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"
         raise InputError(f"contains {counted(len(paths), 'JPEG or PNG file')}", folder, "photographs", remedy)
-    kept = [replace(_photograph(path), number=i) for i, path in enumerate(paths)]
+    named = [replace(_photograph(path), name=path.relative_to(folder).as_posix()) for path in paths]
+    kept = [replace(photograph, number=i) for i, photograph in enumerate(named)]
     most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]
     kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in kept]
     remedy = f"a fit takes {MAX_SIZES} at most: leave out those that were cropped"
     require_few_sizes(folder, "photographs", {p.kept_size: p.name for p in kept}, remedy)
     return kept
+
+
+def write_frames(video: Path, folder: Path) -> None:
+    """Write the sharpest of every few frames of a video as JPEG files, at most FRAMES. Raises InputError for
+    an unreadable video, and without PyAV."""
+    try:
+        import av
+    except ImportError:
+        remedy = 'pip install "mi_refgs[video]", or take frames with ffmpeg and give their folder'
+        raise InputError("PyAV, which reads videos, is not installed", video, "video", remedy) from None
+    try:
+        with av.open(str(video)) as count, av.open(str(video)) as opened:
+            step = -(-sum(packet.size > 0 for packet in count.demux(video=0)) // FRAMES)
+            frames = enumerate(opened.decode(video=0))
+            for number, group in groupby(frames, lambda frame: frame[0] // step):
+                images = (frame.to_image().rotate(frame.rotation, expand=True) for _, frame in group)
+                sharpest = max(images, key=lambda image: np.var(laplace(np.float32(image.convert("L")))))
+                sharpest.save(folder / f"{number:04}.jpg", quality=95, subsampling=0)
+    except (av.FFmpegError, IndexError, ZeroDivisionError) as error:
+        remedy = "record it again, or give a folder with JPEG or PNG files"
+        raise InputError(f"cannot be read ({error})", video, "video", remedy) from error
 
 
 def _photograph(path: Path) -> Photograph:
@@ -118,7 +145,7 @@ def _photograph(path: Path) -> Photograph:
     device = f"{exif.get(MAKE, '')} {exif.get(MODEL, '')} {own or equivalent or ''}"
     focal = None if equivalent is None else equivalent / DIAGONAL_35MM
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return Photograph(path, digest, size, focal, device, plain, orientation)
+    return Photograph(path, path.name, digest, size, focal, device, plain, orientation)
 
 
 def _positive(value: object) -> float | None:

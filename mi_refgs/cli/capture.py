@@ -21,7 +21,7 @@ class Capture:
     """
 
     photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """folder with JPEG or PNG files of one scene"""
+    """folder with JPEG or PNG files of one scene, or a video (pip install "mi_refgs[video]" reads it)"""
     output: Output  # folder of the data set; an interrupted run is continued
     masks: Annotated[Path | None, optional("FOLDER")] = None
     """masks NAME.png, one per photograph, white where the object is"""

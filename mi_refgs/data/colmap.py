@@ -1,25 +1,29 @@
 """Reader of COLMAP's layout: a reconstruction in `sparse/0`, text or binary, `images`, and perhaps `masks`.
-Every eighth image by name is a test view, unless `test.txt` beside the reconstruction lists them."""
+Every eighth image by name is a test view, unless `test.txt` beside the reconstruction lists them. Of several
+reconstructions, the one with most images is read."""
 
 from __future__ import annotations
 
-import itertools
+import contextlib
 from dataclasses import replace
+from glob import glob
 from pathlib import Path
 
 import numpy as np
 
-from mi_refgs.data.colmap_model import TEST_LIST, Camera, Image, read_cameras, read_images, read_points
-from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.images import ImageFile, ImageFolder
+from mi_refgs.data.colmap_model import TEST_LIST, Image, read_cameras, read_images, read_points
+from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, fitted, held_out, make_view
+from mi_refgs.data.images import ImageFile, ImageFolder, find_image, mask_of
 from mi_refgs.data.poses import from_world_to_camera
+from mi_refgs.data.transforms import read_points as read_ply_points
 from mi_refgs.data.view import View
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.images import linear_from_srgb
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-"""Folders of a reconstruction, in the order in which they are tried."""
+PLACES = "sparse/* sparse colmap/sparse/* colmap/sparse dense/*/sparse dense/sparse".split()
+PLACES += ["distorted/sparse/*", "colmap", "."]
+"""Folders of reconstructions, in the order in which they are tried."""
 ENDINGS = ("bin", "txt")
 MIN_VIEWS, MAX_ERROR = 3, 2.0  # track length and error, pixels, of used points: wrong matches have others
 MIN_POINTS = 100  # number of reliable points below which others are used, too
@@ -32,7 +36,7 @@ class ColmapReader:
     looks_for = "sparse/0/cameras.bin or .txt, beside images"
 
     def recognises(self, folder: Path) -> bool:
-        return _model(folder) is not None
+        return bool(_models(folder))
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         model = Reconstruction(folder, options)
@@ -42,17 +46,20 @@ class ColmapReader:
 
 class Reconstruction:
     def __init__(self, folder: Path, options: ReadOptions) -> None:
-        model, ending = _model(folder) or (folder, ENDINGS[0])
-        options.require_png(folder)
-        self.options = options
-        self.source = model / f"images.{ending}"
-        self.cameras = read_cameras(model / f"cameras.{ending}")
+        self.options, self.models = options, _models(folder)
+        self.source = max(self.models, key=_registered) if len(self.models) > 1 else self.models[0]
+        self.cameras = read_cameras(self.source.with_stem("cameras"))
         self.images = read_images(self.source)
-        point_file = model / f"points3D.{ending}"
+        point_file = self.source.with_stem("points3D")
         self.table = read_points(point_file) if point_file.is_file() else None
-        self.folder = ImageFolder.of(folder, flat=True)
-        found = {image.name: self.folder.find(image.name) for image in self.images}
-        self.files = {name: file for name, file in found.items() if file is not None}
+        self.folder = ImageFolder.of(folder, self.source.parent)
+        self.files, taken = dict[str, Path](), dict[Path, str]()
+        for name in (image.name for image in self.images):
+            if found := find_image((self.folder.path, self.folder.root), name, options.say):
+                if (other := taken.setdefault(found, name)) != name:
+                    what = f"{abbreviated(name)} and {abbreviated(other)} are both {found}"
+                    raise InputError(what, self.source, remedy="restore the folders of the images")
+                self.files[name] = found
 
     def registered(self, split: str) -> list[Image]:
         images = [image for image in self.images if image.name in self.files]
@@ -80,8 +87,11 @@ class Reconstruction:
         except InputError as error:
             raise error.at(file=where) from None
         pose = from_world_to_camera(image.rotation, image.translation, f"{self.source}: {image.name}")
-        file = ImageFile.of(self.files[image.name], self.options.downscale, self.folder.mask(image.name))
-        view = make_view(file, self.options, where, image.name, _intrinsics(camera, file), pose, lens)[0]
+        path = self.files[image.name]
+        file = ImageFile.of(path, self.options.downscale, mask_of(path, self.folder.root))
+        size, source = (camera.width, camera.height), f"{self.source.parent.name}/{self.source.name}"
+        pinhole = fitted(camera.intrinsics, size, file, self.options, source)
+        view = make_view(file, self.options, where, image.name, pinhole, pose, lens)[0]
         tracks, observed = None, image.observed
         if self.table is not None and len(numbers := self.table.number):
             at = np.searchsorted(numbers, observed[:, 2]) % len(numbers)
@@ -91,8 +101,9 @@ class Reconstruction:
 
     def points(self) -> PointCloud | None:
         """The reliable points, or all where only a few are reliable; None without any."""
-        if (points := self.table) is None:
-            return None
+        if (points := self.table) is None:  # some programs write them as PLY
+            file = self.source.with_name("points3D.ply")
+            return read_ply_points(file) if file.is_file() else None
         good = (points.views >= MIN_VIEWS) & (points.error <= MAX_ERROR)
         if np.count_nonzero(good) < MIN_POINTS:
             good[:] = True
@@ -107,25 +118,25 @@ class Reconstruction:
             notes.append(f"{absent} of {len(self.images)} cameras have no image and are left out")
         if (spare := len(names) - len(self.files)) > 0:
             notes.append(f"{spare} of {len(names)} images have no camera and are left out")
-        if (other := self.source.parent.with_name("1")).is_dir() and self.source.parent.name == "0":
-            notes.append(f"{other.parent.name}/1 contains another reconstruction, which is left out")
+        if others := len(self.models) - 1:
+            chosen = f"{'/'.join(self.source.parts[-3:-1])}, of {len(self.images)} images, is read"
+            notes.append(f"{chosen}; {others} smaller models are left out")
         return tuple(notes)
 
 
-def _model(folder: Path) -> tuple[Path, str] | None:
-    """The folder of the reconstruction and the ending of its files, binary ones first as in COLMAP."""
-    for place, ending in itertools.product(MODEL_FOLDERS, ENDINGS):
-        if all((folder / place / f"{name}.{ending}").is_file() for name in ("cameras", "images")):
-            return folder / place, ending
-    return None
+def _models(folder: Path) -> list[Path]:
+    """The images files of the reconstructions in one place; binary ones first, as in COLMAP."""
+    for place in PLACES:
+        paths = [folder / name for name in sorted(glob(place, root_dir=folder))]
+        files = (path / f"images.{ending}" for path in paths for ending in ENDINGS)
+        found = [f for f in files if f.is_file() and f.with_stem("cameras").is_file()]
+        if found:
+            return [file for file in found if file.suffix == ".bin" or file.with_suffix(".bin") not in found]
+    return []
 
 
-def _intrinsics(camera: Camera, image: ImageFile) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels of the file, perhaps a smaller copy; InputError for another aspect ratio."""
-    across, down = image.width / camera.width, image.height / camera.height
-    # Width and height of a copy are rounded by up to a pixel each.
-    if abs(image.height - across * camera.height) > 1 + image.height / image.width:
-        what = f"{image.width} × {image.height} pixels are no copy of {camera.width} × {camera.height}"
-        raise InputError(f"{what}, which were reconstructed", image.path, "size", "restore the image")
-    fx, fy, cx, cy = camera.intrinsics
-    return fx * across, fy * down, cx * across, cy * down
+def _registered(path: Path) -> int:
+    """Number of images of a reconstruction; 0 if it is broken."""
+    with contextlib.suppress(InputError):
+        return len(read_images(path))
+    return 0

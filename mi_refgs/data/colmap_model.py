@@ -169,7 +169,7 @@ def _records(path: Path, binary: Callable[[_Cursor], Records], text: Callable[[A
             if cursor.at < len(cursor.data):
                 raise ValueError(f"{len(cursor.data) - cursor.at} bytes follow the last record")
         else:
-            with path.open(encoding="utf-8") as lines:
+            with path.open(encoding="utf-8-sig") as lines:
                 rows = [*text(line.strip() for line in lines)]
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path, "file", "restore it") from error

@@ -16,11 +16,12 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.data.images import ImageCache, ImageFile, ImageSource
+from mi_refgs.data.images import MASKS, ImageCache, ImageFile, ImageSource, is_copy
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import FileCamera, View, evenly_spread
 from mi_refgs.errors import InputError
+from mi_refgs.io.images import image_size
 from mi_refgs.registry import Registry
 
 HOLDOUT = 8  # every eighth image is a test view where a data set names none (LLFF, 3DGS, 2DGS)
@@ -42,11 +43,16 @@ class ReadOptions:
     images: str = "png"  # "png": sRGB-encoded, or "exr": linear radiance
     truth: bool = True  # read ground-truth normals, depth and materials
     cache: ImageCache = field(default_factory=ImageCache, compare=False)
+    said: dict[str, dict[str, str]] = field(default_factory=dict, compare=False)
+    """What was changed or not used, for the user: by image, an example; empty if it is about no image."""
 
-    def require_png(self, folder: Path) -> None:
-        """Raise InputError if EXR images are requested, which most layouts do not have."""
-        if self.images != "png":
-            raise InputError("has no EXR images", file=folder, field="images", remedy="read it as 'png'")
+    def say(self, what: str, image: str, example: object) -> None:
+        self.said.setdefault(what, {})[image] = str(example)
+
+    def notes(self) -> tuple[str, ...]:
+        """What was said."""
+        examples = [(what, len(of), next(iter(of.values()), "")) for what, of in self.said.items()]
+        return tuple(f"{n} images: {what}, such as {one}" if n else what for what, n, one in examples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +107,27 @@ READERS: Registry[Reader] = Registry("reader of data sets", newest_first=True)
 register_reader = READERS.register  # add a reader, whose `recognises` is called before those of all others
 
 
-def reader_of(folder: Path) -> Reader:
-    """The reader of a folder; raises InputError if there is no such folder, or none recognises it."""
+def reader_of(folder: Path, options: ReadOptions | None = None) -> Reader:
+    """The reader of a folder: of several layouts that it has, the first whose training views can be read.
+    Raises InputError if there is no such folder, or no such layout."""
+    options = options or ReadOptions()
     if not folder.is_dir():
         raise InputError("no such folder", folder, "data set", "give one that contains images and cameras")
-    for reader in READERS.values():
-        if reader.recognises(folder):
+    readers = [*READERS.values()]
+    found, failed = [reader for reader in readers if reader.recognises(folder)], list[str]()
+    for reader in found:
+        try:
+            if len(found) > 1:
+                reader.read(folder, "train", replace(options, truth=False, said={}))
+        except InputError as error:
+            failed.append(f"{reader.name}: {error}")
+        else:
+            options.said.update({f"not read as {reason}": {} for reason in failed})
             return reader
-    known = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS.values())
+    if failed:
+        what = f"none of its layouts is whole: {'; '.join(failed)}"
+        raise InputError(what, folder, "data set", "mend or remove one of them")
+    known = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in readers)
     raise InputError("no layout is recognised", folder, "data set", f"complete it ({known})")
 
 
@@ -127,12 +146,31 @@ def require_few_sizes(file: Path, field: str, sizes: dict[tuple[int, int], str],
         raise InputError(f"{len(sizes)} different sizes, such as {some}", file, field, remedy)
 
 
+def fitted(
+    given: tuple[float, ...], size: tuple[float, float], image: ImageFile, options: ReadOptions, source: str
+) -> tuple[float, ...]:
+    """fx, fy, cx, cy of an image of `size`, as `source` has it, for the file, perhaps a smaller copy; raises
+    InputError for another aspect ratio."""
+    if size == (image.width, image.height):
+        return given
+    name, (width, height) = f"{image.width} × {image.height}", size
+    if not is_copy((image.width, image.height), size):
+        turned = is_copy((image.height, image.width), size)
+        remedy = "turn it, as its EXIF data may say" if turned else "restore the image"
+        what = f"{name} pixels are no copy of {width:g} × {height:g}, which {source} says"
+        raise InputError(what, image.path, "size", remedy)
+    what = "focal length and principal point are of a larger or smaller copy, and scaled"
+    options.say(what, str(image.path), f"{width:g} × {height:g} for the {name} pixels of {image.path.name}")
+    across, down = image.width / width, image.height / height
+    return tuple(n * scale for n, scale in zip(given, (across, down, across, down), strict=True))
+
+
 def make_view(
     image: ImageFile,
     options: ReadOptions,
     where: str,
     name: str,
-    intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy, pixels of the file
+    intrinsics: tuple[float, ...],  # fx, fy, cx, cy, pixels of the file
     to_world: np.ndarray,
     lens: Lens | None = None,
 ) -> tuple[View, Undistortion | None]:
@@ -141,7 +179,17 @@ def make_view(
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
             raise InputError(f"{focal:.3g} pixels is out of range", where, "focal length", "correct it")
-    file = FileCamera(image.path, image.width, image.height, intrinsics, lens, image.mask)
+    if image.is_linear_radiance != (options.images == "exr"):
+        what, other = ("an EXR file", "exr") if image.is_linear_radiance else ("no EXR file", "png")
+        raise InputError(what, image.path, "images", f"give data.images={other}")
+    fx, fy, cx, cy = intrinsics
+    file = FileCamera(image.path, image.width, image.height, (fx, fy, cx, cy), lens, image.mask)
+    if (mask := image.mask) is not None and mask.below is None:
+        if mask.path.parent.name not in (MASKS, image.path.parent.name):
+            options.say("a mask was found", name, mask.path)
+        if (size := image_size(mask.path)) != (image.width, image.height):
+            what = f"{size[0]} × {size[1]} for {image.width} × {image.height} pixels"
+            options.say("the mask is of another size, and resized", name, what)
     fx, fy, cx, cy = (value / image.downscale for value in intrinsics)
     straight = None
     if lens is not None:
@@ -238,7 +286,7 @@ def read_dataset(
     options = ReadOptions(1 if downscale is None else downscale, BACKGROUNDS[background], images, truth)
     if options.downscale < 1:
         raise InputError(f"{downscale} is out of range", path, "downscale", "give a whole number from 1")
-    reader = reader_of(path)
+    reader = reader_of(path, options)
     found = reader.read(path, split, options)
     if downscale is None:
         size = found.views[0].file or found.views[0]
@@ -247,7 +295,8 @@ def read_dataset(
         if (factor := next(fitting, most)) > 1:
             options = replace(options, downscale=factor)
             found = reader.read(path, split, options)
-    views, notes, points = found.views, found.notes, found.points
+    views, points = found.views, found.points
+    notes = found.notes + options.notes()
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
     require_few_sizes(found.source or path, "images", sizes, remedy)
@@ -255,7 +304,7 @@ def read_dataset(
     training = views
     if split != "train":
         with contextlib.suppress(InputError):  # a relit data set has none
-            training = reader.read(path, "train", replace(options, truth=False)).views
+            training = reader.read(path, "train", replace(options, truth=False, said={})).views
     # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored, but not that of masks.
     if _opaque(views) and (split == "train" or _opaque(training)):
         which = f"{sum(map(_own_alpha, views))} of {len(views)} images have alpha"

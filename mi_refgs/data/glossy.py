@@ -36,7 +36,6 @@ class GlossyReader:
         return bool(_numbers(folder))
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        options.require_png(folder)
         numbers = held_out(_numbers(folder), split, folder)
         return Recording(tuple(_view(folder, number, options) for number in numbers), source=folder)
 

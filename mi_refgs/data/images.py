@@ -4,9 +4,13 @@ undistorted and composited onto the background. An orientation in EXIF data is i
 
 from __future__ import annotations
 
+import os
+import re
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +19,7 @@ import numpy as np
 from mi_refgs.data.lens import Undistortion
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.exr import exr_has_alpha, read_exr_image
-from mi_refgs.io.files import inside, is_file
+from mi_refgs.io.files import is_file
 from mi_refgs.io.images import (
     ENDINGS,
     box_downscale,
@@ -29,8 +33,11 @@ from mi_refgs.io.images import (
 
 CACHE_BYTES = 2**30  # of decoded images that a data set keeps: 28 of 12 Mpx, a thousand of 600 × 600
 BAND = 256  # rows of a file that are converted to floating point at a time, for less memory
-IMAGES, MASKS = "images", "masks"  # names of folders
-COPIES = ("images_2", "images_4", "images_8")  # folders of smaller copies, the largest first
+MASKS = "masks"
+FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "rgb", "image")
+"""Folders of images, in the order in which they are tried; images_2 … contain smaller copies."""
+MASK = re.compile(r"(?i)(^|[-_. ])(masks?|alphas?|mattes?|silhouettes?)($|[-_. ])")  # in names of folders
+MARKS = ("", ".mask", "_mask", "-mask", "_alpha")  # after the name of an image in that of its mask
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,8 @@ class ImageFile:
 
     def decode(self) -> np.ndarray:
         """(H, W, 3 or 4): uint8 as in the file, else float32, averaged and premultiplied."""
+        from PIL import Image
+
         linear, factor = self.is_linear_radiance, 1
         if linear:
             pixels = read_exr_image(self.path)
@@ -94,9 +103,12 @@ class ImageFile:
                 return pixels
         mask = None if self.mask is None else self.mask.read()
         if mask is not None and self.mask is not None and mask.shape != (self.height, self.width):
-            size = f"{mask.shape[1]} × {mask.shape[0]}"
-            what = f"{size} pixels, but {self.path.name} has {self.width} × {self.height}"
-            raise InputError(what, self.mask.path, "mask", "make both of one size")
+            if not is_copy(mask.shape[::-1], (self.width, self.height)):
+                size = f"{mask.shape[1]} × {mask.shape[0]}"
+                what = f"{size} pixels, but {self.path.name} has {self.width} × {self.height}"
+                raise InputError(what, self.mask.path, "mask", "make both of one size")
+            whole, linearly = (self.width, self.height), Image.Resampling.BILINEAR  # averages, if smaller
+            mask = np.asarray(Image.fromarray(mask).resize(whole, linearly))
         (width, height), block = self.size, self.downscale // factor
         bands, step = [], max(BAND // block, 1)
         for top in range(0, height, step):
@@ -187,47 +199,90 @@ class ImageSource:
         return pixels if self.has_alpha else pixels.without_alpha()
 
 
+def is_copy(size: tuple[float, ...], of: tuple[float, ...]) -> bool:
+    """Whether two sizes have one aspect ratio, rounded by up to a pixel per side of the smaller one."""
+    return abs(size[0] * of[1] - size[1] * of[0]) < max(sum(size), sum(of))
+
+
 @dataclass(frozen=True)
 class ImageFolder:
-    """The folder `images` of COLMAP's and LLFF's layouts, and the folder `masks` beside it."""
+    """A folder of images of COLMAP's and LLFF's layouts."""
 
     path: Path
-    masks: Path | None
+    root: Path  # beside it or, of a folder without such a name, itself
 
     @classmethod
-    def of(cls, root: Path, flat: bool = False) -> ImageFolder:
-        """`images` below `root`, else the largest copies, such as `images_4`, else with `flat` `root`."""
-        found = [root / name for name in (IMAGES, *COPIES) if (root / name).is_dir()]
-        if not found and flat and any(map(_is_image, root.iterdir())):
-            found = [root]
+    def of(cls, root: Path, model: Path | None = None) -> ImageFolder:
+        """The first of FOLDERS below `root`; of a `model`, a folder there, of the nearest of its parents that
+        has one, or else that itself contains images."""
+        parents = [root] if model is None else [p for p in (model, *model.parents) if p.is_relative_to(root)]
+        found = [(p / name, p) for p in parents for name in FOLDERS if (p / name).is_dir()]
+        if not found and model is not None:
+            found = [(parent, parent) for parent in parents if any(map(_is_image, parent.iterdir()))]
         if not found:
-            raise InputError("no such folder", root, IMAGES, "put the images there")
-        return cls(found[0], root / MASKS if (root / MASKS).is_dir() else None)
+            raise InputError("no such folder", root, FOLDERS[0], "put the images there")
+        return cls(*found[0])
 
     def names(self) -> list[str]:
-        """Sorted paths of the images, also in subfolders of a folder that contains nothing else."""
-        pattern = "**/*" if self.path.name in (IMAGES, *COPIES) else "*"
-        return sorted(str(path.relative_to(self.path)) for path in self.path.glob(pattern) if _is_image(path))
+        """Sorted paths of the images, also in subfolders of a folder that contains nothing else; no masks."""
+        files = image_files(self.path, "*" if self.path == self.root else "**/*")
+        return [str(path.relative_to(self.path)) for path in files]
 
-    def find(self, name: str) -> Path | None:
-        """The file of an image, which may have another ending than the name; None without a file."""
-        file = inside(self.path, name)
-        if file is None:
-            what = f"{abbreviated(name)} names no file in {self.path.name}"
-            raise InputError(what, self.path.parent, remedy="move the image there")
-        return file if is_file(file) else with_ending(file.with_suffix(""))
 
-    def mask(self, name: str) -> Mask | None:
-        return None if self.masks is None else mask_in(self.masks, name)
+def image_files(folder: Path, pattern: str) -> list[Path]:
+    """The images in a folder by name, but neither hidden ones nor masks beside their images."""
+    paths = sorted(path for path in folder.glob(pattern) if _is_image(path))
+    masks = {f"{path.with_suffix('')}{mark}" for path in paths for mark in MARKS[1:]}
+    return [path for path in paths if str(path.with_suffix("")) not in masks]
+
+
+def find_image(folders: Sequence[Path], name: str, tell: Callable[[str, str, object], None]) -> Path | None:
+    """The file in one of `folders` that another program calls `name`, whatever its ending; of an absolute
+    name, or one in FOLDERS, that of its last parts, of which `tell`, such as `ReadOptions.say`, is told."""
+    parts = os.path.normpath(name.replace("\\", "/")).split("/")
+    away = parts[0] in ("", os.pardir) or parts[0].endswith(":")
+    starts = range(len(parts)) if away else range(1 + (parts[0] in FOLDERS))
+    for start, folder in product(starts, folders):
+        if parts[start:] and parts[start] not in ("", os.curdir, os.pardir):
+            file = folder.joinpath(*parts[start:])
+            found = file if is_file(file) else with_ending(file)
+            if found is None and not file.suffix[1:].isdigit():  # a number is part of the name
+                found = with_ending(file.with_suffix(""), (file.suffix.lower(), *ENDINGS, ".exr"))
+            if found is not None:
+                if start:
+                    tell("the path leads elsewhere, and its last parts are read", name, abbreviated(name))
+                return found
+    return None
+
+
+def mask_of(image: Path, root: Path, beside: bool = True) -> Mask | None:
+    """The mask of an image of the folder `root`: `beside` it, such as a_mask.png of a.jpg, or in a folder of
+    `root` such as masks, or of its own folder `train`, train_mask. Raises InputError if it is not there."""
+    if beside and (found := _mask_file(image.parent, image.name, MARKS[1:])):
+        return Mask(found)
+    name = image.relative_to(root)
+    own = name.parts[0] if len(name.parts) > 1 else ""
+    folders = [path for path in sorted(root.iterdir()) if MASK.search(path.name) and path.is_dir()]
+    images = {path: MASK.sub("", path.name) for path in folders}  # the folder whose masks these are, or ""
+    folders = [path for path in folders if images[path] in ("", own) or not (root / images[path]).is_dir()]
+    if not folders:
+        return None
+    best = min(folders, key=lambda path: (images[path] != own, images[path] != "", path.name != MASKS))
+    return mask_in(best, str(name.relative_to(own) if own in (*FOLDERS, images[best]) else name))
 
 
 def mask_in(folder: Path, name: str) -> Mask:
-    """The mask of an image in a folder of masks: `a.jpg.png`, `a.jpg` or `a.png` of `a.jpg`."""
-    for candidate in (f"{name}.png", name, str(Path(name).with_suffix(".png"))):
-        file = inside(folder, candidate)
-        if file is not None and is_file(file):
-            return Mask(file)
+    """The mask of an image in a folder of masks: of `a.jpg` `a.jpg.png`, `a.png`, `a_mask.png` and so on."""
+    if found := _mask_file(folder, name, MARKS):
+        return Mask(found)
     raise InputError("missing", folder / f"{name}.png", "mask", "add it, or remove the folder of masks")
+
+
+def _mask_file(folder: Path, name: str, marks: Sequence[str]) -> Path | None:
+    endings = (*ENDINGS, *(ending.upper() for ending in ENDINGS))
+    stems = (name, str(Path(name).with_suffix("")))
+    files = (folder / f"{stem}{mark}{ending}" for stem, mark, ending in product(stems, marks, endings))
+    return next((file for file in files if is_file(file)), None)
 
 
 def _is_image(path: Path) -> bool:

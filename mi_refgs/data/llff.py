@@ -12,7 +12,7 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.dataset import ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.images import ImageFile, ImageFolder
+from mi_refgs.data.images import ImageFile, ImageFolder, mask_of
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
@@ -30,7 +30,6 @@ class LlffReader:
         return (folder / POSES).is_file()
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        options.require_png(folder)
         source, images = folder / POSES, ImageFolder.of(folder)
         rows, names = read_poses(source), images.names()
         if len(names) != len(rows):
@@ -58,7 +57,8 @@ def read_poses(path: Path) -> np.ndarray:
 
 
 def _view(source: Path, images: ImageFolder, options: ReadOptions, name: str, row: np.ndarray) -> View:
-    image = ImageFile.of(images.path / name, options.downscale, images.mask(name))
+    path = images.path / name
+    image = ImageFile.of(path, options.downscale, mask_of(path, images.root))
     down, right, backwards, position, (height, width, focal) = row[:15].reshape(3, 5).T
     if min(height, width, focal) <= 0:
         remedy = "export the poses again"

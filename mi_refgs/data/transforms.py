@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.images import IMAGES, MASKS, ImageFile, Mask, block_mean, mask_in
+from mi_refgs.data.colmap_model import MODELS
+from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, fitted, held_out, make_view
+from mi_refgs.data.images import FOLDERS, ImageFile, Mask, block_mean, find_image, mask_of
 from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
@@ -30,12 +31,10 @@ from mi_refgs.io.images import ENDINGS, linear_from_srgb, read_png, read_tiff, w
 from mi_refgs.io.ply import read_vertices
 
 SUFFIXES = (*ENDINGS, ".exr")  # that `file_path` may have or omit, in the order in which they are tried
-CAMERA_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
-CAMERA_MODELS |= {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of unsupported lenses, refused unless they are 0 or false."""
 MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}  # channels of ground truth
-NORMALS, DISPARITY, ALPHA = "_normal.png", "_disp.tiff", "_alpha.png"  # after the stem of an image's name
+NORMALS, DISPARITY = "_normal.png", "_disp.tiff"  # after the stem of an image's name
 NORMAL_LENGTH = 0.5  # smallest length of an 8-bit normal: no normal is stored as (½, ½, ½)
 
 
@@ -53,7 +52,7 @@ class TransformsReader:
         views = tuple(_view(frame, options) for frame in frames)
         light, file, points = folder / "environment.exr", frames[0].file, None
         if name := frames[0].given.get("ply_file_path"):
-            points = read_points(_inside(file, "ply_file_path", name))
+            points = read_points(_path(file, "ply_file_path", name, options))
         return Recording(views, points, light if light.is_file() else None, source=file)
 
 
@@ -85,10 +84,10 @@ class Frame:
     def refuse(self, key: str, what: str, remedy: str) -> InputError:
         return InputError(what, self.file, f"{self.place}.{key}" if key in self.own else key, remedy)
 
-    def path(self, key: str) -> Path | None:
+    def path(self, key: str, options: ReadOptions) -> Path | None:
         """The file of a key; None where the frame has no such key, or an empty name."""
         name = self.own.get(key)
-        return None if name in (None, "") else _inside(self.file, f"{self.place}.{key}", name)
+        return None if name in (None, "") else _path(self.file, f"{self.place}.{key}", name, options)
 
     def number(self, key: str, positive: bool = False) -> float | None:
         value = self.given.get(key)
@@ -99,26 +98,32 @@ class Frame:
             raise self.refuse(key, f"{abbreviated(value)} is not {kind}", "correct it")
         return float(value)
 
-    def to_world(self) -> np.ndarray:
+    def to_world(self, options: ReadOptions | None = None) -> np.ndarray:
         """`View.to_world`, from `transform_matrix`."""
         field = f"{self.place}.transform_matrix"
         try:
             matrix = np.array(self.own["transform_matrix"], dtype=np.float64)
         except (KeyError, TypeError, ValueError, OverflowError):
             matrix = np.empty(0)
+        if matrix.shape == (3, 4):
+            matrix = np.vstack([matrix, [0, 0, 0, 1]])
         if matrix.shape != (4, 4):
             raise InputError("missing or not 4 × 4 numbers", self.file, field, "give camera to world")
-        return rigid(matrix, f"{self.file}: {field}") @ MITSUBA_FROM_OPENGL
+        made = rigid(matrix, f"{self.file}: {field}")
+        if made is not matrix and options is not None:
+            options.say("the rotation is rounded or scaled, and made orthonormal", self.place, field)
+        return made @ MITSUBA_FROM_OPENGL
 
     def lens(self) -> Lens | None:
         """The lens; None for a pinhole."""
         model = self.given.get("camera_model") or "OPENCV"
         fisheye = self.given.get("is_fisheye") or False
         odd = [key for key in OTHER_LENSES if self.given.get(key)]
-        if not isinstance(model, str) or model not in CAMERA_MODELS or not isinstance(fisheye, bool) or odd:
+        if odd or str(model).upper() not in MODELS or not isinstance(fisheye, bool):
             remedy = "undistort the images, or give OpenCV's perspective or fisheye coefficients"
-            raise self.refuse(odd[0] if odd else "camera_model", "this lens is not supported", remedy)
-        fisheye = fisheye or model.endswith("FISHEYE")
+            what = f"the lens {odd[0] if odd else abbreviated(model)} is not supported"
+            raise self.refuse(odd[0] if odd else "camera_model", what, remedy)
+        fisheye = fisheye or model.upper().endswith("FISHEYE")
         given = {key: self.number(key) or 0.0 for key in COEFFICIENTS}
         for key in ("p1", "p2") if fisheye else ("k4",):
             if given[key]:
@@ -175,8 +180,11 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
     return lists["train"] or {frame.name for frame in frames} - test - lists["val"]
 
 
-def _inside(transforms: Path, field: str, name: object) -> Path:
-    file = inside(transforms.parent, name)
+def _path(transforms: Path, field: str, name: object, options: ReadOptions) -> Path:
+    """The file of a name, or where it is missing; raises InputError for a name of no file in the folder."""
+    root = transforms.parent
+    more = [root / folder for folder in FOLDERS] if field.endswith("file_path") else []
+    file = find_image((root, *more), str(name), options.say) or inside(root, name)
     if file is None:
         what = f"{abbreviated(name)} names no file in the data set's folder"
         raise InputError(what, transforms, field, "move the file there and give its relative path")
@@ -204,11 +212,14 @@ def read_points(path: Path) -> PointCloud | None:
 
 
 def _view(frame: Frame, options: ReadOptions) -> View:
-    file = _image(frame, options.images)
+    file = _image(frame, options)
     image = ImageFile.of(file, options.downscale)
-    image = replace(image, mask=_mask(frame, image))
-    name, pinhole = _stem(str(Path(frame.name))), _intrinsics(frame, image)
-    pose, lens, where = frame.to_world(), frame.lens(), f"{frame.file}: {frame.place}"
+    if (mask := frame.path("mask_path", options)) == file:
+        raise frame.refuse("mask_path", "it is the image", "name a mask")
+    found = Mask(mask) if mask else mask_of(file, frame.file.parent, beside=not image.has_alpha())
+    image = replace(image, mask=found)
+    name, pinhole = _stem(str(Path(frame.name))), _intrinsics(frame, image, options)
+    pose, lens, where = frame.to_world(options), frame.lens(), f"{frame.file}: {frame.place}"
     view, straight = make_view(image, options, where, name, pinhole, pose, lens)
     if not options.truth:
         return view
@@ -216,7 +227,7 @@ def _view(frame: Frame, options: ReadOptions) -> View:
     maps = {
         name: _map(path, f"{frame.place}.{name}_path", (*size, channels), options.downscale, straight)
         for name, channels in MAPS.items()
-        if (path := frame.path(f"{name}_path"))
+        if (path := frame.path(f"{name}_path", options))
     }
     normal, depth = maps.pop("normal", None), maps.pop("depth", None)
     if normal is depth is None:
@@ -228,49 +239,25 @@ def _view(frame: Frame, options: ReadOptions) -> View:
     return replace(view, normal=normal, depth=depth, materials=maps)
 
 
-def _mask(frame: Frame, image: ImageFile) -> Mask | None:
-    """The mask of an image: the frame's, or without alpha a file beside the image, or one of `masks`."""
-    if (named := frame.path("mask_path")) is not None:
-        return Mask(named)
-    if image.has_alpha():
-        return None
-    file, masks = image.path, frame.file.parent / MASKS
-    if (found := _beside(file, ALPHA)) is not None:
-        return Mask(found)
-    if not masks.is_dir():
-        return None
-    name = file.relative_to(frame.file.parent)
-    return mask_in(masks, str(name.relative_to(name.parts[0]) if name.parts[0].startswith(IMAGES) else name))
-
-
-def _image(frame: Frame, images: str) -> Path:
-    path = frame.path("file_path")
+def _image(frame: Frame, options: ReadOptions) -> Path:
+    path = frame.path("file_path", options)
     if path is None:
         raise InputError("missing", frame.file, f"{frame.place}.file_path", "name the image")
     stem = path.with_name(_stem(path.name))
-    linear = frame.path("exr_path") or with_ending(stem, (".exr",))
-    if images == "exr":
+    if options.images == "exr":
+        linear = frame.path("exr_path", options) or with_ending(stem, (".exr",))
         return linear or stem.with_name(f"{stem.name}.exr")
-    file = path if is_file(path) else with_ending(stem)
-    if file is None:
-        file = stem.with_name(stem.name + ENDINGS[0])
-        if linear is not None and is_file(linear):
-            file = linear
-    if file.suffix.lower() == ".exr":
-        raise InputError("an EXR file", file, "images", "give data.images=exr to read EXR files")
-    return file
+    return path if is_file(path) else stem.with_name(stem.name + ENDINGS[0])
 
 
-def _intrinsics(frame: Frame, image: ImageFile) -> tuple[float, float, float, float]:
+def _intrinsics(frame: Frame, image: ImageFile, options: ReadOptions) -> tuple[float, ...]:
     """fx, fy, cx, cy in pixels of the image file."""
-    width, height = image.width, image.height
-    for key, size in (("w", width), ("h", height)):
-        wanted = frame.number(key, positive=True)
-        if wanted is not None and wanted != size:
-            what = f"{width} × {height} pixels, but {frame.file.name} says {key} = {wanted:g}"
-            raise InputError(what, image.path, "size", "restore the image, or give only camera_angle_x")
+    width, height = frame.number("w", positive=True), frame.number("h", positive=True)
+    width = width or image.width * (height or image.height) / image.height
+    height = height or image.height * width / image.width
     cx, cy = frame.number("cx", positive=True), frame.number("cy", positive=True)
-    return *frame.focal_lengths(width, height), cx or width / 2, cy or height / 2
+    given = (*frame.focal_lengths(width, height), cx or width / 2, cy or height / 2)
+    return fitted(given, (width, height), image, options, frame.file.name)
 
 
 def _map(

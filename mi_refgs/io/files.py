@@ -152,7 +152,7 @@ def inside(folder: Path, name: object) -> Path | None:
 def read_any_json(path: Path) -> Any:
     """The value in a JSON file; raises InputError for other files."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         what, remedy = f"cannot be read ({error})", "correct it or export it again"
         raise InputError(what, path, "JSON", remedy) from error

@@ -18,7 +18,7 @@ from mi_refgs.io.files import check_size, is_file, replace_file, require_file
 SRGB_LINEAR_LIMIT = 0.0031308  # linear value below which the sRGB curve is a straight line (IEC 61966-2-1)
 SRGB_ENCODED_LIMIT = 0.04045  # the same point after encoding
 ALPHA_FLOOR = 1e-8  # alpha by which radiance is divided at least
-ENDINGS = (".png", ".jpg", ".jpeg")  # of 8-bit images, in the order in which they are tried
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp")  # of 8-bit images, in the order in which they are tried
 EXIF_IFD = 0x8769  # tag of the table of camera settings (EXIF 2.3)
 PSNR_MAX = 100.0  # dB, of identical images: JSON has no infinity
 JPEG_SHRINK = 8  # JPEG blocks have 8 × 8 pixels; the decoder can return 8 × 8, 4 × 4, 2 × 2 or 1 for each
@@ -67,7 +67,7 @@ def with_ending(stem: Path, endings: tuple[str, ...] = ENDINGS) -> Path | None:
                 return file
     try:
         others = sorted(path for path in stem.parent.iterdir() if path.name.startswith(f"{stem.name}."))
-    except OSError:
+    except (OSError, ValueError):  # an impossible name
         return None
     by_ending = {path.name[len(stem.name) :].lower(): path for path in others if is_file(path)}
     return next((by_ending[ending] for ending in endings if ending in by_ending), None)
@@ -150,7 +150,7 @@ def open_image(path: Path, *formats: str) -> Iterator[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `check_size` is stricter
-            image = Image.open(path, formats=formats or ("PNG", "JPEG"))
+            image = Image.open(path, formats=formats or ("PNG", "JPEG", "WEBP"))
         with image:
             check_size(path, *image.size, len(image.getbands()))
             yield image

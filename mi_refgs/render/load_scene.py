@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import mitsuba as mi
@@ -15,9 +16,16 @@ IMAGES = {"envmap": read_radiance, "bitmap": lambda file: read_image(file)[0]}
 """Readers of the files of Mitsuba's plugins."""
 
 
-def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False, optimize: bool = True) -> Any:
+def load_scene(
+    path: Path,
+    aovs: Sequence[str] = (),
+    object_only: bool = False,
+    optimize: bool = True,
+    define: Mapping[str, str] = MappingProxyType({}),
+) -> Any:
     """Load a scene, its `refgs` integrator with these AOVs (types, or `name:type`) after its own,
     `object_only` without what surrounds the object, not to `optimize` with all its shapes and their ids.
+    `define`: values of the parameters $name in the file.
     Raises InputError for what cannot be loaded, for a name of two types, and for AOVs or `object_only`
     without that integrator."""
     before = mi.file_resolver()
@@ -27,7 +35,7 @@ def load_scene(path: Path, aovs: Sequence[str] = (), object_only: bool = False, 
     try:
         config = mi.parser.ParserConfig(mi.variant())
         config.merge_equivalent = config.merge_meshes = optimize
-        state = mi.parser.parse_file(config, str(path))
+        state = mi.parser.parse_file(config, str(path), **define)
         mi.parser.transform_all(config, state)
         if aovs or object_only:
             integrators = [node.props for node in state.nodes if node.props.plugin_name() == "refgs"]
@@ -71,4 +79,9 @@ def reason(error: BaseException) -> str:
         _, found, message = line.partition("InputError: ")
         if found:
             return message
-    return f"{lines[-1] if lines else error}; correct the scene"
+    remedy = (
+        "`refgs dataset -D NAME=VALUE` gives one"
+        if "undefined parameter" in str(error)
+        else "correct the scene"
+    )
+    return f"{lines[-1] if lines else error}; {remedy}"

@@ -34,8 +34,8 @@ def traced(
 ) -> Dataset:
     """The views; see `Dataset.from_mitsuba`."""
     path = Path(scene) if isinstance(scene, str | Path) else Path("scene in memory")
-    loaded = load_scene(path) if isinstance(scene, str | Path) else scene
     given = options_of("from_mitsuba", path, options)
+    loaded = load_scene(path, given.define) if isinstance(scene, str | Path) else scene
     cameras, _, region = around_object(loaded, given, path)
     jobs: list[tuple[Tracer, View, int]] = []
     if isinstance(sensors, int):

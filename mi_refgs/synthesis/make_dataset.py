@@ -62,7 +62,7 @@ def make_dataset(
     lights = [relight] if isinstance(relight, str | Path) else relight
     settings, others = given.record(scene), [LightFile.of(Path(path)) for path in lights]
     # The scene under each light, and its surface.
-    loaded = load_scene(scene)
+    loaded = load_scene(scene, given.define)
     cameras, shapes, region = around_object(loaded, given, scene, progress)
     vertices, faces = surface_mesh(shapes)
     relit = [under_light(loaded, other.path, cameras.objects) for other in others]

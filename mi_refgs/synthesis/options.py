@@ -7,13 +7,13 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import Suppress, arg
+from tyro.conf import Suppress, UseAppendAction, arg
 
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.files import require_file
@@ -27,6 +27,7 @@ OPTIONS |= {"objects": "--object", "scene": "the scene file", "scene_sha256": "t
 WHOLE = (lambda n: n >= 1 and n % 1 == 0, "give a whole number of at least 1")
 RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("views", "spp", "max_depth", "test_views"), WHOLE),
+    "define": (lambda given: all("=" in text for text in given), "give NAME=VALUE"),
     "seed": (lambda n: n >= 0 and n % 1 == 0, "give a whole number of at least 0"),
     "environment_height": (lambda n: n >= 0 and n % 1 == 0, "give a whole number of at least 0"),
     "resolution": (lambda size: len(size) == 2 and all(map(WHOLE[0], size)), "give pixels, or WIDTH, HEIGHT"),
@@ -54,6 +55,8 @@ class DatasetOptions:
     objects: Annotated[tuple[str, ...], optional(metavar="ID …", name="object")] = ()
     """shapes of the object, among others: opaque images, ground truth of these shapes only (default: all but
     lamps; all but floors, walls and domes much larger than the rest, if there are any)"""
+    define: Annotated[UseAppendAction[tuple[str, ...]], optional(metavar="NAME=VALUE", aliases=("-D",))] = ()
+    """value of the scene's parameter $NAME, as in `mitsuba -D`; may be repeated"""
     distance: Annotated[Range | None, optional(metavar="NEAR FAR")] = None
     """distance of cameras from the object's centre, scene units (default: the object fills the image)"""
     elevation: Annotated[Range, arg(metavar="LOW HIGH")] = (-30.0, 80.0)  # elevation of cameras, degrees
@@ -94,12 +97,13 @@ class DatasetOptions:
         width, height = self.resolution
         values = vars(self) | {
             "scene": scene.name,
-            "scene_sha256": scene_hash(scene),  # of the XML and the files in it
+            "scene_sha256": scene_hash(scene, self.define),  # of the XML and the files in it
             "test_views": self.count("test"),
             "size": width,
             "height": 0 if height == width else height,
             "distance": self.distance or (0, 0),
         }
+        del values["define"]
         content: dict[str, Any] = json.loads(json.dumps(values))  # tuples become lists
         return content
 
@@ -119,8 +123,8 @@ class LightFile:
         return LightFile(path, name, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
-def scene_hash(scene: Path) -> str:
-    """SHA-256 of a scene's XML and the files in it; raises InputError if it is missing or no XML."""
+def scene_hash(scene: Path, define: Sequence[str] = ()) -> str:
+    """SHA-256 of a scene's XML, the files in it, and parameters; raises InputError if it is no XML file."""
     if not scene.is_file():
         raise InputError("missing", scene, "scene", "give the path of a Mitsuba XML file")
     content = scene.read_bytes()
@@ -128,7 +132,7 @@ def scene_hash(scene: Path) -> str:
         root = ElementTree.fromstring(content)
     except ElementTree.ParseError as error:
         raise InputError(f"not XML ({error})", scene, "scene", "give a Mitsuba scene") from error
-    digest = hashlib.sha256(content)
+    digest = hashlib.sha256(content + "".join(define).encode())
     names = [e.get("value") for e in root.iter("string") if e.get("name") == "filename"]
     for name in [*names, *(e.get("filename") for e in root.iter("include"))]:
         file = scene.parent / (name or "")

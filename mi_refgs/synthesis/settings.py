@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -31,9 +32,20 @@ FILES = (
 """Files of a data set, and of its views under another map, which overwriting removes."""
 
 
-def load_scene(scene: Path) -> Any:
-    """Load a Mitsuba scene with all shapes and their ids: Mitsuba would merge meshes of one material."""
-    loaded = scenes.load_scene(scene, optimize=False)
+def load_scene(scene: Path, define: Sequence[str] = ()) -> Any:
+    """Load a Mitsuba scene with all shapes and their ids: Mitsuba would merge meshes of one material.
+    `define`: values of its parameters, name=value; those of the integrator, which is replaced, need none."""
+    values = dict(text.partition("=")[::2] for text in define)
+    with contextlib.suppress(OSError, ElementTree.ParseError):  # which Mitsuba reports
+        root = ElementTree.parse(scene).getroot()
+        inside = [element for parent in root.iter("integrator") for element in parent.iter()]
+        elsewhere = {value for e in root.iter() if e not in inside for value in e.attrib.values()}
+        for element in inside:
+            for key, value in element.attrib.items():
+                if value.startswith("$") and value not in elsewhere:
+                    any_value = "path" if key == "type" else {"boolean": "false"}.get(element.tag, "1")
+                    values.setdefault(value[1:], any_value)
+    loaded = scenes.load_scene(scene, optimize=False, define=values)
     for kind, there in (("shapes", loaded.shapes()), ("emitters", loaded.emitters())):
         if not there:
             raise InputError("the scene has none", scene, kind, "add an object and a light")

@@ -18,7 +18,7 @@ from PIL import Image
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
 from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
-from mi_refgs.capture.photographs import find_masks, find_photographs, mask_pixels
+from mi_refgs.capture.photographs import find_masks, find_photographs, mask_pixels, write_frames
 from mi_refgs.capture.pipeline import require_placed
 from mi_refgs.cli import main
 from mi_refgs.data.lens import Lens, undistortion
@@ -275,9 +275,41 @@ def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
     refused(command, "5 different sizes, such as 10 × 8 ('10.jpg')")
 
 
-def test_missing_pycolmap_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
-    refused(["capture", tmp_path, "-o", tmp_path / "data"], 'pip install "mi_refgs[capture]"')
+def test_photographs_in_subfolders(tmp_path: Path) -> None:
+    """Whatever their format; masks are no photographs."""
+    for i, kind in enumerate(("JPEG", "WEBP", "PNG")):
+        Image.new("RGB", (6, 4), (80 * i, 0, 0)).save(_made(tmp_path / str(i)) / "a.jpg", kind, lossless=True)
+        Image.new("L", (6, 4)).save(_made(tmp_path / "masks") / f"{i}.png")
+    found = find_photographs(tmp_path)
+    assert [photograph.name for photograph in found] == ["0/a.jpg", "1/a.jpg", "2/a.jpg"]
+    assert [np.asarray(photograph.load())[1, 2, 0] for photograph in found] == [0, 80, 160]
+
+
+def test_sharpest_frames_of_a_video_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    av, clip, out = pytest.importorskip("av"), tmp_path / "clip.mp4", _made(tmp_path / "frames")
+    with av.open(str(clip), "w") as video:
+        stream = video.add_stream("mpeg4", 30, width=64, height=48, pix_fmt="yuv420p", bit_rate=10**7)
+        for i in range(9):
+            frame = np.full((48, 64, 3), 20 * i + 20, dtype=np.uint8)
+            frame[:, ::4] = 0 if i % 2 else frame[0, 0]  # lines in every second one
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+        video.mux(stream.encode())
+    monkeypatch.setattr("mi_refgs.capture.photographs.FRAMES", 5)
+    write_frames(clip, out)
+    found = [read_png(path)[:, 1::4].mean() for path in sorted(out.iterdir())]
+    np.testing.assert_allclose(found, np.array([40, 80, 120, 160, 180]) / 255, atol=0.04)
+    clip.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(100))
+    refused(["capture", clip, "-o", tmp_path / "data"], "clip.mp4: video: cannot be read")
+
+
+@pytest.mark.parametrize(("module", "extra"), [("pycolmap", "capture"), ("av", "video")])
+def test_missing_library_is_named(
+    module: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, module, None)
+    (tmp_path / "clip.MP4").write_bytes(b"0")
+    source = tmp_path / ("clip.MP4" if module == "av" else "")
+    refused(["capture", source, "-o", tmp_path / "data"], f'pip install "mi_refgs[{extra}]"')
 
 
 def test_exif_gives_orientation_and_focal_length(tmp_path: Path) -> None:

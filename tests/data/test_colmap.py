@@ -91,7 +91,7 @@ def test_copies_are_used_without_images(tmp_path: Path) -> None:
     assert (view.width, view.height) == (49, 37)
     assert (view.fx, view.cy) == pytest.approx((110 * 49 / 97, 34.6 * 37 / 73))
     replace(SHOTS[1], width=72, height=96).write(data / "images_2")  # as turned upright by its EXIF data
-    refused(lambda: read_dataset(data, "train"), "b.png: size: 72 × 96 pixels are no copy of 97 × 73")
+    refused(lambda: read_dataset(data, "train"), "72 × 96 pixels are no copy of 97 × 73", "turn it")
 
 
 def test_unreliable_points_are_left_out(tmp_path: Path) -> None:
@@ -116,12 +116,10 @@ def test_cameras_and_images_without_each_other_are_noted(tmp_path: Path) -> None
     data = write_colmap(tmp_path)
     SHOTS[0].write(data / "images/more")
     (data / "images/c.png").unlink()
-    (data / "sparse/1").mkdir()
     found = read_dataset(data, "train")
     assert len(found.views) == 7 and found.notes == (
         "1 of 9 cameras have no image and are left out",
         "1 of 9 images have no camera and are left out",
-        "sparse/1 contains another reconstruction, which is left out",
     )
     shutil.rmtree(data / "images")
     refused(lambda: read_dataset(data, "train"), "images: no such folder")
@@ -129,12 +127,12 @@ def test_cameras_and_images_without_each_other_are_noted(tmp_path: Path) -> None
     refused(lambda: read_dataset(data, "train"), "images.bin: none of its 9 images is in")
 
 
-def test_names_outside_of_the_folder_are_refused(tmp_path: Path) -> None:
+def test_names_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:
     data = write_colmap(tmp_path / "data")
-    SHOTS[0].write(tmp_path)
+    (data / "images/a.png").rename(tmp_path / "a.png")
     for name in ("../a.png", str(tmp_path / "a.png"), "."):
         write_binary(data / "sparse/0", [replace(SHOTS[0], name=name), *SHOTS[1:]])
-        refused(partial(read_dataset, data, "test"), "names no file in images")
+        assert read_dataset(data, "test").notes == ("1 of 9 cameras have no image and are left out",)
 
 
 @pytest.mark.parametrize(

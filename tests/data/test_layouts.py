@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,13 +15,12 @@ from PIL import Image
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.io.images import linear_from_srgb, write_png
-from tests.helpers import read_loaded, refused
+from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import (
     SHOTS,
     change_transforms,
     ply_bytes,
-    write_colmap,
     write_glossy,
     write_llff,
     write_nerfstudio,
@@ -65,51 +63,6 @@ def test_filenames_define_splits(tmp_path: Path) -> None:
     for names_given, words in ((["images/no.png"], "zero test views"), ([3], "not a list of paths")):
         change_transforms(data, partial(dict.update, test_filenames=names_given))
         refused(partial(read_dataset, data, "test"), words)
-
-
-@pytest.mark.parametrize("name", ["a.PNG", "a.Png", "a.JPG", "a.jpeg", "a.b.JPEG"])
-@pytest.mark.parametrize("ending", [".png", ""])
-def test_file_path_matches_any_ending(name: str, ending: str, tmp_path: Path) -> None:
-    """With the file's ending, in other letters or of another kind, or without; a dot may be in the name."""
-    data = write_nerfstudio(tmp_path)
-    (data / "images/a.png").unlink()
-    (data / "images/b.png").rename(data / "images" / name)
-    frame = {"file_path": f"images/{Path(name).stem}{ending}"}
-    change_transforms(data, lambda content: content.update(frames=[content["frames"][1] | frame]))
-    check(read_dataset(data, "test").views[0], SHOTS[1])
-
-
-@pytest.mark.parametrize("write", [write_nerfstudio, write_llff, write_colmap])
-def test_masks_become_alpha(write: Callable[[Path], Path], tmp_path: Path) -> None:
-    """All images need one."""
-    data = write(tmp_path)
-    (data / "masks").mkdir()
-    mask = np.zeros((72, 96, 3))
-    mask[36:] = 1
-    for i, shot in enumerate(SHOTS):
-        write_png(data / "masks" / (shot.name + ".png", shot.name)[i % 2], mask)
-    if write is write_nerfstudio:
-        change_transforms(data, lambda made: [f.update(mask_path="masks/b.png") for f in made["frames"]])
-    view = read_dataset(data, "train", downscale=2, background="black").views[0].load()
-    assert view.alpha is not None and (view.alpha[:18] == 0).all() and (view.alpha[18:] == 1).all()
-    assert not view.image[:18].any() and view.image[18:].max() > 0.9
-    (data / "masks/b.png").unlink()
-    refused(lambda: read_loaded(data, "train"), "masks/b.png", "missing")
-
-
-@pytest.mark.parametrize("images", ["images_4", "train"])
-def test_masks_beside_transforms_become_alpha(images: str, tmp_path: Path) -> None:
-    """By the path of the image, without its folder if that is one of `images`."""
-    data = write_nerfstudio(tmp_path)
-    (data / "images").rename(data / images)
-    masks = data / "masks" / ("train" if images == "train" else "")
-    masks.mkdir(parents=True)
-    for i, shot in enumerate(SHOTS):
-        write_png(masks / shot.name, np.repeat((np.indices((72, 96))[0] < 8 * i)[..., None], 3, axis=2))
-    file = data / "transforms.json"
-    file.write_text(file.read_text().replace('"images/', f'"{images}/'))
-    alphas = [view.load().alpha for view in read_dataset(data, "train").views]
-    assert [int((a == 1).all(axis=1).sum()) for a in alphas if a is not None] == [8 * i for i in range(1, 8)]
 
 
 def shiny(folder: Path, alpha: bool = True) -> Path:

@@ -112,11 +112,11 @@ def test_zero_distortion_changes_no_pixel(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lens", "words"),
     [
-        ({"camera_model": "EQUIRECTANGULAR"}, ["camera_model", "undistort"]),
+        ({"camera_model": "EQUIRECTANGULAR"}, ["camera_model: the lens 'EQUIRECTANGULAR'", "undistort"]),
         ({"is_fisheye": "yes"}, ["camera_model"]),
         ({"ftheta_p0": 0.1}, ["ftheta_p0"]),
         ({"k1": 0.1, "k6": 0.1}, ["k6"]),
-        ({"k4": 0.1}, ["k4", "perspective"]),
+        ({"k4": 0.1, "camera_model": "full_opencv"}, ["k4", "perspective"]),
         ({"is_fisheye": True, "p1": 0.1}, ["p1", "fisheye"]),
         ({"k1": -5.0}, ["frames[0]", "folds"]),
         ({"k1": 1e9}, ["frames[0]", "half-way"]),

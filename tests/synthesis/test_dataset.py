@@ -20,7 +20,7 @@ from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.latlong import environment_image
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
-from mi_refgs.synthesis.options import DatasetOptions
+from mi_refgs.synthesis.options import DatasetOptions, scene_hash
 from mi_refgs.synthesis.settings import load_scene, under_light
 from tests.helpers import read_loaded, refused, slow
 from tests.scenes.integrator import sky
@@ -305,6 +305,17 @@ def test_replacement_light_is_rotated_like_the_scenes_own(made: Path, tmp_path: 
     found = radiance(changed.environment(), np.array([[0, 0, 1], [0, 1, 0]]))
     np.testing.assert_allclose(found[:, 0], [5, 0.1], rtol=1e-5)
     assert len(changed.emitters()) == 2  # the lamp stays
+
+
+def test_parameters_of_a_scene_are_given(tmp_path: Path) -> None:
+    """Those of its integrator need no value."""
+    depth = '<integrator type="$how"><integer name="max_depth" value="$deep"/></integrator>'
+    ball = '<emitter type="constant"/><shape type="sphere"><float name="radius" value="$r"/></shape>'
+    (file := tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{depth}{ball}</scene>')
+    assert load_scene(file, ["r=2.5"]).bbox().max.x == 2.5
+    assert scene_hash(file, ["r=1"]) != scene_hash(file, ["r=2"])
+    refused(lambda: load_scene(file), "undefined parameter: $r", "-D NAME=VALUE")
+    refused(["dataset", file, "-o", tmp_path / "out", "-D", "r=1", "-D", "r"], "give NAME=VALUE")
 
 
 def test_unusable_lights_are_refused(relit: Path, made: Path, tmp_path: Path) -> None:
