@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from mi_refgs.data.checks import FINE, SAID, examine, off_backdrop
 from mi_refgs.data.dataset import read_dataset, reader_of
-from mi_refgs.data.images import IMAGES, MASKS
+from mi_refgs.data.images import FOLDERS, MASKS
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_bytes, write_png
@@ -70,7 +70,7 @@ def write_masks(folder: Path, found: dict[str, Any]) -> int:
         with contextlib.suppress(InputError):
             files += [v.file.path for v in read_dataset(folder, split, truth=False).views if v.file]
     named = [file.relative_to(folder).parts for file in files]
-    names = [Path(*parts[parts[0].startswith(IMAGES) :]).with_suffix(".png") for parts in named]
+    names = [Path(*parts[parts[0] in FOLDERS :]).with_suffix(".png") for parts in named]
     if (masks := folder / MASKS).exists():
         raise InputError("exists", masks, "--masks", "remove it")
     for file, name in zip(files, names, strict=True):
