@@ -33,8 +33,7 @@ from mi_refgs.surfels.ply import decode_ply
 from mi_refgs.surfels.table import Surfels
 
 EXPECTED = "the PLY file of 3DGS or 2DGS"  # what messages say to give
-DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3", *DC)
+NEEDED = "x y z opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3 f_dc_0 f_dc_1 f_dc_2"
 SPLAT = re.compile(r"[xyz]|opacity|filter_3D|refl_strength|(scale|rot|f_dc|f_rest)_\d+")  # what is read
 MATERIALS = re.compile(r"roughness|(ori_color|ind_dc|ind_rest)_\d+")  # more that is read of Ref-Gaussian's
 OURS = {"refl_strength": "metallic", **{f"ori_color_{i}": f"albedo_{i}" for i in range(3)}}  # by their names
@@ -44,7 +43,7 @@ ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip|antialias\w*\s+1|train_flags.*
 MAGIC = {b"\x1f\x8b": "spz", b"NGSP": "spz", b"PK\x03\x04": "sog"}  # first bytes of compressed splats
 CONVERT = "import sys, gaussforge as g; data = open(sys.argv[2], 'rb').read(); \
 open(sys.argv[3], 'wb').write(g.GaussForge().convert(data, sys.argv[1], 'ply')['data'])"
-SECONDS, BYTES_PER_SECOND = 30, 10**6  # that a conversion may take: damaged files can hang it
+SECONDS = 300  # that a conversion may take: damaged files can hang it
 ENDS = 20.0  # logit for an infinite opacity, and minus the log of a deviation of 0: other programs' limit
 ODD = (0, 1, 3, 6, 8, 10, 11, 13)  # SH functions from degree 1 on that half a turn around x negates
 BRIGHTEST = 1e6  # display-encoded colour whose linear radiance fits float32
@@ -74,7 +73,7 @@ def read_splats(path: Path, linear: bool = False, light: EnvironmentLight | None
         if light is None:
             light = EnvironmentLight.constant(1.0)
             notes.append(
-                "its light is in another file, which only PyTorch reads: it is 1, or that of --envmap"
+                "its light, in another file that only PyTorch reads, is 1 here: give one by --envmap"
             )
     elif light is not None:
         raise InputError("it has colours only, which no light changes", path, "--envmap", "leave it out")
@@ -98,11 +97,10 @@ def _plain(path: Path, target: Path) -> tuple[Path, int | None]:
     what, remedy = f"compressed splats ({kind})", f"convert it: `splat-transform {path.name} plain.ply`"
     if importlib.util.find_spec("gaussforge") is None:
         raise InputError(what, path, "header", f'pip install "mi_refgs[splats]", or {remedy}')
-    command = [sys.executable, "-c", CONVERT, kind, str(path), str(target)]
-    limit = SECONDS + path.stat().st_size / BYTES_PER_SECOND
     try:
         head = gzip.open(path).read(15) if first.startswith(b"\x1f\x8b") else first
-        subprocess.run(command, check=True, capture_output=True, timeout=limit)
+        command = [sys.executable, "-c", CONVERT, kind, str(path), str(target)]
+        subprocess.run(command, check=True, capture_output=True, timeout=SECONDS)
         return target, head[14] if kind == "spz" else None
     except (OSError, EOFError, IndexError, zlib.error, subprocess.SubprocessError) as error:
         remedy = f"export it again, or {remedy}"
@@ -122,21 +120,16 @@ def _columns(path: Path, header: Header, rows: np.ndarray) -> dict[str, np.ndarr
         raise InputError(what, path, foreign[0], "give the run folder to the command that needs it")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
         read = [x for x in names if SPLAT.fullmatch(x) or (materials and MATERIALS.fullmatch(x))]
-        columns = {OURS.get(name, name): _float(rows[name]) for name in read}
+        # 16-bit integers are the bits of half floats, which PLY lacks.
+        half = {x: rows[x].astype("u2").view("f2") for x in read if rows.dtype[x].str[1:] == "u2"}
+        columns = {OURS.get(x, x): half.get(x, rows[x]).astype(np.float32) for x in read}
     if "f_dc_0" not in names and {"red", "green", "blue"} <= {*names}:  # nerfstudio's colour mode "rgb"
         most = 1 if rows.dtype["red"].kind == "f" else 255
-        for name, colour in zip(DC, ("red", "green", "blue"), strict=True):
-            columns[name] = ((rows[colour] / most - 0.5) / SH_DC).astype(np.float32)
-    if missing := [name for name in NEEDED if name not in columns]:
+        for i, name in enumerate(("red", "green", "blue")):
+            columns[f"f_dc_{i}"] = ((rows[name] / most - 0.5) / SH_DC).astype(np.float32)
+    if missing := [name for name in NEEDED.split() if name not in columns]:
         raise InputError("the property is missing", path, missing[0], "export the file again with it")
     return columns
-
-
-def _float(column: np.ndarray) -> np.ndarray:
-    """Return a column as float32; 16-bit integers are the bits of half floats, since PLY has none."""
-    if column.dtype.kind == "u" and column.dtype.itemsize == 2:
-        column = column.copy().view(column.dtype.str.replace("u", "f"))
-    return column.astype(np.float32)
 
 
 @np.errstate(all="ignore")  # unusable rows
