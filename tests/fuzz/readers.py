@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from shutil import copytree
+from shutil import copy, copytree
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -17,8 +19,10 @@ from PIL import Image
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
+from mi_refgs.formats.cameras import read_cameras
+from mi_refgs.formats.splat_import import read_splats
 from mi_refgs.io.exr import read_exr_image
-from mi_refgs.io.images import read_png, read_tiff
+from mi_refgs.io.images import read_mask, read_png, read_tiff
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
@@ -26,12 +30,14 @@ from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import read_loaded
 from tests.scenes import layouts
 from tests.scenes.dots import COLOURS, POINTS
+from tests.scenes.splat_file import ball_columns
 from tests.scenes.tiny import write_data
 
 RGBA = np.random.default_rng(0).random((9, 11, 4))
@@ -91,13 +97,23 @@ def _read_mesh(path: Path) -> list[Any]:
 
 
 def _images(folder: Path) -> None:
-    for kind in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "DWAA"):
+    for name in ("sky", "studio"):
+        copy(resource_dir("scenes") / f"lights/{name}.exr", folder)
+    for kind in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"):
         header = {"compression": getattr(OpenEXR, f"{kind}_COMPRESSION"), "type": OpenEXR.scanlineimage}
         planes = {name: RGBA[..., i].astype(np.float16) for i, name in enumerate("RGBA")}
         OpenEXR.File(header, planes).write(str(folder / f"{kind}.exr"))
     tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
     OpenEXR.File(tiles, {"Y": RGBA[..., 0].astype(np.float32)}).write(str(folder / "tiled.exr"))
+    planes = {f"a.Combined.{name}": np.ones((24, 4), np.float16) for name in "RGB"}
+    header = {"type": OpenEXR.scanlineimage, "envmap": OpenEXR.ENVMAP_CUBE}
+    OpenEXR.File(header | {"displayWindow": ((0, 0), (3, 23))}, planes).write(str(folder / "cube.exr"))
+    parts = [OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, planes) for name in "ab"]
+    OpenEXR.File(parts).write(str(folder / "parts.exr"))
     mi.Bitmap(np.ones((8, 16, 3), np.float32)).write(str(folder / "a.hdr"))
+    head, pixels = "#?RADIANCE\nEXPOSURE=2\nFORMAT=32-bit_rle_xyze\n\n", bytes((128, 64, 32, 129))
+    (folder / "b.hdr").write_bytes(f"{head}+X 8 -Y 16\n".encode() + pixels * 128)
+    (folder / "c.hdr").write_bytes(f"{head}-Y 8 +X 16\n".encode() + (pixels + bytes((1, 1, 1, 15))) * 8)
     image = Image.fromarray((255 * RGBA).astype(np.uint8))
     for mode in ("RGBA", "RGB", "L", "LA", "P", "1"):
         image.convert(mode).save(folder / f"{mode}.png")
@@ -109,10 +125,26 @@ def _images(folder: Path) -> None:
 
 
 def _read_image(path: Path) -> list[Any]:
-    read = {".exr": read_exr_image, ".tiff": read_tiff, ".png": read_png, ".jpg": read_png}
-    if path.suffix in read:
-        return [read[path.suffix](path)]
-    return [EnvironmentLight.from_file(path).radiance().numpy()]
+    return [{".exr": read_exr_image, ".tiff": read_tiff}.get(path.suffix, read_png)(path)]
+
+
+def _splats(folder: Path) -> None:
+    columns = {name: column[:9] for name, column in ball_columns().items()}
+    for kind in ("ascii", "binary_little_endian", "binary_big_endian"):
+        (folder / f"{kind}.ply").write_bytes(layouts.ply_bytes(columns | {"filter_3D": columns["x"]}, kind))
+    (folder / "ours.ply").write_bytes(layouts.ply_bytes(columns))
+    if find_spec("gaussforge"):
+        made = import_module("gaussforge").GaussForge()
+        for kind in ("spz", "splat", "ksplat", "sog"):
+            data = made.convert((folder / "ours.ply").read_bytes(), "ply", kind)["data"]
+            (folder / f"a.{kind}").write_bytes(data)
+
+
+def _cameras(folder: Path) -> None:
+    layouts.write_nerfstudio(folder, layouts.SHOTS[:3])
+    one: dict[str, Any] = {"width": 64, "height": 48, "fx": 70, "fy": 70}
+    one |= {"position": [0, 0, 4], "rotation": np.eye(3).tolist()}
+    (folder / "a.json").write_text(json.dumps([one, one]))
 
 
 def _read_method(path: Path) -> list[Any]:
@@ -169,9 +201,14 @@ READERS = {
     "colmap-text": Reader(_colmap("txt"), "sparse/0/*", _data_set),
     "glossy": Reader(layouts.write_glossy, "1-camera.pkl", _data_set),
     "llff": Reader(layouts.write_llff, "*.npy", _data_set),
+    "splats": Reader(_splats, "*.*", lambda path: read_splats(path).surfels.to_numpy().values()),
+    "cameras": Reader(_cameras, "*.json", lambda path: [camera.pose() for camera in read_cameras(path)]),
     "exr": Reader(_images, "*.exr", _read_image),
     "image": Reader(_images, "*.[pj]*", _read_image),
-    "light, disparity": Reader(_images, "*.[ht]*", _read_image),
+    "mask": Reader(_images, "*.[pj]*", lambda path: [read_mask(path)]),
+    "disparity": Reader(_images, "*.tiff", _read_image),
+    "light": Reader(_images, "*.[eh]*", lambda path: [read_radiance(path)]),
+    "hdr": Reader(_images, "*.hdr", lambda path: [EnvironmentLight.from_file(path).radiance().numpy()]),
     "method": Reader(partial(copytree, resource_dir("variants"), dirs_exist_ok=True), "*.toml", _read_method),
     "model": Reader(_run, "model.json", lambda path: [TrainedScene.read(path.parent).seconds]),
     "run-data": Reader(_run, "dataset.json", _read_run),
