@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import itertools
 import json
 import os
 import pickle
@@ -39,7 +40,7 @@ class Part:
     channels: Mapping[str, Any]  # type, shape and bytes by name, or None if only the header was read
     data: tuple[int, int, int, int]  # window of the pixels that are stored
     display: tuple[int, int, int, int]  # window of the image
-    name: str
+    name: str | None
     layout: str | None  # of an environment, "cube" or "lat-long", if the header says it
     chromaticities: tuple[float, ...] | None
 
@@ -132,20 +133,19 @@ def _read(path: Path, vectors: bool = False, pixels: bool = True) -> tuple[Part,
 
 
 def _names(channels: Collection[str], vectors: bool) -> list[str]:
-    """The channels of an image, in order: of those without a layer, else of the first layer named Combined
-    (Blender's), else of the first one; [] if there are none."""
+    """The channels of an image, in order: of those without a layer, else of the first layer with Combined in
+    its name (Blender's), else of the first one; [] if there are none."""
     layers: dict[str, set[str]] = {}
     for name in channels:
         layer, _, channel = name.rpartition(".")
         layers.setdefault(layer, set()).add(channel)
-    order = sorted(layers, key=lambda layer: (layer != "", not layer.endswith("Combined"), layer))
-    colour = ["R G B A", "R G B", *(["X Y Z"] if vectors else []), "Y RY BY"]
-    for layer, kind in [
-        (layer, kind) for kinds in (colour, ["Y A", "Y"]) for layer in order for kind in kinds
-    ]:
-        missing = set(kind.split()) ^ layers[layer]
-        if not missing or (kind in colour and missing < layers[layer]):
-            return [f"{layer}.{channel}" if layer else channel for channel in kind.split()]
+    order = sorted(layers, key=lambda layer: (layer != "", "Combined" not in layer, layer))
+    colour = ["R G B A", "R G B", "X Y Z", "Y RY BY"] if vectors else ["R G B A", "R G B", "Y RY BY"]
+    for kinds in (colour, ["Y A", "Y"]):
+        for layer, kind in itertools.product(order, kinds):
+            wanted, found = kind.split(), layers[layer]
+            if found.issuperset(wanted) and (kinds is colour or len(found) == len(wanted)):
+                return [f"{layer}.{channel}" if layer else channel for channel in wanted]
     return list(channels) if len(channels) == 1 else []
 
 

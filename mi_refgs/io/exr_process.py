@@ -1,5 +1,7 @@
-"""Reads EXR files in a process of its own, which a broken file may end; a script that `exr` runs. For each
-line of standard input, JSON of the arguments of `parts`, it writes a pickle: the result or a message."""
+"""Reads EXR files in a process of its own, which a broken file may end; a script that `exr` runs.
+
+A line of standard input is JSON of a path and of whether its pixels are wanted; it writes pickled parts, or a
+message."""
 
 from __future__ import annotations
 
@@ -10,28 +12,23 @@ import signal
 import sys
 from typing import Any
 
+import numpy as np
 import OpenEXR
 
 SECONDS = 300  # for one file, after which this process ends
 LAYOUTS = {OpenEXR.ENVMAP_CUBE: "cube", OpenEXR.ENVMAP_LATLONG: "lat-long"}
 
 
-def parts(path: str, pixels: bool) -> list[dict[str, Any]]:
+def fields(part: Any, header: dict[str, Any], pixels: bool) -> dict[str, Any]:
     """Fields of `exr.Part`, of built-in types."""
-    with OpenEXR.File(path, separate_channels=True, header_only=not pixels) as file:
-        return [_fields(part, part.header, pixels) for part in file.parts]
-
-
-def _fields(part: Any, header: dict[str, Any], pixels: bool) -> dict[str, Any]:
     flat = header["type"] in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
     channels: dict[str, Any] = dict.fromkeys(channel.name for channel in header["channels"])
     for name in channels if pixels and flat else ():
         array = part.channels[name].pixels
         channels[name] = array.dtype.str, array.shape, array.tobytes()
-    windows = ([int(x) for corner in header[f"{name}Window"] for x in corner] for name in ("data", "display"))
-    names = header.get("name", ""), LAYOUTS.get(header.get("envmap")), header.get("chromaticities")
-    keys = ("flat", "channels", "data", "display", "name", "layout", "chromaticities")
-    return dict(zip(keys, (flat, channels, *windows, *names), strict=True))
+    found = {key: np.ravel(header[f"{key}Window"]).tolist() for key in ("data", "display")}
+    found |= {key: header.get(key) for key in ("name", "chromaticities")}
+    return found | {"flat": flat, "channels": channels, "layout": LAYOUTS.get(header.get("envmap"))}
 
 
 if __name__ == "__main__":
@@ -39,9 +36,12 @@ if __name__ == "__main__":
     os.dup2(2, 1)  # OpenEXR prints warnings to standard output
     for line in sys.stdin:
         signal.alarm(SECONDS)
+        path, pixels = json.loads(line)
         try:
-            answer: Any = parts(*json.loads(line))
+            with OpenEXR.File(path, separate_channels=True, header_only=not pixels) as file:
+                answer: Any = [fields(part, part.header, pixels) for part in file.parts]
         except Exception as error:  # RuntimeError, TypeError or types of its own
             answer = str(error)
         pickle.dump(answer, answers)
         answers.flush()
+        signal.alarm(0)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -19,19 +21,9 @@ from mi_refgs.shade.light.lobe_matrices import map_directions, resample
 
 MAX_ROWS = 4096  # most rows that are kept of a map: 400 MB of float32
 CONVERTED_ROWS = 1024  # most rows of a map that was a cube or an angular map
-ASPECT = 0.05  # by which the aspect of a lat-long image differs from 2 without a word
 EVEN = 0.01  # range of values, by the median of the picture, where a cross or an angular map has no picture
-RIGHT, UP, FRONT = AXES = np.diag((-1.0, 1.0, 1.0))  # from inside; front is the middle of a lat-long image
-FACES = np.array(
-    [
-        [RIGHT, -FRONT, UP],
-        [-RIGHT, FRONT, UP],
-        [UP, RIGHT, -FRONT],
-        [-UP, RIGHT, FRONT],
-        [FRONT, RIGHT, UP],
-        [-FRONT, -RIGHT, UP],
-    ]
-)
+R, U, F = AXES = np.diag((-1.0, 1.0, 1.0))  # right, up, front: from inside, the middle of a lat-long image
+FACES = np.array([[R, -F, U], [-R, F, U], [U, R, -F], [-U, R, F], [F, R, U], [-F, -R, U]])
 """Of the faces of a cube in OpenGL's order: the middle, the directions along rows and up columns."""
 CROSSES = {
     (4, 3): [(1, 2), (1, 0), (0, 1), (2, 1), (1, 1), (1, 3)],
@@ -51,21 +43,23 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
         note(path, f"{counted(below, 'texel')} below 0 set to 0")
         image = np.maximum(image, 0)
     height, width, _ = image.shape
-    size = f"{width} × {height} pixels"
+    size, limit = f"{width} × {height} pixels", min(rows, CONVERTED_ROWS)
     if min(height, width) < 2:
         raise InputError(f"{size} are no lat-long image", path, "environment", "give 2 × 2 at least")
-    limit, faces = min(rows, CONVERTED_ROWS), None if layout == "lat-long" else _faces(image, layout)
-    if layout == "cube" and faces is None:
+    if layout == "cube" and height != 6 * width:
         remedy = "export six square faces in a column, or a lat-long image"
-        raise InputError(f"a cube, but of {width} × {height} pixels", path, "envmap", remedy)
-    if faces is not None:
+        raise InputError(f"a cube, but of {size}", path, "envmap", remedy)
+    if layout != "lat-long" and (faces := _faces(image, layout)) is not None:
         if layout is None:
             note(path, f"{size} are read as the faces of a cube, in OpenGL's order")
-        image = _from_cube(faces, limit, edges=layout == "cube")
+        n = faces.shape[1]
+        span = n - 1 if layout == "cube" else n  # the outer pixels of OpenEXR's faces are on edges
+        image = _lat_long(faces, partial(_on_cube, span=span / n), min(2 * n, limit), 4 * n)
     elif layout is None and _is_disc(image):
         note(path, f"{size} are read as an angular map (light probe), not as a photograph of a mirror ball")
-        image = _from_angular(image, limit)
-    elif abs(width / height - 2) > ASPECT and width != 2 * (height - 1):
+        rim = 1 - 1.5 / width  # beyond, pixels are mixed with those outside
+        image = _lat_long(image[None], partial(_on_disc, rim=rim), min(max(width // 2, 2), limit), width)
+    elif abs(width - 2 * height) > 2:
         note(path, f"{size} are stretched over the sphere; a lat-long image is twice as wide as high")
     height, width, _ = image.shape
     return np.ascontiguousarray(resample(image, min(height, rows), min(width, 2 * rows)))
@@ -115,39 +109,30 @@ def _is_disc(image: np.ndarray) -> bool:
     return height == width and _is_even(image[radius > 1 + 4 / width], image[radius < 1])
 
 
-def _from_cube(faces: np.ndarray, limit: int, edges: bool) -> np.ndarray:
-    """A lat-long image of at most `limit` rows; with `edges`, the outer pixels of a face are on its edges."""
-    n = faces.shape[1]
-
-    def place(directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        face = (directions @ FACES[:, 0].T).argmax(axis=1)
-        depth, right, up = np.einsum("ij,ikj->ki", directions, FACES[face])
-        scale = (n - 1) / n / depth if edges else 1 / depth
-        return face, -up * scale, right * scale
-
-    return _lat_long(faces, place, min(2 * n, limit), 4 * n)
+Place: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""The number of a picture, and a place in it from -1 to 1, down and to the right."""
 
 
-def _from_angular(image: np.ndarray, limit: int) -> np.ndarray:
-    """A lat-long image of at most `limit` rows. The distance from the middle of the disc is proportional to
-    the angle from the front. [Debevec, "Rendering synthetic objects into real scenes", 1998]"""
-    n = len(image)
+def _on_cube(directions: np.ndarray, span: float) -> Place:
+    """Where directions (m, 3) are on FACES, whose edges are at ± `span`."""
+    face = (directions @ FACES[:, 0].T).argmax(axis=1)
+    depth, right, up = np.einsum("ij,ikj->ki", directions, FACES[face])
+    return face, -up * span / depth, right * span / depth
 
-    def place(directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        right, up, front = AXES @ directions.T
-        across = np.hypot(right, up)
-        radius = np.minimum(np.arctan2(across, front) / np.pi, 1 - 1.5 / n)  # no pixel beyond the disc
-        scale = radius / np.maximum(across, 1e-9)
-        return np.zeros(len(up), int), -up * scale, right * scale
 
-    return _lat_long(image[None], place, min(max(n // 2, 2), limit), n)
+def _on_disc(directions: np.ndarray, rim: float) -> Place:
+    """Where directions (m, 3) are on an angular map: the distance from its middle is proportional to the
+    angle from the front. [Debevec, "Rendering synthetic objects into real scenes", 1998]"""
+    right, up, front = AXES @ directions.T
+    across = np.hypot(right, up)
+    scale = np.minimum(np.arctan2(across, front) / np.pi, rim) / np.maximum(across, 1e-9)
+    return np.zeros(len(up), int), -up * scale, right * scale
 
 
 def _lat_long(
-    pictures: np.ndarray, place: Callable[[np.ndarray], tuple[np.ndarray, ...]], height: int, turn: int
+    pictures: np.ndarray, place: Callable[[np.ndarray], Place], height: int, turn: int
 ) -> np.ndarray:
-    """A lat-long image of square pictures (k, n, n, 3) with `turn` pixels in 360°; `place` returns, for
-    directions (m, 3), the number of the picture, and the place in it from -1 to 1, down and to the right."""
+    """A lat-long image of square pictures (k, n, n, 3) with `turn` pixels in 360°."""
     n = pictures.shape[1]
     factor = next(f for f in range(max(turn // (4 * height), 1), 0, -1) if n % f == 0)
     pictures = np.stack([box_downscale(picture, factor) for picture in pictures])
