@@ -16,8 +16,7 @@ from benchmarks.common import errors, timing
 from benchmarks.common.errors import CLEAR
 from benchmarks.common.report import Row, where
 from benchmarks.common.setup import path_tracer
-from benchmarks.common.view import Light, make_light, view_bins
-from benchmarks.common.view import rows as image_values
+from benchmarks.common.view import Light, make_light, rows as image_values, view_bins
 from benchmarks.splitsum import budget
 from benchmarks.splitsum.setup import CONVEX, Exact, Settings, split_sum
 

@@ -22,8 +22,7 @@ from benchmarks.common.fits import make_trainer, sphere_data
 from benchmarks.common.report import make_parser, write_measured
 from benchmarks.stability import bias, response
 from benchmarks.stability.cases import catalogue
-from benchmarks.stability.measure import IMAGE_LIMIT
-from benchmarks.stability.measure import measure as measure_case
+from benchmarks.stability.measure import IMAGE_LIMIT, measure as measure_case
 from mi_refgs.data.images import Pixels
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.method import LIGHT

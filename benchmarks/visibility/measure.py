@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.common import errors, timing
-from benchmarks.common import montecarlo as mc
+from benchmarks.common import errors, montecarlo as mc, timing
 from benchmarks.common.report import Row, where
 from benchmarks.visibility.cases import PAPER, Settings, make_scene, rules
 from benchmarks.visibility.harmonics import mirror_radiance

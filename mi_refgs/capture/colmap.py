@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from itertools import combinations
-from itertools import count as counter
+from itertools import combinations, count as counter
 from pathlib import Path
 from typing import Any, TypeVar
 

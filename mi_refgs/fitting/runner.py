@@ -12,8 +12,7 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.data import checks
-from mi_refgs.data import object_region as regions
+from mi_refgs.data import checks, object_region as regions
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import REGION_FILE, region_pixels
 from mi_refgs.data.stereo import stereo

@@ -18,8 +18,7 @@ from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, UnknownNameError, abbreviated
 from mi_refgs.io.files import is_file
 from mi_refgs.io.resources import resource_dir
-from mi_refgs.methods.build import build, plain, scaled
-from mi_refgs.methods.build import settings as keys_of
+from mi_refgs.methods.build import build, plain, scaled, settings as keys_of
 from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method
 from mi_refgs.registry import load_again, plugin_files
 from mi_refgs.shade.light.kind import LIGHTS

@@ -9,9 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from benchmarks.common import errors
-from benchmarks.common import montecarlo as mc
-from benchmarks.common import view as common
+from benchmarks.common import errors, montecarlo as mc, view as common
 from benchmarks.common.errors import Step
 from benchmarks.common.report import where
 from benchmarks.splitsum import budget

@@ -18,8 +18,7 @@ from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.events import densify as densify_event
-from mi_refgs.fitting.events import open_scene
+from mi_refgs.fitting.events import densify as densify_event, open_scene
 from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.resets import ResetOpacity
 from mi_refgs.fitting.exchange import depth_outside, exchanged

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.stability import __main__ as run
-from benchmarks.stability import measure as module
-from benchmarks.stability import response
+from benchmarks.stability import __main__ as run, measure as module, response
 from benchmarks.stability.cases import Case, catalogue, plain
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row, measure
 from mi_refgs.reference import image as oracle

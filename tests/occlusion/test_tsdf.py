@@ -12,8 +12,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from mi_refgs.occlusion import mesh as meshes
-from mi_refgs.occlusion import tsdf
+from mi_refgs.occlusion import mesh as meshes, tsdf
 from mi_refgs.reference import occlusion as ref
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat.camera import Camera

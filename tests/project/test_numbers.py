@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import all as everything
-from benchmarks import pages, plots, tables
+from benchmarks import all as everything, pages, plots, tables
 from benchmarks.common.build import RESULTS, merged, read_result, recorded, write_result
 from benchmarks.fits.plan import GROUPS, RING, SOURCES, Fit
 from mi_refgs.errors import InputError
