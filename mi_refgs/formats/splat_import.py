@@ -37,7 +37,10 @@ NEEDED = "x y z opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3 f_dc_0 f_dc_1 f_
 SPLAT = re.compile(r"[xyz]|opacity|filter_3D|refl_strength|(scale|rot|f_dc|f_rest)_\d+")  # what is read
 MATERIALS = re.compile(r"roughness|(ori_color|ind_dc|ind_rest)_\d+")  # more that is read of Ref-Gaussian's
 OURS = {"refl_strength": "metallic", **{f"ori_color_{i}": f"albedo_{i}" for i in range(3)}}  # by their names
-FOREIGN = re.compile(r"metallic|roughness|(albedo|tint|offset|ind_dc|f_anchor_feat)_0")  # what is not read
+FOREIGN = re.compile(
+    r"metallic|(albedo|tint|offset|ind_dc|f_anchor_feat)_0"
+)  # what colours alone do not show
+UNUSED = {"nx", "ny", "nz", "red", "green", "blue"}  # zeros, and copies of f_dc
 ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip|antialias\w*\s+1|train_flags.*antialias", re.IGNORECASE)
 """Comments of Brush, gsplat and nerfstudio; of Postshot; of 3DGS."""
 MAGIC = {b"\x1f\x8b": "spz", b"NGSP": "spz", b"PK\x03\x04": "sog"}  # first bytes of compressed splats
@@ -57,8 +60,11 @@ def read_splats(path: Path, linear: bool = False, light: EnvironmentLight | None
         plain, flags = _plain(path, Path(folder) / "plain.ply")
         with plain.open("rb") as file:
             header = read_header(path, file, EXPECTED)
-            columns = _columns(path, header, read_rows(path, file, header))
-    notes = _repair(path, columns)
+            rows = read_rows(path, file, header)
+    columns = _columns(path, header, rows)
+    notes, names = _repair(path, columns), rows.dtype.names or ()
+    if unread := {re.sub(r"_\d+$", "", x) for x in names if not {x, OURS.get(x)} & {*columns}} - UNUSED:
+        notes.append(f"not read: {', '.join(sorted(unread))}")
     if flags is not None:  # SPZ has +y up and +z backward: half a turn around x
         each = sum(name.startswith("f_rest_") for name in columns) // 3
         turned = [f"f_rest_{c * each + k}" for c in range(3) for k in ODD if k < each]
@@ -116,8 +122,10 @@ def _columns(path: Path, header: Header, rows: np.ndarray) -> dict[str, np.ndarr
         kind = "a mesh" if any(element.name == "face" for element in header.elements) else kind
         raise InputError(f"{kind}, no Gaussians", path, "vertex", f"give {EXPECTED}")
     if not materials and (foreign := sorted(filter(FOREIGN.fullmatch, names))):
-        what = "materials of a run, which require its light and shading, or features for networks"
-        raise InputError(what, path, foreign[0], "give the run folder to the command that needs it")
+        what, remedy = "materials, which require their light and shading", "give the run folder instead"
+        if foreign[0] == "f_anchor_feat_0":
+            what, remedy = "anchors of Scaffold-GS", "export the Gaussians that its networks make of them"
+        raise InputError(what, path, foreign[0], remedy)
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
         read = [x for x in names if SPLAT.fullmatch(x) or (materials and MATERIALS.fullmatch(x))]
         # 16-bit integers are the bits of half floats, which PLY lacks.
