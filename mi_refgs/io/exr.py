@@ -153,7 +153,8 @@ def _image(path: Path, names: list[str], planes: list[np.ndarray]) -> np.ndarray
     """Channels (H, W) as an image (H, W, C) float32, luminance and chroma as R, G, B; raises InputError
     unless all are finite."""
     image = np.stack(planes, axis=-1).astype(np.float32)
-    if len(bad := np.argwhere(~np.isfinite(image))):
+    if not (finite := np.isfinite(image)).all():
+        bad = np.argwhere(~finite)
         what = f"{len(bad)} NaN or infinite values, the first at row {bad[0, 0]}, column {bad[0, 1]}"
         raise InputError(what, path, f"channel {names[bad[0, 2]]}", "render the image again")
     if names[-1].endswith("BY"):

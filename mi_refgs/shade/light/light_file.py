@@ -20,7 +20,7 @@ from mi_refgs.io.progress import note
 from mi_refgs.shade.light.lobe_matrices import map_directions, resample
 
 MAX_ROWS = 4096  # most rows that are kept of a map: 400 MB of float32
-CONVERTED_ROWS = 1024  # most rows of a map that was a cube or an angular map
+CONVERTED_ROWS = 512  # most rows of a map that was a cube or an angular map
 EVEN = 0.01  # range of values, by the median of the picture, where a cross or an angular map has no picture
 R, U, F = AXES = np.diag((-1.0, 1.0, 1.0))  # right, up, front: from inside, the middle of a lat-long image
 FACES = np.array([[R, -F, U], [-R, F, U], [U, R, -F], [-U, R, F], [F, R, U], [-F, -R, U]])
@@ -115,8 +115,9 @@ Place: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _on_cube(directions: np.ndarray, span: float) -> Place:
     """Where directions (m, 3) are on FACES, whose edges are at ± `span`."""
-    face = (directions @ FACES[:, 0].T).argmax(axis=1)
-    depth, right, up = np.einsum("ij,ikj->ki", directions, FACES[face])
+    along = (directions @ FACES.reshape(18, 3).T).reshape(-1, 6, 3)
+    face = along[..., 0].argmax(axis=1)
+    depth, right, up = along[np.arange(len(face)), face].T
     return face, -up * span / depth, right * span / depth
 
 
