@@ -106,7 +106,8 @@ def _is_disc(image: np.ndarray) -> bool:
     """Whether an image is square, and even outside of its largest disc."""
     height, width, _ = image.shape
     radius = np.hypot(*np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j])
-    return height == width and _is_even(image[radius > 1 + 4 / width], image[radius < 1])
+    outside = radius > 1 + 4 / width
+    return height == width and outside.any() and _is_even(image[outside], image[radius < 1])
 
 
 Place: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
