@@ -438,11 +438,20 @@ def _percent(value: float, sign: str = "") -> str:
     return "0" if abs(value) < 1e-9 else f"{100 * value:{sign}.2g} %"
 
 
+def corpus(result: Result) -> Values:
+    """Return the table of what became of files."""
+    rows = result["rows"]
+    said = [row["said"] if len(row["said"]) <= 72 else f"{row['said'][:70]}…" for row in rows]
+    cells = [[row["file"], row["result"], text] for row, text in zip(rows, said, strict=True)]
+    return {"table": table(["file", "result", "what is said"], cells)}
+
+
 PAGES: dict[str, Callable[[Result], Values]] = {
     "splatting": splatting,
     "splitsum": splitsum,
     "visibility": visibility,
     "stability": stability,
     "endtoend": endtoend,
+    "corpus": corpus,
 }
 """Benchmarks that write their data file themselves."""
