@@ -34,10 +34,7 @@ def _views(found: dict[str, Any]) -> str:
 
 READERS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "": (".data.survey:survey", _views),
-    ".ply .spz .sog .splat .ksplat .glb": (
-        ":import_splats",
-        lambda run: f"{run.trained.surfels.count} splats",
-    ),
+    ".ply .spz .sog .splat .ksplat .glb": (":import_splats", lambda x: f"{x.trained.surfels.count} splats"),
     ".exr .hdr": (".shade.light.light_file:read_radiance", lambda x: f"{x.shape[1]} × {x.shape[0]} texels"),
     ".json": (".formats.cameras:read_cameras", lambda cameras: f"{len(cameras)} cameras"),
     ".xml": (".render.load_scene:load_scene", lambda scene: f"{len(scene.shapes())} shapes"),
@@ -76,7 +73,7 @@ def outcome(path: Path) -> Row:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
         result = {0: "read", 2: "refused"}.get(done.returncode, f"crashed ({done.returncode})")
-        errors = done.stderr.replace(f"{path}", path.name).splitlines()
+        errors = done.stderr.replace(f"{path}: ", "").replace(f"{path}", path.name).splitlines()
         notes = [line.split(": ", 3)[-1] for line in errors if "warning: " in line]
         said = "; ".join([done.stdout.strip(), *notes] if result == "read" else errors[-1:])
     except subprocess.TimeoutExpired:

@@ -90,10 +90,8 @@ def off_backdrop(image: np.ndarray) -> np.ndarray:
 
 
 class _Look(NamedTuple):
-    """What is seen of one image, as displayed."""
-
     view: View
-    sharpness: float  # log2 of the variance of the Laplacian over the squared mean
+    sharpness: float  # log2 of the variance of the Laplacian over the squared mean, as displayed
     brightness: float  # log2 of the mean linear colour of what is covered; both are NaN if nothing is
     border: np.ndarray  # (N, 3)
     plain: float  # share of it that a plain backdrop explains
@@ -179,9 +177,6 @@ class Sight:
         if self.data.points is not None:
             scale = max(scale, float(np.median(np.linalg.norm(self.data.points.position - middle, axis=1))))
         return {"spread": spread}, 2 * (spread <= ONE_PLACE * scale), ()
-
-    def few(self) -> Measured:
-        return {"count": len(self.views)}, len(self.views) < FEW_VIEWS, ()
 
     def ahead(self) -> Measured | None:
         if self.tracks:
@@ -271,7 +266,8 @@ def _unmasked(view: View) -> View:
 WRONG = "another model's images file; images turned by EXIF, resized or cropped"
 CHECKS: tuple[tuple[str, Callable[[Sight], Measured | None], str], ...] = (
     ("cameras", Sight.one_place, "{which} in one place show no shape; add images from other sides"),
-    ("views", Sight.few, "only {count} training views; other views may look wrong; add images"),
+    ("views", lambda sight: ({"count": (count := len(sight.views))}, count < FEW_VIEWS, ()),
+     "only {count} training views; others may look wrong"),
     ("points", Sight.ahead, "{share:.0%} are in front of their cameras; correct the axes of the poses"),
     ("keypoints", Sight.keypoints, "points project {median} pixels (median; 90 %: {p90}) from them in images "
      f"of {{size}}; {{which}} are off by up to {{worst}} ({WRONG}?); use files of one model"),

@@ -83,7 +83,7 @@ def write_masks(folder: Path, found: dict[str, Any]) -> int:
 
 def survey_text(found: dict[str, Any]) -> str:
     """A survey as text, one line per item, notes last."""
-    lines = [f"{name:<16}{value}" for name, value in found.items() if name not in ("checks", "notes")]
-    for name, numbers in found["checks"].items():
-        lines.append(f"{name:<16}{', '.join(f'{key} {value}' for key, value in numbers.items())}")
+    shown = {name: value for name, value in found.items() if name not in ("checks", "notes")}
+    shown |= {name: ", ".join(f"{k} {x}" for k, x in of.items()) for name, of in found["checks"].items()}
+    lines = [f"{name:<16}{value}" for name, value in shown.items()]
     return "\n".join([*lines, *(f"NOTE: {note}" for note in found["notes"])])

@@ -16,7 +16,7 @@ from tests.helpers import refused
 from tests.scenes.layouts import change_transforms, write_colmap
 from tests.scenes.tiny import train_command, write_data, write_method
 
-FEW = "only 5 training views; other views may look wrong; add images"
+FEW = "only 5 training views; others may look wrong"
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
