@@ -13,6 +13,7 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
@@ -88,6 +89,9 @@ def slow(*values: Any) -> Any:
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
 def unit(d: np.ndarray) -> np.ndarray:
     """Rows of length 1."""
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
@@ -96,6 +100,13 @@ def unit(d: np.ndarray) -> np.ndarray:
 def vector(d: np.ndarray) -> mi.Vector3f:
     """(N, 3) array → mi.Vector3f."""
     return mi.Vector3f(np.ascontiguousarray(np.asarray(d).T, dtype=np.float32))
+
+
+def emitted(emitter: Any, directions: np.ndarray) -> np.ndarray:
+    """Radiance (N, 3) of a distant emitter from directions (N, 3) of any length."""
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = -vector(unit(directions))
+    return emitter.eval(si).numpy().T
 
 
 def level_maps(light: Any) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ from mi_refgs.data import hull
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.reference.camera import look_at
-from tests.helpers import refused, with_pixels
+from tests.helpers import refused, unit, with_pixels
 
 BLACK = np.zeros(3)
 
@@ -20,9 +20,7 @@ def spheres(count: int, size: int, centre: np.ndarray, radius: float, rng: np.ra
     views = []
     focal = 1.6 * size
     for number in range(count):
-        forward = rng.normal(size=3)
-        forward /= np.linalg.norm(forward)
-        to_world = look_at(centre - 4 * forward, centre, (0.3, 0.5, 0.8))
+        to_world = look_at(centre - 4 * unit(rng.normal(size=3)), centre, (0.3, 0.5, 0.8))
         column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
         rays = np.stack([(column - size / 2) / focal, (row - size / 2) / focal, -np.ones_like(row)], axis=-1)
         cosine = -rays[..., 2] / np.linalg.norm(rays, axis=-1)

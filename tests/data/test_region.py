@@ -21,7 +21,7 @@ from mi_refgs.data.region import (
 )
 from mi_refgs.data.view import View
 from mi_refgs.reference.camera import look_at
-from tests.helpers import refused
+from tests.helpers import refused, unit
 
 
 def view_from(origin: np.ndarray, focal: float = 100.0) -> View:
@@ -36,8 +36,7 @@ def test_region_pixels_are_those_whose_rays_hit_it(planes: tuple[Plane, ...]) ->
     region = Region((0.3, -0.2, 0.1), 0.4, planes)
     for origin in ([2.0, 1.0, 0.5], [-0.5, 0.6, -1.5], [0.35, 0.05, 0.3], [2.0, 0.0, 0.25]):
         view = replace(view_from(np.array(origin)), width=30, height=20, fx=25.0, fy=28.0, cx=12.0, cy=11.0)
-        rays = np.array(view.camera().rays()).T
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = unit(np.array(view.camera().rays()).T)
         steps = origin + np.linspace(0, 6, 3000)[:, None, None] * rays
         sure, never = (replace(region, radius=0.4 + e, planes=shifted(region, -e)) for e in (-4e-3, 4e-3))
         found = region_pixels(view, region).ravel()

@@ -10,6 +10,7 @@ import pytest
 
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.reconstruction import relightable_import
+from tests.helpers import unit
 from tests.scenes.layouts import ply_bytes
 from tests.scenes.tiny import METHOD
 
@@ -20,8 +21,7 @@ PRESET = "6:100"
 
 def ball_columns(**values: float) -> dict[str, np.ndarray]:
     """Opaque Gaussians on a sphere, coloured by their normals; values of the first one may be others."""
-    direction = np.random.default_rng(0).normal(size=(COUNT, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = unit(np.random.default_rng(0).normal(size=(COUNT, 3)))
     columns = dict(zip("xyz", RADIUS * direction.T, strict=True))
     columns |= {f"f_dc_{i}": c for i, c in enumerate(direction.T)}
     columns |= {f"scale_{i}": np.full(COUNT, np.log(0.06)) for i in range(3)}

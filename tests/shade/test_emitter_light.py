@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.plugins.light import emitter_light, own_light, rotated
+from tests.helpers import AXES, emitted, unit, vector
 from tests.scenes.integrator import sky
-
-AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 
 
 def T(matrix: object = None) -> mi.ScalarTransform4f:
@@ -33,13 +31,8 @@ def emitter(to_world: object) -> mi.Emitter:
 @pytest.mark.parametrize("turn", TURNS)
 def test_radiance_is_that_of_mitsuba(turn: str, rng: np.random.Generator) -> None:
     """Along the axes and between them, of the scene's own light and of the integrator's copy."""
-    oblique = rng.normal(size=(50, 3))
-    directions = np.vstack([AXES, oblique / np.linalg.norm(oblique, axis=1, keepdims=True)])
-    world = mi.Vector3f(directions.T.astype(np.float32))
-    made = emitter(TURNS[turn]())
-    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
-    si.wi = -world
-    truth = made.eval(si).numpy()
+    directions, made = unit(np.vstack([AXES, rng.normal(size=(50, 3))])), emitter(TURNS[turn]())
+    world, truth = vector(directions), emitted(made, directions).T
     np.testing.assert_allclose(emitter_light(made).radiance(world).numpy(), truth, rtol=1e-3)
     own, to_world = own_light(made)
     light = rotated(own.prefilter(), to_world)

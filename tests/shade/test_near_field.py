@@ -58,8 +58,7 @@ def test_box_room(rays: tuple[np.ndarray, np.ndarray]) -> None:
 
     point, direction = rays
     offset = point - CENTRE
-    hit = offset + distance(offset, direction)[:, None] * direction
-    expected = hit / np.linalg.norm(hit, axis=1, keepdims=True)
+    expected = unit(offset + distance(offset, direction)[:, None] * direction)
     field = NearField(CENTRE, 1 / distance(np.zeros(3), map_directions(64)))
     error = degrees(towards(field, point, direction), expected)
     assert degrees(direction, expected).mean() > 8 and error.mean() < 0.5 and np.median(error) < 0.1

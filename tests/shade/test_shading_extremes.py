@@ -11,11 +11,10 @@ import pytest
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance.split_sum import shade
-from tests.helpers import slow, unit
+from tests.helpers import AXES, slow, unit
 from tests.scenes.shading_points import exact_light, exact_terms, points_of, shading_values
 
 N = 24
-AXES = np.concatenate([np.eye(3), -np.eye(3)])
 TERMS = ("diffuse", "specular", "indirect")
 
 

@@ -18,11 +18,12 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.io.exr import write_exr
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.latlong import environment_image
+from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.options import DatasetOptions, scene_hash
 from mi_refgs.synthesis.settings import load_scene, under_light
-from tests.helpers import read_loaded, refused, slow
+from tests.helpers import AXES, emitted, read_loaded, refused, slow, unit, vector
 from tests.scenes.integrator import sky
 from tests.scenes.sphere import CENTRE, RADIUS, SCENE
 
@@ -80,35 +81,18 @@ def check_brightness(radiance: Dataset, shape: Dataset, light: np.ndarray) -> No
         np.testing.assert_allclose(view.image[inside].mean(0), expected.mean(0), rtol=0.04)
 
 
-def radiance(emitter: Any, directions: np.ndarray) -> np.ndarray:
-    """Radiance (N, 3) of an emitter from directions (N, 3) of any length."""
-    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
-    si.wi = -mi.Vector3f((directions / np.linalg.norm(directions, axis=1, keepdims=True)).T)
-    return np.array(emitter.eval(si)).T
-
-
-def test_environment_in_mitsuba_orientation(made: Path, rng: np.random.Generator) -> None:
-    light, scene = read_loaded(made, "train").environment, mi.load_string(SCENE)
-    assert light == made / "environment.exr"
-    copy = mi.load_dict({"type": "scene", "e": {"type": "envmap", "filename": str(light)}})
-    directions = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(2000, 3))])
-    seen, truth = (radiance(s.environment(), directions) for s in (copy, scene))
-    # 64 rows average 128: equal but for the edges of the softboxes.
-    difference = np.abs(seen - truth).max(axis=1)
-    assert np.quantile(difference, 0.8) < 0.06
-    # The poles of the copy are a whole row each; the equator's axes are not near an edge.
-    assert difference[[0, 2, 3, 5]].max() < 0.1
-    np.testing.assert_allclose(seen.mean(axis=0), truth.mean(axis=0), rtol=0.03)
-
-
-def test_rotated_environment_is_resampled(rng: np.random.Generator) -> None:
-    """A smooth light, turned to an oblique axis, poles included; and a constant one."""
+def test_rotated_environment_is_resampled(made: Path, rng: np.random.Generator) -> None:
+    """The file of the data set; a smooth light, turned to an oblique axis, poles included; a constant one."""
+    assert read_loaded(made, "train").environment == made / "environment.exr"
+    np.testing.assert_array_equal(
+        read_radiance(made / "environment.exr"), environment_image(mi.load_string(SCENE), 64)
+    )
     turn = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 50)
     light = {"type": "envmap", "bitmap": mi.Bitmap(sky(64)), "to_world": turn}
     scene = mi.load_dict({"type": "scene", "e": light})
     copy = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(environment_image(scene, 64))})
-    directions = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(2000, 3))])
-    seen, truth = (radiance(emitter, directions) for emitter in (copy, scene.environment()))
+    directions = np.concatenate([AXES, rng.normal(size=(2000, 3))])
+    seen, truth = (emitted(emitter, directions) for emitter in (copy, scene.environment()))
     np.testing.assert_allclose(seen[:6], truth[:6], rtol=2e-3)
     np.testing.assert_allclose(seen, truth, rtol=0.02)  # beside a pole a texel is narrow
     colour = {"type": "rgb", "value": [1, 2, 3]}
@@ -245,8 +229,7 @@ ROOMS = {
 def test_rooms_are_closed_and_show_the_whole_object(name: str, tmp_path: Path) -> None:
     """Loads in plain Mitsuba; every ray meets something; the object is whole in nearly every view."""
     scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=9, resy=16, spp=4)
-    directions = np.random.default_rng(0).normal(size=(3, 4000))
-    outward = mi.Vector3f(directions / np.linalg.norm(directions, axis=0))
+    outward = vector(unit(np.random.default_rng(0).normal(size=(4000, 3))))
     assert dr.all(scene.ray_test(mi.Ray3f(mi.Point3f(0, 0, 1.5), outward))) and scene.environment() is None
     objects, distance, azimuth = ROOMS[name]
     tiny = OPTIONS | {"views": 12, "size": (18, 32), "spp": 1, "environment_height": 0}
@@ -302,7 +285,7 @@ def test_replacement_light_is_rotated_like_the_scenes_own(made: Path, tmp_path: 
     light[:4] = 5  # the map's y, which becomes z
     write_exr(tmp_path / "top.exr", light)
     changed = under_light(load_scene(tmp_path / "plain.xml"), tmp_path / "top.exr")
-    found = radiance(changed.environment(), np.array([[0, 0, 1], [0, 1, 0]]))
+    found = emitted(changed.environment(), np.array([[0, 0, 1], [0, 1, 0]]))
     np.testing.assert_allclose(found[:, 0], [5, 0.1], rtol=1e-5)
     assert len(changed.emitters()) == 2  # the lamp stays
 
