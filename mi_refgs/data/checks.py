@@ -241,26 +241,16 @@ class Sight:
 
     def turntable(self) -> Measured | None:
         """Whether the background stays while the cameras turn, and is not the one colour of a cut-out."""
-        views, borders = self.views, [look.border for look in self.looks]
-        masked = [isinstance(v.pixels, ImageSource) and v.pixels.file.mask is not None for v in views]
-        if np.min(self.axes @ self.axes.T) > TURNED:
-            return None
-        if all(masked):
-            some = (_unmasked(views[i]) for i in evenly_spread(len(views), UNMASKED))
-            borders = [border_of(view.load().displayed) for view in some]
-        if len({len(border) for border in borders}) > 1:
-            return None
+        sources = {
+            v: v.pixels for v in self.views if isinstance(v.pixels, ImageSource) and v.pixels.file.mask
+        }
+        whole = [replace(s, file=replace(s.file, mask=None), has_alpha=False) for s in sources.values()]
+        some = (replace([*sources][i], pixels=whole[i]) for i in evenly_spread(len(whole), UNMASKED))
+        borders = [border_of(v.load().displayed) for v in some] or [look.border for look in self.looks]
         middle = np.median(borders, axis=0)
         still = np.median(abs(borders - middle), axis=0).max(axis=-1) <= 2 * ALIKE
         varied = still.any() and middle[still].std(axis=0).max() > ALIKE
         return {"still": float(still.mean())}, bool(varied and still.mean() >= STILL), ()
-
-
-def _unmasked(view: View) -> View:
-    """A view as it was photographed, without the mask of another file."""
-    source = view.pixels
-    assert isinstance(source, ImageSource)
-    return replace(view, pixels=replace(source, file=replace(source.file, mask=None), has_alpha=False))
 
 
 WRONG = "another model's images file; images turned by EXIF, resized or cropped"
