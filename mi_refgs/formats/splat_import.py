@@ -98,13 +98,15 @@ def _plain(path: Path, target: Path) -> tuple[Path, int | None]:
         kind = path.suffix.lower()[1:]
     if first.startswith(b"ply"):
         kind = "compressed.ply" if b"packed_position" in first else None
-    if kind is None:
+    if kind is None or b"data.pkl" in first:  # a zip archive of PyTorch
         return path, None
     what, remedy = f"compressed splats ({kind})", f"convert it: `splat-transform {path.name} plain.ply`"
     if importlib.util.find_spec("gaussforge") is None:
         raise InputError(what, path, "header", f'pip install "mi_refgs[splats]", or {remedy}')
     try:
         head = gzip.open(path).read(15) if first.startswith(b"\x1f\x8b") else first
+        if kind == "spz" and not head.startswith(b"NGSP"):
+            raise InputError("a compressed file, but not SPZ", path, "header", "decompress it first")
         command = [sys.executable, "-c", CONVERT, kind, str(path), str(target)]
         subprocess.run(command, check=True, capture_output=True, timeout=SECONDS)
         return target, head[14] if kind == "spz" else None

@@ -24,7 +24,7 @@ TYPES = {
 }
 """NumPy's names of the types, without the byte order."""
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "a"}
-OTHERS = {b"PK": "a zip archive", b"\x1f\x8b": "a gzip file", b"glTF": "a glTF file", b"<": "a web page"}
+OTHERS = {b"PK": "PyTorch's or a zip file", b"glTF": "a glTF file", b"<": "a web page"}  # by first bytes
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 
@@ -158,6 +159,8 @@ def broken(kind: str, whole: bytes) -> bytes:
         "zeros": header + end + bytes(len(body)),
         "points": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar red\nend_header\n0\n",
         "page": b"<!DOCTYPE html>\n",
+        "checkpoint": b"PK\x03\x04" + bytes(26) + b"archive/data.pkl",
+        "gzip": gzip.compress(whole),
         "mesh": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         b"property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n",
         "empty": header.replace(b"vertex 40", b"vertex 0") + end,
@@ -176,6 +179,8 @@ def broken(kind: str, whole: bytes) -> bytes:
         ("zeros", "unusable are 40 of 40 rows: 0 with NaN or infinity, 40 with zero rotation"),
         ("points", "vertex: points with colours, no Gaussians"),
         ("page", "not a PLY file but a web page"),
+        ("checkpoint", "not a PLY file but PyTorch's or a zip file"),
+        ("gzip", "a compressed file, but not SPZ; decompress it first"),
         ("mesh", "vertex: a mesh, no Gaussians"),
         ("empty", "there are none"),
         ("degree", "f_rest_*: 44 properties"),
