@@ -102,13 +102,13 @@ def _end() -> int:
 
 
 def _read(path: Path, vectors: bool = False, pixels: bool = True) -> tuple[Part, list[str]]:
-    """The first flat part of a file that has an image, and the names of its channels; raises InputError."""
+    """The first flat part of a file with colour, else with any image, and its channels; raises InputError."""
     require_file(path)
     parts = _ask(path, pixels=False)
     flat = [(index, part, _names(part.channels, vectors)) for index, part in enumerate(parts) if part.flat]
     if not flat:
         raise InputError("deep pixels" if parts else "no parts", path, "header", "flatten the image")
-    index, part, names = next((found for found in flat if found[2]), flat[0])
+    index, part, names = max(flat, key=lambda found: min(len(found[2]), 3))  # colour, else grey
     (left, top, right, bottom), (x0, y0, x1, y1) = part.data, part.display
     if right < left or bottom < top or min(right, x1) < max(left, x0) or min(bottom, y1) < max(top, y0):
         raise InputError("no pixel is in the display window", path, "dataWindow", "export it again")
@@ -117,7 +117,8 @@ def _read(path: Path, vectors: bool = False, pixels: bool = True) -> tuple[Part,
     if not names:
         remedy = f"export R, G, B (and A), {'X, Y, Z, ' if vectors else ''}or one channel (and A)"
         raise InputError(f"found {', '.join(sorted(part.channels))}", path, "channels", remedy)
-    if len(names) > 2 and not np.allclose(part.chromaticities or SRGB, SRGB, atol=CHROMATICITY_TOLERANCE):
+    coloured = len(names) > 2 and not names[0].endswith("X")
+    if coloured and not np.allclose(part.chromaticities or SRGB, SRGB, atol=CHROMATICITY_TOLERANCE):
         raise InputError("not those of sRGB", path, "chromaticities", "convert the image to linear sRGB")
     if len(parts) > 1:
         note(path, f"{len(parts)} parts, of which '{part.name}' is read")

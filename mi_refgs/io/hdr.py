@@ -52,9 +52,7 @@ def _calibrated(path: Path, header: bytes, image: np.ndarray) -> np.ndarray:
         if not (factor > 1e-9).all():
             raise ValueError("not positive")
     except ValueError as error:
-        raise InputError(
-            f"no numbers ({error})", path, "EXPOSURE or COLORCORR", "correct the header"
-        ) from error
+        raise InputError(f"no numbers ({error})", path, "EXPOSURE, COLORCORR", "correct them") from error
     if (factor != 1).any():
         note(path, f"values are divided by {factor.round(6)}, by EXPOSURE and COLORCORR of its header")
         image = (np.minimum(image, MAX_VALUE) / factor).astype(np.float32)
@@ -77,7 +75,7 @@ def _row(data: bytes, position: int, row: np.ndarray) -> int:
     pixels = np.frombuffer(data, np.uint8, 4 * max(count, 0), position).reshape(-1, 4)
     repeats = (pixels[:, :3] == 1).all(axis=1)  # the old coding: 1 1 1 N repeats the pixel before N times
     if not repeats.any():
-        row[:] = pixels
+        row[:] = pixels.reshape(row.shape)  # fails at the end of the file
         return position + 4 * width
     index = np.arange(count)
     last = np.maximum.accumulate(np.where(repeats, -1, index))

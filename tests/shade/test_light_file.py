@@ -86,8 +86,8 @@ def test_what_is_no_light(tmp_path: Path) -> None:
     write_exr(tmp_path / "hole.exr", hole)
     write_exr(tmp_path / "xyz.exr", np.ones((4, 8, 3)), names="XYZ")
     write_exr(tmp_path / "row.exr", np.ones((1, 8, 3)))
-    write_hdr(tmp_path / "cut.hdr", np.ones((9, 16, 3), np.uint8))
-    (tmp_path / "cut.hdr").write_bytes((tmp_path / "cut.hdr").read_bytes()[:-9])
+    write_hdr(tmp_path / "cut.hdr", np.full((9, 16, 3), 200, np.uint8))
+    (tmp_path / "cut.hdr").write_bytes((tmp_path / "cut.hdr").read_bytes()[:-60])
     write_exr(tmp_path / "cut.exr", np.random.default_rng(0).random((64, 64, 3)))
     (tmp_path / "cut.exr").write_bytes((tmp_path / "cut.exr").read_bytes()[:-9000])
     for name, words in {
