@@ -46,7 +46,6 @@ class Part:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the image."""
         return self.display[2] - self.display[0] + 1, self.display[3] - self.display[1] + 1
 
     def plane(self, name: str) -> np.ndarray:
@@ -109,8 +108,8 @@ def _read(path: Path, vectors: bool = False, pixels: bool = True) -> tuple[Part,
     if not flat:
         raise InputError("deep pixels" if parts else "no parts", path, "header", "flatten the image")
     index, part, names = max(flat, key=lambda found: min(len(found[2]), 3))  # colour, else grey
-    (left, top, right, bottom), (x0, y0, x1, y1) = part.data, part.display
-    if right < left or bottom < top or min(right, x1) < max(left, x0) or min(bottom, y1) < max(top, y0):
+    left, top, right, bottom = part.data
+    if (np.minimum(part.data[2:], part.display[2:]) < np.maximum(part.data[:2], part.display[:2])).any():
         raise InputError("no pixel is in the display window", path, "dataWindow", "export it again")
     check_size(path, right - left + 1, bottom - top + 1, SAMPLE_BYTES * len(part.channels))
     check_size(path, *part.size, 1)
@@ -180,9 +179,9 @@ def read_exr_light(path: Path) -> tuple[np.ndarray, str | None]:
     if (infinite := np.isposinf(planes)).any():
         half = planes[0].dtype == np.float16
         largest = np.finfo(np.float16).max if half else np.max(planes, where=~infinite, initial=0)
-        planes = [*np.where(infinite, largest, planes)]
-        texels = counted(int(infinite.any(axis=0).sum()), "infinite texel")
-        note(path, f"{texels} set to {largest:g}, the largest {'half float' if half else 'value'}")
+        planes, count = [*np.where(infinite, largest, planes)], int(infinite.any(axis=0).sum())
+        kind = "half float" if half else "value"
+        note(path, f"{counted(count, 'infinite texel')} set to {largest:g}, the largest {kind}")
     image = _image(path, names, planes)
     return (image[..., :3] if len(names) > 2 else image[..., [0, 0, 0]]), part.layout
 

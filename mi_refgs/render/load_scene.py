@@ -24,10 +24,9 @@ def load_scene(
     define: Mapping[str, str] = MappingProxyType({}),
 ) -> Any:
     """Load a scene, its `refgs` integrator with these AOVs (types, or `name:type`) after its own,
-    `object_only` without what surrounds the object, not to `optimize` with all its shapes and their ids.
-    `define`: values of the parameters $name in the file.
-    Raises InputError for what cannot be loaded, for a name of two types, and for AOVs or `object_only`
-    without that integrator."""
+    `object_only` without what surrounds the object, not to `optimize` with all its shapes and their ids, with
+    the values of parameters $name in `define`. Raises InputError for what cannot be loaded, for a name of two
+    types, and for AOVs or `object_only` without that integrator."""
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(str(path.parent.resolve()))
@@ -53,10 +52,7 @@ def load_scene(
         for props in (node.props for node in state.nodes):
             if props.plugin_name() in IMAGES and "filename" in props:
                 file = path.parent / str(beside.resolve(props["filename"]))
-                if file.suffix.lower() in (
-                    ".exr",
-                    ".hdr",
-                ):  # a broken one ends the process in Mitsuba's readers
+                if file.suffix.lower() in (".exr", ".hdr"):  # broken, they end the process in Mitsuba
                     props["bitmap"] = mi.Bitmap(IMAGES[props.plugin_name()](file))
                     del props["filename"]
         loaded = mi.parser.instantiate(config, state)
