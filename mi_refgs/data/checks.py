@@ -241,12 +241,14 @@ class Sight:
 
     def turntable(self) -> Measured | None:
         """Whether the background stays while the cameras turn, and is not the one colour of a cut-out."""
-        sources = {
-            v: v.pixels for v in self.views if isinstance(v.pixels, ImageSource) and v.pixels.file.mask
-        }
-        whole = [replace(s, file=replace(s.file, mask=None), has_alpha=False) for s in sources.values()]
-        some = (replace([*sources][i], pixels=whole[i]) for i in evenly_spread(len(whole), UNMASKED))
-        borders = [border_of(v.load().displayed) for v in some] or [look.border for look in self.looks]
+        if np.min(self.axes @ self.axes.T) > TURNED or len({(v.width, v.height) for v in self.views}) > 1:
+            return None
+        masked = [p for p in (v.pixels for v in self.views) if isinstance(p, ImageSource) and p.file.mask]
+        borders = [look.border for look in self.looks]
+        if masked:  # as photographed
+            some = (masked[i] for i in evenly_spread(len(masked), UNMASKED))
+            whole = (replace(x, file=replace(x.file, mask=None), has_alpha=False) for x in some)
+            borders = [border_of(replace(self.views[0], pixels=x).load().displayed) for x in whole]
         middle = np.median(borders, axis=0)
         still = np.median(abs(borders - middle), axis=0).max(axis=-1) <= 2 * ALIKE
         varied = still.any() and middle[still].std(axis=0).max() > ALIKE
