@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -149,3 +150,9 @@ def finished(data: Path, method: Path, tmp_path_factory: pytest.TempPathFactory)
     run = tmp_path_factory.mktemp("runs") / "run"
     assert main(train_command(data, run, method)) == 0
     return run
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run, to be spoilt."""
+    return shutil.copytree(finished, tmp_path / "run")

@@ -65,6 +65,12 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         return {name: channel.pixels.astype(np.float32) for name, channel in file.channels().items()}
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of a folder, by their paths in it."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
 def command_names() -> list[str]:
     return [name for group in COMMANDS.values() for name in group]
 

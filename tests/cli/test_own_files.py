@@ -18,7 +18,7 @@ from mi_refgs.io.ownership import MARK, RUN_FILES, own_folder, owner_of
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.relight import relight
 from mi_refgs.runs.run import Run
-from tests.helpers import command_names, refused
+from tests.helpers import command_names, contents, refused
 from tests.scenes.tiny import train_command
 
 FOREIGN = b'{"of": "another program"}\n'
@@ -69,11 +69,6 @@ def out(place: Path) -> Iterator[Path]:
     (folder / "notes.txt").write_bytes(FOREIGN)
     yield folder
     shutil.rmtree(folder)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def test_every_command_has_a_case() -> None:

@@ -22,25 +22,20 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import BusyError
 from mi_refgs.reconstruction import fit as reconstruct
 from mi_refgs.runs.run import LOCK, Run
-from tests.helpers import read_exr, refused
+from tests.helpers import contents, read_exr, refused
 from tests.scenes.sphere import SCENE
 from tests.scenes.tiny import METHOD, SETTINGS, train_command
 
 TRACE = ["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--samples", "1"]
 
 
-def tree(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def test_a_fit_resumes_with_its_own_options(finished: Path, data: Path, method: Path, tmp_path: Path) -> None:
+def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path, tmp_path: Path) -> None:
     """Options that say what a run was started with are no others, in other words too."""
-    run = Path(shutil.copytree(finished, tmp_path / "run"))
     argv = [*train_command(data, run, method, "--resume"), "data.downscale=1"]
-    state, config = tree(run / "checkpoints"), Run(run).method()
+    state, config = contents(run / "checkpoints"), Run(run).method()
     for more in ([], ["--method", str(config.file)], ["--preset", "quick"]):
         assert main([*argv, *more]) == 0
-    assert main([*argv[:4], "--resume"]) == 0 and tree(run / "checkpoints") == state
+    assert main([*argv[:4], "--resume"]) == 0 and contents(run / "checkpoints") == state
     other = tmp_path / "twin" / method.name  # of the same name
     other.parent.mkdir()
     other.write_text(f"{METHOD}[rates]\ndecay = 0.25\n")
@@ -54,7 +49,7 @@ def test_a_fit_resumes_with_its_own_options(finished: Path, data: Path, method: 
     longer = dataclasses.replace(config, iterations=500)
     again = lambda: reconstruct.fit(data, longer, output=run, resume=True, progress=Progress())  # noqa: E731
     refused(again, "iterations: the run was started with 6", " 500")
-    assert tree(run / "checkpoints") == state
+    assert contents(run / "checkpoints") == state
     moved = shutil.copytree(data, tmp_path / "moved")
     assert main(["train", str(moved), "-o", str(run), "--resume"]) == 0
     assert str(moved) in (run / "dataset.json").read_text()
@@ -65,10 +60,10 @@ def test_a_data_set_is_completed_or_replaced(tmp_path: Path, capsys: pytest.Capt
     scene.write_text(SCENE)
     argv = [*TRACE, "-o", str(out), str(scene)]
     assert main([*argv, "--json"]) == 0 and json.loads(capsys.readouterr().out)["train_views"] == 2
-    before = tree(out)
+    before = contents(out)
     for option in (["--views", "3"], ["--seed", "1"], ["--fov", "30"]):
         refused([*argv, *option], option[0])
-    assert main(argv) == 0 and tree(out) == before
+    assert main(argv) == 0 and contents(out) == before
     assert main([*argv, "--overwrite", "--views", "3"]) == 0 and (out / "train/r_002.png").is_file()
 
 
@@ -93,9 +88,8 @@ sys.stdin.read()
 
 
 @pytest.fixture
-def live(finished: Path, tmp_path: Path) -> Iterator[tuple[Path, subprocess.Popen[str]]]:
+def live(run: Path) -> Iterator[tuple[Path, subprocess.Popen[str]]]:
     """A run that another process changes, whose artefacts are older than its checkpoint."""
-    run = Path(shutil.copytree(finished, tmp_path / "run"))
     model = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(model | {"iteration": 3}))
     argv = [sys.executable, "-c", HOLD, str(run / LOCK)]
@@ -111,10 +105,10 @@ def test_second_process_on_a_run_is_refused(
     """Commands that change the run are refused, those that look at it read the newest checkpoint."""
     run, process = live
     argv = train_command(data, run, method, "--resume")
-    before = tree(run)
+    before = contents(run)
     for command in (argv, ["export", str(run)], ["export", str(tmp_path / "run"), "-o", str(run)]):
         refused(command, "another process trains this run", run)
-    assert tree(run) == before
+    assert contents(run) == before
     (run / "scene.xml").unlink()  # as in a first fit
     scene = reconstruct.load(run)
     assert scene.trained.iteration == 6

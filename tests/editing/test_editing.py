@@ -26,7 +26,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import SH_DC, logit
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import refused
+from tests.helpers import contents, refused
 from tests.scenes.integrator import sky
 from tests.scenes.known import CENTRES, RADII, known_mesh, known_surfels, with_background
 
@@ -221,20 +221,16 @@ def test_notes_name_what_stays_as_fitted(scene: TrainedScene) -> None:
     assert edit(balls(diffuse="irradiance", occlusion=False), set=["metallic=1"]).notes == ()
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_an_edited_run_is_a_run(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An edit of an edit; every command reads it; the run that it came from stays as it was."""
-    before = files(finished)
+    before = contents(finished)
     new, newer = tmp_path / "new", tmp_path / "newer"
     options = ["--set", "roughness=0.5", "--where", "x > 0"]
     assert main(["edit", str(finished), "-o", str(new), *options]) == 0
     out = capsys.readouterr().out
     assert main(["edit", str(new), "-o", str(newer), "--set", "metallic=0.25", "--json"]) == 0
     second = json.loads(capsys.readouterr().out)
-    assert files(finished) == before
+    assert contents(finished) == before
     assert not (new / "checkpoints").exists()
     record = json.loads((newer / "edit.json").read_text())["edits"]
     assert [edit["selected"] == edit["of"] for edit in record] == [False, True]
@@ -277,9 +273,9 @@ def test_an_edited_run_is_not_resumed(finished: Path, data: Path, tmp_path: Path
     """Training would replace what was edited."""
     new = tmp_path / "new"
     assert main(["edit", str(finished), "-o", str(new), "--set", "roughness=0.5"]) == 0
-    before = files(new)
+    before = contents(new)
     refused(["train", data, "-o", new, "--resume"], "checkpoints: none, but a scene that was edited")
-    assert files(new) == before
+    assert contents(new) == before
 
 
 def test_a_bad_command_writes_nothing(finished: Path, tmp_path: Path) -> None:

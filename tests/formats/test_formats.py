@@ -94,9 +94,8 @@ def test_bad_export_arguments_are_refused(
 
 @pytest.mark.parametrize("record", [None, '{"path": "gone"}'])
 def test_run_without_data_has_cameras_around_its_surfels(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], record: str | None
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], record: str | None
 ) -> None:
-    run = shutil.copytree(finished, tmp_path / "run")
     (run / "dataset.json").unlink()
     if record is not None:
         (run / "dataset.json").write_text(record)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from shutil import copytree
 
 import numpy as np
 import pytest
@@ -76,54 +75,50 @@ def damage(path: Path, how: str) -> None:
 
 @pytest.mark.parametrize("how", ["empty", "cut", "half", "flipped"])
 def test_resume_goes_on_from_checkpoint_before_and_says_so(
-    how: str, finished: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    how: str, run: Path, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = Run(copytree(finished, tmp_path / "run"))
-    before, newest = run.checkpoints()
+    before, newest = Run(run).checkpoints()
     damage(newest, how)
-    assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 0
+    assert main(["train", str(data), "-o", str(run), "--resume"]) == 0
     said = capsys.readouterr().err
     assert f"{newest}: damaged" in said and "resumed at iteration 3 of 6" in said
-    assert checkpoint.read(newest)["iteration"] == 6 and run.checkpoints() == [before, newest]
+    assert checkpoint.read(newest)["iteration"] == 6 and Run(run).checkpoints() == [before, newest]
 
 
-def test_no_fit_begins_anew_over_damaged_checkpoints(finished: Path, data: Path, tmp_path: Path) -> None:
-    run = Run(copytree(finished, tmp_path / "run"))
-    for path in run.checkpoints():
+def test_no_fit_begins_anew_over_damaged_checkpoints(run: Path, data: Path) -> None:
+    for path in Run(run).checkpoints():
         damage(path, "half")
-    words = "0000006.npz: damaged", "begin anew", run.path / "checkpoints"
-    refused(["train", data, "-o", run.path, "--resume"], *words)
-    assert len(run.checkpoints()) == 2
+    words = "0000006.npz: damaged", "begin anew", run / "checkpoints"
+    refused(["train", data, "-o", run, "--resume"], *words)
+    assert len(Run(run).checkpoints()) == 2
     # The artefacts are of iteration 6 and need no checkpoint.
-    assert main(["eval", str(run.path)]) == 0
+    assert main(["eval", str(run)]) == 0
 
 
-def test_resume_clears_what_killed_process_left(finished: Path, data: Path, tmp_path: Path) -> None:
-    run = Run(copytree(finished, tmp_path / "run"))
-    log = run.path / "metrics.jsonl"
+def test_resume_clears_what_killed_process_left(run: Path, data: Path) -> None:
+    log = run / "metrics.jsonl"
     whole = log.read_bytes()
     log.write_bytes(whole + b'{"iteration": 6, "loss": 0.\x00\xff{')
     for name in ("checkpoints/.0000009.npz.0123456789ab.tmp.npz", ".surfels.ply.0123456789ab.tmp.ply"):
-        (run.path / name).write_bytes(b"half")
-    (run.path / ".notes").write_text("mine")
-    copy = run.path / "checkpoints" / "0000006 copy.npz"
+        (run / name).write_bytes(b"half")
+    (run / ".notes").write_text("mine")
+    copy = run / "checkpoints" / "0000006 copy.npz"
     copy.write_bytes(b"mine")
-    run.checkpoints()[-1].unlink()
-    assert main(["train", str(data), "-o", str(run.path), "--resume"]) == 0
-    assert {path.name for path in run.path.rglob(".*")} == {MARK, ".notes"} and copy.exists()
+    Run(run).checkpoints()[-1].unlink()
+    assert main(["train", str(data), "-o", str(run), "--resume"]) == 0
+    assert {path.name for path in run.rglob(".*")} == {MARK, ".notes"} and copy.exists()
     lines = log.read_bytes().splitlines()
     assert lines[:1] == whole.splitlines()[:1] and len(lines) == 3
 
 
-def test_method_that_changed_since_is_refused(finished: Path, data: Path, tmp_path: Path) -> None:
-    run = Run(copytree(finished, tmp_path / "run"))
-    config = run.path / "config.toml"
-    for old, new, name in (
+def test_method_that_changed_since_is_refused(run: Path, data: Path) -> None:
+    config = run / "config.toml"
+    for old, new, at in (
         ("height = 8", "height = 16", "light"),
         ("radiance_sh = 1", "radiance_sh = 2", "sh"),
     ):
         text = config.read_text()
         assert old in text
         config.write_text(text.replace(old, new))
-        refused(["train", data, "-o", run.path, "--resume"], str(run.path), name, "resume with the method")
+        refused(["train", data, "-o", run, "--resume"], run, at, "resume with the method")
         config.write_text(text)

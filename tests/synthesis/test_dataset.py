@@ -23,7 +23,7 @@ from mi_refgs.synthesis import pathtrace
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.options import DatasetOptions, scene_hash
 from mi_refgs.synthesis.settings import load_scene, under_light
-from tests.helpers import AXES, emitted, read_loaded, refused, slow, unit, vector
+from tests.helpers import AXES, contents, emitted, read_loaded, refused, slow, unit, vector
 from tests.scenes.integrator import sky
 from tests.scenes.sphere import CENTRE, RADIUS, SCENE
 
@@ -41,10 +41,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dataset")
     (folder / "ball.xml").write_text(SCENE)
     return make_dataset(folder / "ball.xml", folder / "out", **OPTIONS)
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_depth_and_normals_are_those_of_the_sphere(made: Path) -> None:
@@ -134,12 +130,12 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_unfinished_folder_is_continued(made: Path, traced: list[int]) -> None:
-    scene, before = made.parent / "ball.xml", files(made)
+    scene, before = made.parent / "ball.xml", contents(made)
     (made / "train/r_001.png").unlink()
     (made / "test/r_000_depth.exr").unlink()
     (made / "transforms_train.json").unlink()
     make_dataset(scene, made, **OPTIONS)
-    assert len(traced) == 2 and files(made) == before
+    assert len(traced) == 2 and contents(made) == before
 
 
 def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
@@ -255,12 +251,12 @@ def relit(made: Path) -> Path:
 
 
 def test_adding_lights_traces_no_other_views(relit: Path, made: Path, traced: list[int]) -> None:
-    folder, before = made.parent, files(relit)
-    inherited = {k: v for k, v in files(made).items() if k != "dataset.json"}
+    folder, before = made.parent, contents(relit)
+    inherited = {k: v for k, v in contents(made).items() if k != "dataset.json"}
     assert before.items() >= inherited.items()
     for lights in (str(folder / "warm.exr"), ()):
         make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=lights)
-        assert not traced and files(relit) == before  # the other lights stay, too
+        assert not traced and contents(relit) == before  # the other lights stay, too
     assert set(json.loads(before["dataset.json"])["relight"]) == {"warm", "cold_sky"}
 
 
