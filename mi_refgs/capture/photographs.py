@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import laplace
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
-from mi_refgs.data.images import MASK, image_files, mask_in
+from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.images import exif_tags, image_size, open_image, read_mask, to_8_bits
 
@@ -95,17 +97,17 @@ def find_photographs(folder: Path) -> list[Photograph]:
     if not folder.is_dir():
         what = "is no video" if folder.exists() else "no such folder"
         raise InputError(what, folder, "photographs", "give a folder with JPEG or PNG files")
-    paths = image_files(folder, "*")
+    paths = image_files(folder, deep=False)
     if len(paths) < FEWEST:
-        inner = image_files(folder, "**/*")
+        inner = image_files(folder, deep=True)
         paths = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
     if len(paths) < FEWEST:
         files = (path for path in folder.rglob("*") if path.suffix.lower() in OTHER_ENDINGS)
         other = Counter(path.suffix for path in files).most_common(1)
         remedy = f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"
         raise InputError(f"contains {counted(len(paths), 'JPEG or PNG file')}", folder, "photographs", remedy)
-    named = [replace(_photograph(path), name=path.relative_to(folder).as_posix()) for path in paths]
-    kept = [replace(photograph, number=i) for i, photograph in enumerate(named)]
+    read = enumerate(map(_photograph, paths))
+    kept = [replace(p, name=str(p.path.relative_to(folder)), number=i) for i, p in read]
     most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]
     kept = [replace(p, lying=p.size != most and p.size[::-1] == most) for p in kept]
     remedy = f"a fit takes {MAX_SIZES} at most: leave out those that were cropped"
@@ -113,25 +115,31 @@ def find_photographs(folder: Path) -> list[Photograph]:
     return kept
 
 
-def write_frames(video: Path, folder: Path) -> None:
-    """Write the sharpest of every few frames of a video as JPEG files, at most FRAMES. Raises InputError for
-    an unreadable video, and without PyAV."""
+@contextmanager
+def folder_of(source: Path) -> Iterator[Path]:
+    """A folder of photographs; for a video, a temporary one with the sharpest of every few frames, at most
+    FRAMES. Raises InputError for an unreadable video, and without PyAV."""
+    if source.suffix.lower() not in VIDEOS or not source.is_file():
+        yield source
+        return
     try:
         import av
     except ImportError:
         remedy = 'pip install "mi_refgs[video]", or take frames with ffmpeg and give their folder'
-        raise InputError("PyAV, which reads videos, is not installed", video, "video", remedy) from None
-    try:
-        with av.open(str(video)) as count, av.open(str(video)) as opened:
-            step = -(-sum(packet.size > 0 for packet in count.demux(video=0)) // FRAMES)
-            frames = enumerate(opened.decode(video=0))
-            for number, group in groupby(frames, lambda frame: frame[0] // step):
-                images = (frame.to_image().rotate(frame.rotation, expand=True) for _, frame in group)
-                sharpest = max(images, key=lambda image: np.var(laplace(np.float32(image.convert("L")))))
-                sharpest.save(folder / f"{number:04}.jpg", quality=95, subsampling=0)
-    except (av.FFmpegError, IndexError, ZeroDivisionError) as error:
-        remedy = "record it again, or give a folder with JPEG or PNG files"
-        raise InputError(f"cannot be read ({error})", video, "video", remedy) from error
+        raise InputError("PyAV, which reads videos, is not installed", source, "video", remedy) from None
+    with TemporaryDirectory(prefix=f"{source.stem}_") as folder:
+        try:
+            with av.open(str(source)) as count, av.open(str(source)) as opened:
+                step = -(-sum(packet.size > 0 for packet in count.demux(video=0)) // FRAMES)
+                frames = enumerate(opened.decode(video=0))
+                for number, group in groupby(frames, lambda frame: frame[0] // step):
+                    images = (frame.to_image().rotate(frame.rotation, expand=True) for _, frame in group)
+                    sharpest = max(images, key=lambda image: np.var(laplace(np.float32(image.convert("L")))))
+                    sharpest.save(Path(folder) / f"{number:04}.jpg", quality=95, subsampling=0)
+        except (av.FFmpegError, IndexError, ZeroDivisionError) as error:
+            remedy = "record it again, or give a folder with JPEG or PNG files"
+            raise InputError(f"cannot be read ({error})", source, "video", remedy) from error
+        yield Path(folder)
 
 
 def _photograph(path: Path) -> Photograph:
@@ -166,18 +174,19 @@ def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[s
         raise InputError("no such folder", folder, "--masks", "give one with a PNG file per photograph")
     for photograph in photographs:
         path, wanted = mask_in(folder, photograph.name).path, photograph.size
-        width, height = image_size(path)
-        if (width, height) not in (wanted, photograph.stored_size):
-            what = f"{width} × {height} pixels, but {photograph.name} has {wanted[0]} × {wanted[1]}"
+        size = image_size(path)
+        if not is_copy(size, wanted) and not is_copy(size, photograph.stored_size):
+            what = f"{size[0]} × {size[1]} pixels, but {photograph.name} has {wanted[0]} × {wanted[1]}"
             raise InputError(what, path, "--masks", "make masks of the photographs' size")
         masks[photograph.name] = path
     return masks
 
 
 def mask_pixels(path: Path, photograph: Photograph) -> np.ndarray:
-    """The mask (H, W, 1) uint8, 255 on the object, rotated like the photograph if it has the stored size."""
+    """The mask (H, W, 1) uint8, 255 on the object, of the size and rotation of the photograph."""
     from PIL import Image
 
     mask = Image.fromarray(to_8_bits(read_mask(path)))
-    orientation = 1 if mask.size == photograph.size else photograph.orientation
-    return np.asarray(photograph.turned(mask, orientation))[..., None]
+    upright = is_copy(mask.size, photograph.size)
+    mask = mask.resize(photograph.size if upright else photograph.stored_size)
+    return np.asarray(photograph.turned(mask, 1 if upright else photograph.orientation))[..., None]

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import Solved
 from mi_refgs.capture.frame import upright_unit
 from mi_refgs.capture.output import REPORT, SPARSE, WORK
-from mi_refgs.capture.photographs import VIDEOS, Photograph, find_masks, find_photographs, write_frames
+from mi_refgs.capture.photographs import Photograph, find_masks, find_photographs
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.images import MASK
 from mi_refgs.data.object_region import support_planes
@@ -50,15 +49,10 @@ def capture(
     region: Region | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Reconstruct the cameras of photographs in `source`, a folder or video; write the data set `folder`.
+    """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`.
     `camera`: COLMAP's lens model, or None for the simplest of three that fits. `region`: in the data set's
     world. Returns the content of capture.json. Raises InputError for unusable input, and without pycolmap."""
     # Photographs and options.
-    if source.suffix.lower() in VIDEOS and source.is_file():
-        with TemporaryDirectory() as frames:
-            write_frames(source, Path(frames))
-            options: dict[str, Any] = {"masks": masks, "camera": camera, "region": region, "tell": tell}
-            return capture(Path(frames), folder, **options)
     pycolmap = colmap.load()
     if camera not in (None, *MODELS):
         remedy = f"give one of {', '.join(MODELS)}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -33,13 +33,14 @@ class Capture:
 
     def run(self) -> Result:
         """Estimate the cameras."""
+        from mi_refgs.capture.photographs import folder_of
         from mi_refgs.capture.pipeline import capture, report_text
         from mi_refgs.data.region import Region
 
         region = None
         if self.region is not None:
             region = Region.of({"centre": [*self.region[:3]], "radius": self.region[3]}, "--region")
-        report = capture(
-            self.photographs, self.output, masks=self.masks, camera=self.camera_model, region=region, tell=say
-        )
+        given: dict[str, Any] = {"masks": self.masks, "camera": self.camera_model, "region": region}
+        with folder_of(self.photographs) as source:
+            report = capture(source, self.output, tell=say, **given)
         return Result({"dataset": str(self.output), **report}, report_text(report, self.output))

@@ -13,7 +13,7 @@ import numpy as np
 
 from mi_refgs.data.colmap_model import TEST_LIST, Image, read_cameras, read_images, read_points
 from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, fitted, held_out, make_view
-from mi_refgs.data.images import ImageFile, ImageFolder, find_image, mask_of
+from mi_refgs.data.images import ImageFile, find_image, image_files, image_folder, mask_of
 from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.transforms import read_points as read_ply_points
 from mi_refgs.data.view import View
@@ -52,10 +52,10 @@ class Reconstruction:
         self.images = read_images(self.source)
         point_file = self.source.with_stem("points3D")
         self.table = read_points(point_file) if point_file.is_file() else None
-        self.folder = ImageFolder.of(folder, self.source.parent)
+        self.folder, self.root = image_folder(folder, self.source.parent)
         self.files, taken = dict[str, Path](), dict[Path, str]()
         for name in (image.name for image in self.images):
-            if found := find_image((self.folder.path, self.folder.root), name, options.say):
+            if found := find_image((self.folder, self.root), name, options.say):
                 if (other := taken.setdefault(found, name)) != name:
                     what = f"{abbreviated(name)} and {abbreviated(other)} are both {found}"
                     raise InputError(what, self.source, remedy="restore the folders of the images")
@@ -64,7 +64,7 @@ class Reconstruction:
     def registered(self, split: str) -> list[Image]:
         images = [image for image in self.images if image.name in self.files]
         if not images:
-            what = f"none of its {len(self.images)} images is in {self.folder.path}"
+            what = f"none of its {len(self.images)} images is in {self.folder}"
             raise InputError(what, self.source, remedy="put them there under the same names")
         test_list = self.source.with_name(TEST_LIST)
         if not is_file(test_list):
@@ -88,7 +88,7 @@ class Reconstruction:
             raise error.at(file=where) from None
         pose = from_world_to_camera(image.rotation, image.translation, f"{self.source}: {image.name}")
         path = self.files[image.name]
-        file = ImageFile.of(path, self.options.downscale, mask_of(path, self.folder.root))
+        file = ImageFile.of(path, self.options.downscale, mask_of(path, self.root))
         size, source = (camera.width, camera.height), f"{self.source.parent.name}/{self.source.name}"
         pinhole = fitted(camera.intrinsics, size, file, self.options, source)
         view = make_view(file, self.options, where, image.name, pinhole, pose, lens)[0]
@@ -113,11 +113,11 @@ class Reconstruction:
         return PointCloud(points.position[good], colour)
 
     def notes(self) -> tuple[str, ...]:
-        notes, names = [], self.folder.names()
+        notes, files = [], image_files(self.folder, deep=self.folder != self.root)
         if absent := len(self.images) - len(self.files):
             notes.append(f"{absent} of {len(self.images)} cameras have no image and are left out")
-        if (spare := len(names) - len(self.files)) > 0:
-            notes.append(f"{spare} of {len(names)} images have no camera and are left out")
+        if (spare := len(files) - len(self.files)) > 0:
+            notes.append(f"{spare} of {len(files)} images have no camera and are left out")
         if others := len(self.models) - 1:
             chosen = f"{'/'.join(self.source.parts[-3:-1])}, of {len(self.images)} images, is read"
             notes.append(f"{chosen}; {others} smaller models are left out")

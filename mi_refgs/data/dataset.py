@@ -151,18 +151,15 @@ def fitted(
 ) -> tuple[float, ...]:
     """fx, fy, cx, cy of an image of `size`, as `source` has it, for the file, perhaps a smaller copy; raises
     InputError for another aspect ratio."""
-    if size == (image.width, image.height):
-        return given
-    name, (width, height) = f"{image.width} × {image.height}", size
-    if not is_copy((image.width, image.height), size):
-        turned = is_copy((image.height, image.width), size)
-        remedy = "turn it, as its EXIF data may say" if turned else "restore the image"
-        what = f"{name} pixels are no copy of {width:g} × {height:g}, which {source} says"
+    own, said = (image.width, image.height), f"{size[0]:g} × {size[1]:g}"
+    if not is_copy(own, size):
+        remedy = "turn it, as its EXIF data may say" if is_copy(own[::-1], size) else "restore the image"
+        what = f"{own[0]} × {own[1]} pixels are no copy of {said}, which {source} says"
         raise InputError(what, image.path, "size", remedy)
-    what = "focal length and principal point are of a larger or smaller copy, and scaled"
-    options.say(what, str(image.path), f"{width:g} × {height:g} for the {name} pixels of {image.path.name}")
-    across, down = image.width / width, image.height / height
-    return tuple(n * scale for n, scale in zip(given, (across, down, across, down), strict=True))
+    if own != size:
+        what = "focal length and principal point are of a larger or smaller copy, and scaled"
+        options.say(what, str(image.path), f"{said} for the {own[0]} × {own[1]} pixels of {image.path.name}")
+    return tuple((np.array(given) * np.tile(np.divide(own, size), 2)).tolist())
 
 
 def make_view(
@@ -185,11 +182,11 @@ def make_view(
     fx, fy, cx, cy = intrinsics
     file = FileCamera(image.path, image.width, image.height, (fx, fy, cx, cy), lens, image.mask)
     if (mask := image.mask) is not None and mask.below is None:
-        if mask.path.parent.name not in (MASKS, image.path.parent.name):
-            options.say("a mask was found", name, mask.path)
         if (size := image_size(mask.path)) != (image.width, image.height):
-            what = f"{size[0]} × {size[1]} for {image.width} × {image.height} pixels"
+            what = f"{mask.path} of {size[0]} × {size[1]} for {image.width} × {image.height} pixels"
             options.say("the mask is of another size, and resized", name, what)
+        elif mask.path.parent.name not in (MASKS, image.path.parent.name):
+            options.say("a mask was found", name, mask.path)
     fx, fy, cx, cy = (value / image.downscale for value in intrinsics)
     straight = None
     if lens is not None:

@@ -204,34 +204,22 @@ def is_copy(size: tuple[float, ...], of: tuple[float, ...]) -> bool:
     return abs(size[0] * of[1] - size[1] * of[0]) < max(sum(size), sum(of))
 
 
-@dataclass(frozen=True)
-class ImageFolder:
-    """A folder of images of COLMAP's and LLFF's layouts."""
-
-    path: Path
-    root: Path  # beside it or, of a folder without such a name, itself
-
-    @classmethod
-    def of(cls, root: Path, model: Path | None = None) -> ImageFolder:
-        """The first of FOLDERS below `root`; of a `model`, a folder there, of the nearest of its parents that
-        has one, or else that itself contains images."""
-        parents = [root] if model is None else [p for p in (model, *model.parents) if p.is_relative_to(root)]
-        found = [(p / name, p) for p in parents for name in FOLDERS if (p / name).is_dir()]
-        if not found and model is not None:
-            found = [(parent, parent) for parent in parents if any(map(_is_image, parent.iterdir()))]
-        if not found:
-            raise InputError("no such folder", root, FOLDERS[0], "put the images there")
-        return cls(*found[0])
-
-    def names(self) -> list[str]:
-        """Sorted paths of the images, also in subfolders of a folder that contains nothing else; no masks."""
-        files = image_files(self.path, "*" if self.path == self.root else "**/*")
-        return [str(path.relative_to(self.path)) for path in files]
+def image_folder(root: Path, model: Path | None = None) -> tuple[Path, Path]:
+    """The first of FOLDERS in `root`, and `root`; of a `model`, that of its nearest parent which has one, and
+    that parent, or else twice the nearest that contains images. Raises InputError without any."""
+    parents = [root] if model is None else [p for p in (model, *model.parents) if p.is_relative_to(root)]
+    found = [(p / name, p) for p in parents for name in FOLDERS if (p / name).is_dir()]
+    if not found and model is not None:
+        found = [(parent, parent) for parent in parents if image_files(parent, deep=False)]
+    if not found:
+        raise InputError("no such folder", root, FOLDERS[0], "put the images there")
+    return found[0]
 
 
-def image_files(folder: Path, pattern: str) -> list[Path]:
-    """The images in a folder by name, but neither hidden ones nor masks beside their images."""
-    paths = sorted(path for path in folder.glob(pattern) if _is_image(path))
+def image_files(folder: Path, deep: bool) -> list[Path]:
+    """The images of a folder by name, `deep` with those of subfolders; neither hidden ones nor masks."""
+    files = folder.glob("**/*" if deep else "*")
+    paths = sorted(p for p in files if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
     masks = {f"{path.with_suffix('')}{mark}" for path in paths for mark in MARKS[1:]}
     return [path for path in paths if str(path.with_suffix("")) not in masks]
 
@@ -283,10 +271,6 @@ def _mask_file(folder: Path, name: str, marks: Sequence[str]) -> Path | None:
     stems = (name, str(Path(name).with_suffix("")))
     files = (folder / f"{stem}{mark}{ending}" for stem, mark, ending in product(stems, marks, endings))
     return next((file for file in files if is_file(file)), None)
-
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in ENDINGS and not path.name.startswith(".")
 
 
 def block_mean(

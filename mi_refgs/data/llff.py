@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.data.dataset import ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.images import ImageFile, ImageFolder, mask_of
+from mi_refgs.data.dataset import ReadOptions, Recording, fitted, held_out, make_view
+from mi_refgs.data.images import ImageFile, image_files, image_folder, mask_of
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError
@@ -30,13 +30,13 @@ class LlffReader:
         return (folder / POSES).is_file()
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        source, images = folder / POSES, ImageFolder.of(folder)
-        rows, names = read_poses(source), images.names()
-        if len(names) != len(rows):
-            what = f"{len(rows)} cameras, but {images.path.name} has {len(names)} images"
+        source, images = folder / POSES, image_folder(folder)[0]
+        rows, files = read_poses(source), image_files(images, deep=True)
+        if len(files) != len(rows):
+            what = f"{len(rows)} cameras, but {images.name} has {len(files)} images"
             raise InputError(what, source, remedy="restore the images")
-        chosen = held_out(list(zip(names, rows, strict=True)), split, source)
-        return Recording(tuple(_view(source, images, options, *one) for one in chosen), source=source)
+        chosen = held_out(list(zip(files, rows, strict=True)), split, source)
+        return Recording(tuple(_view(source, options, *one) for one in chosen), source=source)
 
 
 def read_poses(path: Path) -> np.ndarray:
@@ -56,9 +56,9 @@ def read_poses(path: Path) -> np.ndarray:
     return rows
 
 
-def _view(source: Path, images: ImageFolder, options: ReadOptions, name: str, row: np.ndarray) -> View:
-    path = images.path / name
-    image = ImageFile.of(path, options.downscale, mask_of(path, images.root))
+def _view(source: Path, options: ReadOptions, path: Path, row: np.ndarray) -> View:
+    image = ImageFile.of(path, options.downscale, mask_of(path, source.parent))
+    name = path.relative_to(source.parent).as_posix().partition("/")[2]
     down, right, backwards, position, (height, width, focal) = row[:15].reshape(3, 5).T
     if min(height, width, focal) <= 0:
         remedy = "export the poses again"
@@ -66,6 +66,5 @@ def _view(source: Path, images: ImageFolder, options: ReadOptions, name: str, ro
     pose = np.eye(4)
     pose[:3] = np.stack([right, -down, backwards, position], axis=-1)
     to_world = rigid(pose, f"{source}: {name}") @ MITSUBA_FROM_OPENGL
-    fx, fy = focal * image.width / width, focal * image.height / height
-    intrinsics = (fx, fy, image.width / 2, image.height / 2)
-    return make_view(image, options, f"{source}: {name}", name, intrinsics, to_world)[0]
+    pinhole = fitted((focal, focal, width / 2, height / 2), (width, height), image, options, source.name)
+    return make_view(image, options, f"{source}: {name}", name, pinhole, to_world)[0]

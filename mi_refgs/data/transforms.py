@@ -50,10 +50,9 @@ class TransformsReader:
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
         frames = _frames(folder, split)
         views = tuple(_view(frame, options) for frame in frames)
-        light, file, points = folder / "environment.exr", frames[0].file, None
-        if name := frames[0].given.get("ply_file_path"):
-            points = read_points(_path(file, "ply_file_path", name, options))
-        return Recording(views, points, light if light.is_file() else None, source=file)
+        light, points = folder / "environment.exr", frames[0].path("ply_file_path", options)
+        cloud = read_points(points) if points else None
+        return Recording(views, cloud, light if light.is_file() else None, source=frames[0].file)
 
 
 @dataclass(frozen=True)
@@ -85,9 +84,16 @@ class Frame:
         return InputError(what, self.file, f"{self.place}.{key}" if key in self.own else key, remedy)
 
     def path(self, key: str, options: ReadOptions) -> Path | None:
-        """The file of a key; None where the frame has no such key, or an empty name."""
-        name = self.own.get(key)
-        return None if name in (None, "") else _path(self.file, f"{self.place}.{key}", name, options)
+        """The file of a key, or where it is missing; None where there is no such key, or an empty name."""
+        name, root = self.given.get(key), self.file.parent
+        if name in (None, ""):
+            return None
+        more = [root / folder for folder in FOLDERS] if key.endswith("file_path") else []
+        file = find_image((root, *more), str(name), options.say) or inside(root, name)
+        if file is None:
+            what = f"{abbreviated(name)} names no file in the data set's folder"
+            raise self.refuse(key, what, "move the file there and give its relative path")
+        return file
 
     def number(self, key: str, positive: bool = False) -> float | None:
         value = self.given.get(key)
@@ -178,17 +184,6 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
     if not test or split == "test":
         return test or None
     return lists["train"] or {frame.name for frame in frames} - test - lists["val"]
-
-
-def _path(transforms: Path, field: str, name: object, options: ReadOptions) -> Path:
-    """The file of a name, or where it is missing; raises InputError for a name of no file in the folder."""
-    root = transforms.parent
-    more = [root / folder for folder in FOLDERS] if field.endswith("file_path") else []
-    file = find_image((root, *more), str(name), options.say) or inside(root, name)
-    if file is None:
-        what = f"{abbreviated(name)} names no file in the data set's folder"
-        raise InputError(what, transforms, field, "move the file there and give its relative path")
-    return file
 
 
 def read_points(path: Path) -> PointCloud | None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import mitsuba as mi
@@ -17,24 +16,20 @@ IMAGES = {"envmap": read_radiance, "bitmap": lambda file: read_image(file)[0]}
 
 
 def load_scene(
-    path: Path,
-    aovs: Sequence[str] = (),
-    object_only: bool = False,
-    optimize: bool = True,
-    define: Mapping[str, str] = MappingProxyType({}),
+    path: Path, aovs: Sequence[str] = (), object_only: bool = False, define: dict[str, str] | None = None
 ) -> Any:
     """Load a scene, its `refgs` integrator with these AOVs (types, or `name:type`) after its own,
-    `object_only` without what surrounds the object, not to `optimize` with all its shapes and their ids, with
-    the values of parameters $name in `define`. Raises InputError for what cannot be loaded, for a name of two
-    types, and for AOVs or `object_only` without that integrator."""
+    `object_only` without what surrounds the object. With `define`, values of parameters $name, all shapes keep
+    their ids. Raises InputError for what cannot be loaded, for a name of two types, and for AOVs or
+    `object_only` without that integrator."""
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(str(path.parent.resolve()))
     mi.set_file_resolver(beside)
     try:
         config = mi.parser.ParserConfig(mi.variant())
-        config.merge_equivalent = config.merge_meshes = optimize
-        state = mi.parser.parse_file(config, str(path), **define)
+        config.merge_equivalent = config.merge_meshes = define is None
+        state = mi.parser.parse_file(config, str(path), **(define or {}))
         mi.parser.transform_all(config, state)
         if aovs or object_only:
             integrators = [node.props for node in state.nodes if node.props.plugin_name() == "refgs"]

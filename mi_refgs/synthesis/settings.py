@@ -39,13 +39,12 @@ def load_scene(scene: Path, define: Sequence[str] = ()) -> Any:
     with contextlib.suppress(OSError, ElementTree.ParseError):  # which Mitsuba reports
         root = ElementTree.parse(scene).getroot()
         inside = [element for parent in root.iter("integrator") for element in parent.iter()]
-        elsewhere = {value for e in root.iter() if e not in inside for value in e.attrib.values()}
-        for element in inside:
-            for key, value in element.attrib.items():
-                if value.startswith("$") and value not in elsewhere:
-                    any_value = "path" if key == "type" else {"boolean": "false"}.get(element.tag, "1")
-                    values.setdefault(value[1:], any_value)
-    loaded = scenes.load_scene(scene, optimize=False, define=values)
+        used = {value for e in root.iter() if e not in inside for value in e.attrib.values()}
+        for tag, key, value in ((e.tag, *pair) for e in inside for pair in e.attrib.items()):
+            if value.startswith("$") and value not in used:
+                some = {"type": "path", "boolean": "false"}.get(key if key == "type" else tag, "1")
+                values.setdefault(value[1:], some)
+    loaded = scenes.load_scene(scene, define=values)
     for kind, there in (("shapes", loaded.shapes()), ("emitters", loaded.emitters())):
         if not there:
             raise InputError("the scene has none", scene, kind, "add an object and a light")

@@ -18,7 +18,7 @@ from PIL import Image
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
 from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
-from mi_refgs.capture.photographs import find_masks, find_photographs, mask_pixels, write_frames
+from mi_refgs.capture.photographs import find_masks, find_photographs, folder_of, mask_pixels
 from mi_refgs.capture.pipeline import require_placed
 from mi_refgs.cli import main
 from mi_refgs.data.lens import Lens, undistortion
@@ -286,7 +286,7 @@ def test_photographs_in_subfolders(tmp_path: Path) -> None:
 
 
 def test_sharpest_frames_of_a_video_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    av, clip, out = pytest.importorskip("av"), tmp_path / "clip.mp4", _made(tmp_path / "frames")
+    av, clip = pytest.importorskip("av"), tmp_path / "clip.mp4"
     with av.open(str(clip), "w") as video:
         stream = video.add_stream("mpeg4", 30, width=64, height=48, pix_fmt="yuv420p", bit_rate=10**7)
         for i in range(9):
@@ -295,8 +295,8 @@ def test_sharpest_frames_of_a_video_are_written(tmp_path: Path, monkeypatch: pyt
             video.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
         video.mux(stream.encode())
     monkeypatch.setattr("mi_refgs.capture.photographs.FRAMES", 5)
-    write_frames(clip, out)
-    found = [read_png(path)[:, 1::4].mean() for path in sorted(out.iterdir())]
+    with folder_of(clip) as folder:
+        found = [read_png(path)[:, 1::4].mean() for path in sorted(folder.iterdir())]
     np.testing.assert_allclose(found, np.array([40, 80, 120, 160, 180]) / 255, atol=0.04)
     clip.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(100))
     refused(["capture", clip, "-o", tmp_path / "data"], "clip.mp4: video: cannot be read")

@@ -247,18 +247,18 @@ def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPat
     few = Targets(data, options, 2 * one)
     assert not made
     for index in (0, 1, 0, 2, 0, 1):
-        assert few[index].camera.width == 24
-        assert np.array_equal(few[index].image[0], whole[index].image[0])
+        assert few.at(4, index).camera.width == 24
+        assert np.array_equal(few.at(4, index).image[0], whole.at(4, index).image[0])
         assert whole.at(1, index).camera.width == whole.at(3, index).camera.width == 12
-        assert whole.at(4, index) is whole[index]
+        assert whole.at(4, index) is whole.at(5, index)
     assert made == [0, 1, 2, 1]
     lone = Targets(data, options, 1)
-    assert lone[3] is lone[3] and lone[4] is not lone[3]
+    assert lone.at(4, 3) is lone.at(4, 3) is not lone.at(4, 4)
 
 
 def test_crop_of_a_target_is_that_part_of_its_view() -> None:
     """Pixels, masks and rays are those of the whole image; a linear one has no clipped pixels."""
-    whole = Targets(ball(24, 1), DataOptions())[0]
+    whole = Targets(ball(24, 1), DataOptions()).at(0, 0)
     part = whole.cropped(8, 16, 10, 5)
     rows = (slice(16, 21), slice(8, 18))
     assert whole.alpha is not None and part.alpha is not None and whole.clipped is not None

@@ -36,19 +36,6 @@ def colmap(folder: Path, name: str = "{}", images: str = "images", place: str = 
     return folder
 
 
-def larger(folder: Path) -> None:
-    write_colmap(folder, place="sparse/1")
-    write_text(folder / SPARSE, SHOTS[:3])
-
-
-def marked(folder: Path) -> None:
-    """A byte-order mark, as editors of Windows write; and files of COLMAP's rigs."""
-    for path in colmap(folder).glob("sparse/0/*.txt"):
-        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    for name in ("rigs", "frames"):
-        (folder / SPARSE / f"{name}.bin").write_bytes(b"\x01")
-
-
 def ply_points(folder: Path) -> None:
     columns = dict(zip("xyz", POINTS.T, strict=True))
     (colmap(folder) / SPARSE / "points3D.ply").write_bytes(ply_bytes(columns))
@@ -79,18 +66,25 @@ def fourfold(frame: dict[str, Any]) -> None:
     frame.update({key: 4 * frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")})
 
 
-def copies(folder: Path) -> None:
-    (write_nerfstudio(folder) / "images").rename(folder / "images_4")
+def marked(write: Callable[[Path], Path], pattern: str) -> Callable[[Path], None]:
+    """With a byte-order mark, as editors of Windows write."""
+
+    def written(folder: Path) -> None:
+        for path in write(folder).glob(pattern):
+            path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+
+    return written
 
 
-def with_mark(folder: Path) -> None:
-    file = write_nerfstudio(folder) / "transforms.json"
-    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+def rigs(folder: Path) -> None:
+    for name in ("rigs", "frames"):
+        (colmap(folder) / SPARSE / f"{name}.bin").write_bytes(b"\x01")
 
 
 FOLDERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "COLMAP, dense": (lambda f: colmap(f / "dense/0", place="sparse"), ""),
-    "COLMAP, two models": (larger, "sparse/1, of 9 images, is read; 1 smaller models"),
+    "COLMAP, two models": (lambda f: write_text(write_colmap(f, place="sparse/1") / SPARSE, SHOTS[:3]),
+                           "sparse/1, of 9 images, is read; 1 smaller models are left out"),
     "COLMAP, folder in the names": (lambda f: colmap(f, "images/{}"), ""),
     "COLMAP, other letters": (lambda f: colmap(f, "{:.1}.PNG"), ""),
     "COLMAP, no endings": (lambda f: colmap(f, "{:.1}"), ""),
@@ -98,7 +92,8 @@ FOLDERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "COLMAP, distorted": (lambda f: colmap(f, images="input", place="distorted/sparse/0"), ""),
     "COLMAP, spaces": (lambda f: write_colmap(f, "txt", [replace(s, name=f"ü {s.name}") for s in SHOTS]), ""),
     "COLMAP, Windows": (lambda f: colmap(f, "C:\\Users\\me\\vase\\images\\{}"), "9 images: the path"),
-    "COLMAP, byte-order mark": (marked, ""),
+    "COLMAP, byte-order mark": (marked(colmap, "sparse/0/*.txt"), ""),
+    "COLMAP, rigs": (rigs, ""),
     "COLMAP, points as PLY": (ply_points, ""),
     "nerfstudio, scaled": (frames(fourfold), "7 images: focal length and principal point"),
     "nerfstudio, small letters": (frames(lambda frame: frame.update(camera_model="opencv", k1=0.0)), ""),
@@ -111,8 +106,8 @@ FOLDERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "nerfstudio, Windows": (named("images\\{}"), ""),
     "instant-ngp, Windows": (named("./..\\scenes\\vase\\images/{}"), "7 images: the path leads"),
     "nerfstudio, absolute": (named("/home/me/vase/images/{}"), "such as '/home/me/vase/images/b.png'"),
-    "nerfstudio, copies only": (copies, "the path leads"),
-    "nerfstudio, byte-order mark": (with_mark, ""),
+    "nerfstudio, copies": (lambda f: (write_nerfstudio(f) / "images").rename(f / "images_4"), "the path"),
+    "nerfstudio, byte-order mark": (marked(write_nerfstudio, "*.json"), ""),
 }  # fmt: skip
 
 
@@ -147,7 +142,7 @@ def test_masks_become_alpha(write: Callable[[Path], Path], pattern: str, tmp_pat
     assert view.alpha is not None and view.alpha.shape == (72, 96)
     assert view.alpha[:34].max() < 0.02 and view.alpha[38:].min() > 0.98
     assert view.image[:34].max() < 0.02 and view.image[38:].max() > 0.9
-    assert ("resized, such as 48 × 36 for 96 × 72 pixels" in notes) == half
+    assert ("_mask.png of 48 × 36 for 96 × 72 pixels" in notes) == half
     assert ("7 images: a mask was found" in notes) == (pattern not in PLAIN)
     if not pattern.startswith("images/"):
         (tmp_path / pattern.format("b")).unlink()
