@@ -19,7 +19,7 @@ def load_scene(
     path: Path, aovs: Sequence[str] = (), object_only: bool = False, define: dict[str, str] | None = None
 ) -> Any:
     """Load a scene, its `refgs` integrator with these AOVs (types, or `name:type`) after its own,
-    `object_only` without what surrounds the object. With `define`, values of parameters $name, all shapes keep
+    `object_only` without what surrounds the object. With `define`, values of its $names, all shapes keep
     their ids. Raises InputError for what cannot be loaded, for a name of two types, and for AOVs or
     `object_only` without that integrator."""
     before = mi.file_resolver()
