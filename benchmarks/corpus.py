@@ -74,7 +74,7 @@ def outcome(path: Path) -> Row:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
         result = {0: "read", 2: "refused"}.get(done.returncode, f"crashed ({done.returncode})")
         errors = done.stderr.replace(f"{path}: ", "").replace(f"{path}", path.name).splitlines()
-        notes = [line.split(": ", 3)[-1] for line in errors if "warning: " in line]
+        notes = [line.split("warning: ", 1)[1] for line in errors if "warning: " in line]
         said = "; ".join([done.stdout.strip(), *notes] if result == "read" else errors[-1:])
     except subprocess.TimeoutExpired:
         result, said = "too long", f"more than {SECONDS} s"

@@ -441,9 +441,8 @@ def _percent(value: float, sign: str = "") -> str:
 def corpus(result: Result) -> Values:
     """Return the table of what became of files."""
     rows = result["rows"]
-    said = [row["said"] if len(row["said"]) <= 72 else f"{row['said'][:70]}…" for row in rows]
-    cells = [[row["file"], row["result"], text] for row, text in zip(rows, said, strict=True)]
-    return {"table": table(["file", "result", "what is said"], cells)}
+    cells = [[row["file"], row["result"], row["said"].split(";")[0]] for row in rows]
+    return {"table": table(["file", "result", "what is said first"], cells)}
 
 
 PAGES: dict[str, Callable[[Result], Values]] = {
