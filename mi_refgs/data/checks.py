@@ -261,8 +261,8 @@ CHECKS: tuple[tuple[str, Callable[[Sight], Measured | None], str], ...] = (
     ("views", lambda sight: ({"count": (count := len(sight.views))}, count < FEW_VIEWS, ()),
      "only {count} training views; others may look wrong"),
     ("points", Sight.ahead, "{share:.0%} are in front of their cameras; correct the axes of the poses"),
-    ("keypoints", Sight.keypoints, "points project {median} pixels (median; 90 %: {p90}) from them in images "
-     f"of {{size}}; {{which}} are off by up to {{worst}} ({WRONG}?); use files of one model"),
+    ("keypoints", Sight.keypoints, "points project {median} pixels off in the median, {p90} at 90 %, in "
+     f"images of {{size}}; {{which}} are off by up to {{worst}} ({WRONG}?); use files of one model"),
     ("frusta", Sight.aimless, "{which} show no point and no object; correct or leave them out"),
     ("shape", Sight.shape, "{which} are stretched by {stretch:.0%}, or cropped, {offset:.0%} off-centre"),
     ("exposure", Sight.exposure, "neighbours differ by {stops} stops; fit gains: --set event.exposure={{}}"),
