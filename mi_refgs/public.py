@@ -76,7 +76,7 @@ from mi_refgs.splat.camera import Camera as Camera
 from mi_refgs.surfels.attributes import Attribute as Attribute, register as register_attribute
 from mi_refgs.surfels.init import from_points as from_points
 from mi_refgs.surfels.ply import read_ply as read_ply, write_ply as write_ply
-from mi_refgs.surfels.primitives import Primitive as Primitive, register as register_primitive
+from mi_refgs.surfels.primitives.primitive import Primitive as Primitive, register as register_primitive
 from mi_refgs.surfels.table import Surfels as Surfels
 from mi_refgs.synthesis.make_dataset import make_dataset as make_dataset
 from mi_refgs.synthesis.mesh_surfels import surfels_from_mesh as surfels_from_mesh

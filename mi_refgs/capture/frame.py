@@ -3,7 +3,6 @@ Rotation, position and scale are estimated from how cameras are held and where t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -20,22 +19,6 @@ SEEN_SHARE = 0.5  # fraction of the cameras whose images must show a point; othe
 REGION_POINTS = 50  # number of points that determine the region's radius; with fewer, the cameras alone do
 REGION_QUANTILE = 0.9  # fraction of the points around the focus that the region contains
 LEAST_SHARE = 0.5  # least radius over that from the cameras: points are only where the object has texture
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """World points x become scale · rotation x + translation."""
-
-    scale: float
-    rotation: np.ndarray  # (3, 3)
-    translation: np.ndarray  # (3,)
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def moved(self, solved: Solved) -> Solved:
-        rotation, points = solved.rotation @ self.rotation.T, self.apply(solved.points)
-        return replace(solved, rotation=rotation, origin=self.apply(solved.origin), points=points)
 
 
 def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
@@ -99,8 +82,9 @@ def region_of_interest(solved: Solved) -> Region:
     return object_region(Region((x, y, z), radius), solved.origin, solved.points, partial(seen_share, solved))
 
 
-def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
-    """The similarity to +z up and the region as the unit ball around 0; the first camera looks along +y."""
+def upright_unit(solved: Solved, up: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation (3, 3) and translation (3,) that make +z up and the region the unit ball around 0; the
+    first camera looks along +y."""
     z = up_direction(solved, up)
     forward = solved.axis[0] - (solved.axis[0] @ z) * z
     if np.linalg.norm(forward) < 1e-3:  # it looks straight down
@@ -109,4 +93,4 @@ def upright_unit(solved: Solved, up: np.ndarray) -> Similarity:
     rotation = np.stack([np.cross(y, z), y, z])
     region = region_of_interest(solved)
     scale = 1 / region.radius
-    return Similarity(scale, rotation, -scale * rotation @ np.array(region.centre))
+    return scale, rotation, -scale * rotation @ np.array(region.centre)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import shutil
 from collections.abc import Sequence
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.capture import colmap
-from mi_refgs.capture.frame import Similarity
 from mi_refgs.capture.photographs import Photograph, mask_pixels
 from mi_refgs.data.colmap_model import MODELS, Camera
 from mi_refgs.data.lens import Undistortion, undistortion
@@ -129,25 +127,21 @@ def write_model(
     model: colmap.Reconstruction,
     photographs: dict[str, Photograph],
     straight: dict[str, Straight],
-    similarity: Similarity,
     folder: Path,
 ) -> None:
-    """Write COLMAP's binary files of the transformed, undistorted reconstruction."""
+    """Write COLMAP's binary files of the undistorted reconstruction."""
     pycolmap = colmap.load()
-    moved = pycolmap.Reconstruction(model)
-    pose = pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation)
-    moved.transform(pose)
-    lenses = {i: copy.deepcopy(camera) for i, camera in moved.cameras.items()}
-    for i in moved.reg_image_ids():
-        image = moved.images[i]
-        camera, lens = straight[image.name], lenses[image.camera_id]
+    written = pycolmap.Reconstruction(model)
+    for i in written.reg_image_ids():
+        image = written.images[i]
+        camera, lens = straight[image.name], model.cameras[image.camera_id]
         rays = lens.cam_from_img(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
         for point, ray in zip(image.points2D, np.asarray(rays, dtype=np.float64), strict=True):
             seen = ray * camera.focal + camera.centre
             point.xy = np.where(np.isfinite(seen), seen, 0)
-        own = moved.cameras[image.camera_id]
+        own = written.cameras[image.camera_id]
         own.model, own.width, own.height = pycolmap.CameraModelId.PINHOLE, *camera.size
         own.params = [*camera.focal, *camera.centre]
         image.name = photographs[image.name].name
     folder.mkdir(parents=True, exist_ok=True)
-    moved.write_binary(folder)
+    written.write_binary(folder)

@@ -76,8 +76,9 @@ def capture(
     model = pycolmap.Reconstruction(work / "model")
     straight = output.straighten(model, copies)
     solved = Solved.of(model)
-    similarity = upright_unit(solved, np.array([copies[name].up for name in solved.names]))
-    world = similarity.moved(solved)
+    scale, rotation, shift = upright_unit(solved, np.array([copies[name].up for name in solved.names]))
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), shift))
+    world = Solved.of(model)
     found = region or Region((0.0, 0.0, 0.0), 1.0, estimated=True)
     found = replace(found, planes=support_planes(world.points, world.origin, found))
     # Undistorted images and COLMAP's files, unless the last capture wrote the same.
@@ -87,7 +88,7 @@ def capture(
         for stale in (*folder.glob(f"{SPARSE}/*.bin"), last):  # without them the folder is no data set
             stale.unlink(missing_ok=True)
         output.write_images([copies[name] for name in solved.names], straight, mask_files, folder)
-        output.write_model(model, copies, straight, similarity, folder / SPARSE)
+        output.write_model(model, copies, straight, folder / SPARSE)
     write_region(folder, found)
     draw(folder / PLOT, world, found)
     registered = {copies[name].name for name in world.names}

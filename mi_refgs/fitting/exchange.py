@@ -14,7 +14,7 @@ from mi_refgs.fitting.initial import converted
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.state import FitState, TableEdit
 from mi_refgs.methods.method import Method
-from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 
 REACH = 2.0  # deviations to which a surfel extends: one through the plane below the object is the table's

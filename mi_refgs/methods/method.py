@@ -17,7 +17,7 @@ from mi_refgs.shade.light.kind import LIGHTS, LightKind
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, attribute
-from mi_refgs.surfels.primitives import PRIMITIVES
+from mi_refgs.surfels.primitives.primitive import PRIMITIVES
 
 # Names among the parameters of a fit, beside the attributes of the surfels:
 LIGHT, BACKGROUND = "light", "background"  # the environment maps

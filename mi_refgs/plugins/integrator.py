@@ -29,7 +29,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
-from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0  # least time between checks for unusable values: each waits for the device

@@ -21,7 +21,7 @@ from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply
-from mi_refgs.surfels.primitives import PRIMITIVES
+from mi_refgs.surfels.primitives.primitive import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f
 

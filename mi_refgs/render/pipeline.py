@@ -30,7 +30,7 @@ from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace
 from mi_refgs.splat import Camera, splat, splat_compact
 from mi_refgs.surfels.attributes import attribute
-from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, Float, Point3f, TensorXf, Vector3f
 

@@ -12,7 +12,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import read_ply
-from mi_refgs.surfels.primitives import evaluating_both
+from mi_refgs.surfels.primitives.primitive import evaluating_both
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f
 

@@ -25,7 +25,7 @@ from mi_refgs.surfels.table import Surfels
 def channels_of(params: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """The channels of the object's table by name, or with the prefix AROUND those of the surroundings."""
     if prefix:
-        return {name.removeprefix(prefix): x for name, x in params.items() if name.startswith(prefix)}
+        return part(params, prefix)
     return {name: x for name, x in params.items() if name not in APART and not name.startswith(AROUND)}
 
 
@@ -101,6 +101,6 @@ def tensors(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:
     return {name: upload_tensor(value) for name, value in part(state, prefix).items()}
 
 
-def part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays of a checkpoint whose names begin with a prefix, by the rest of their names."""
+def part(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """The arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

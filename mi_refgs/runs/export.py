@@ -1,14 +1,5 @@
-"""The artefacts of a run, which other programs can read.
-
-surfels.ply       the object: raw attributes, with 2DGS's property names
-envmap.exr        the environment map: lat-long radiance, Mitsuba's orientation
-near_field.npz    distances of what the environment map shows, and its centre
-mesh.ply          the occluder
-surroundings.ply  the background Gaussians, like surfels.ply, with radiance_sh only
-background.exr    the background map, lat-long radiance
-scene.xml         the scene for `mi.load_file`
-model.json        iteration and training seconds of these files, their names, and the shading options
-"""
+"""The artefacts of a run, which other programs can read (docs/formats.md). model.json has the iteration and
+training seconds of these files, their names, and the shading options."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera as Camera
 from mi_refgs.splat.composite import Composited as Composited, composite, composite_compact
 from mi_refgs.splat.tiles import TileLists as TileLists, list_by_tile
-from mi_refgs.surfels.primitives import Footprints
+from mi_refgs.surfels.primitives.primitive import Footprints
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 

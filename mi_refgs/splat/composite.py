@@ -27,7 +27,7 @@ from mi_refgs.kernels.timing import boundary, phase
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.lanes import CompactedPixels, Lanes, advance, any_of, walk
 from mi_refgs.splat.tiles import TileLists
-from mi_refgs.surfels.primitives import Footprints
+from mi_refgs.surfels.primitives.primitive import Footprints
 from mi_refgs.types import Bool, Float, UInt32
 
 

@@ -28,7 +28,7 @@ from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PATCH_EDGE, TRANSMITTANCE_M
 from mi_refgs.kernels.trees import mapped
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
-from mi_refgs.surfels.primitives import FootprintSample
+from mi_refgs.surfels.primitives.primitive import FootprintSample
 from mi_refgs.types import Array, Arrays, Bool, Float, Point2f, UInt32
 
 SIDE = LANE_PIXELS_PER_AXIS

@@ -14,7 +14,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.rows import PackedRows
 from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera
-from mi_refgs.surfels.primitives import Footprints, Primitive
+from mi_refgs.surfels.primitives.primitive import Footprints, Primitive
 from mi_refgs.types import Bool, Float, Int32, UInt32, UInt64
 
 MAX_PAIR_BITS = 27  # log₂ of the largest number of surfel-tile pairs: 40 bytes each, 5 GB in all

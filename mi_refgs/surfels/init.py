@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, SH_DC, attribute
-from mi_refgs.surfels.primitives import PRIMITIVES
+from mi_refgs.surfels.primitives.primitive import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 
 DISTANCE_FLOOR = 1e-4  # least distance of neighbours, in extents of the points: keeps the log scale finite

@@ -1,13 +1,8 @@
-"""Surfels and 3D Gaussians in PLY files, with the names and raw encodings of 2DGS and 3DGS.
+"""Surfels and 3D Gaussians in PLY files, with the names and raw encodings of 2DGS and 3DGS (docs/formats.md).
 
-    x y z, nx ny nz       position; zeros, as both write them, ignored when read
-    f_dc_*, f_rest_*      radiance_sh            opacity                 logit
-    scale_0..1 (..2)      log scale (3DGS)       rot_0..3                quaternion, w first
-    albedo_0..2           logit                  metallic, roughness     logit
-    ind_dc_*, ind_rest_*  indirect_sh
-
-Everything is raw (before the activation). Spherical harmonics are colour-major: the constant coefficients of
-r, g, b, then all others of r, of g, of b. The column order of a surfel model is 3 coefficient + rgb.
+Normals are zeros, as both write them, and ignored when read. Spherical harmonics are colour-major: the
+constant coefficients of r, g, b, then all others of r, of g, of b. The column order of a surfel model is 3
+coefficient + rgb.
 """
 
 from __future__ import annotations
@@ -21,7 +16,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_bytes
 from mi_refgs.io.ply import read_vertices
 from mi_refgs.surfels.attributes import ATTRIBUTES, MAX_SH_DEGREE, sh_columns
-from mi_refgs.surfels.primitives import nearest_primitive
+from mi_refgs.surfels.primitives.primitive import nearest_primitive
 from mi_refgs.surfels.table import Surfels
 
 

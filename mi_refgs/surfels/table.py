@@ -24,7 +24,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.kernels.rows import columns_of
 from mi_refgs.surfels.attributes import ATTRIBUTES, attribute
-from mi_refgs.surfels.primitives import Primitive, primitive_of
+from mi_refgs.surfels.primitives.primitive import Primitive, primitive_of
 from mi_refgs.types import Bool, Float, Point3f, Quaternion4f, TensorXf, UInt32, Vector3f
 
 QUATERNION_FLOOR = 1e-12  # largest |component| of a quaternion that counts as zero

@@ -153,12 +153,8 @@ RULES: tuple[tuple[tuple[str, ...], Callable[[_Parameters], Materials]], ...] = 
 def surface_mesh(shapes: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 and faces (F, 3) of shapes of a scene, concatenated. Spheres, disks and
     cylinders are tessellated. Raises InputError that names another shape but a mesh."""
-    vertices, faces, count = [], [], 0
-    for points, corners in map(triangles, shapes):
-        vertices.append(points)
-        faces.append(corners + count)
-        count += len(points)
-    return np.concatenate(vertices), np.concatenate(faces)
+    vertices, faces = zip(*map(triangles, shapes), strict=True)
+    return trimesh.util.append_faces(vertices, faces)
 
 
 def triangles(shape: Any) -> tuple[np.ndarray, np.ndarray]:

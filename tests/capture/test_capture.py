@@ -17,7 +17,7 @@ from PIL import Image
 
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
-from mi_refgs.capture.frame import Similarity, region_of_interest, up_direction
+from mi_refgs.capture.frame import region_of_interest, up_direction
 from mi_refgs.capture.photographs import find_masks, find_photographs, folder_of, mask_pixels
 from mi_refgs.capture.pipeline import require_placed
 from mi_refgs.cli import main
@@ -68,17 +68,17 @@ def test_cameras_are_found_up_to_a_similarity(captured: Path) -> None:
     assert solved.names == NAMES
     true = np.array([shot.origin for shot in shots])
     matrix = trimesh.registration.procrustes(solved.origin, true, reflection=False)[0]
-    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-    similarity = Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
-    extent = np.linalg.norm(true - true.mean(axis=0), axis=1).max()
-    assert np.linalg.norm(similarity.apply(solved.origin) - true, axis=1).max() < 0.01 * extent
-    turned = solved.rotation @ similarity.rotation.T
+    scale, shift = np.cbrt(np.linalg.det(matrix[:3, :3])), matrix[:3, 3]
+    rotation, extent = matrix[:3, :3] / scale, np.linalg.norm(true - true.mean(axis=0), axis=1).max()
+    found = solved.origin @ matrix[:3, :3].T + shift
+    assert np.linalg.norm(found - true, axis=1).max() < 0.01 * extent
+    turned = solved.rotation @ rotation.T
     cosine = [(np.trace(a @ b.rotation.T) - 1) / 2 for a, b in zip(turned, shots, strict=True)]
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.5
     # The world is upright, and its unit ball contains the block.
-    assert similarity.rotation[2] @ [0, 0, 1] > np.cos(np.radians(1)) and 0.5 < similarity.scale < 2
+    assert rotation[2] @ [0, 0, 1] > np.cos(np.radians(1)) and 0.5 < scale < 2
     block = np.array([0, 0, scene.BLOCK[2] / 2])
-    assert np.linalg.norm(similarity.translation - block) < 0.5 * similarity.scale
+    assert np.linalg.norm(shift - block) < 0.5 * scale
 
 
 @needs_colmap

@@ -7,7 +7,7 @@ from typing import Any
 from mi_refgs.methods.read import load, names
 from mi_refgs.shade.options import DIFFUSE, ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
-from mi_refgs.surfels.primitives import PRIMITIVES
+from mi_refgs.surfels.primitives.primitive import PRIMITIVES
 from tests.laws.covering import Case, Rule
 
 WIDTH, HEIGHT = 16, 12

@@ -20,12 +20,12 @@ from mi_refgs.fitting.events import densify
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.splat import Camera, splat
-from mi_refgs.surfels import attributes, primitives
+from mi_refgs.surfels import attributes
 from mi_refgs.surfels.attributes import Attribute
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.ply import read_ply, write_ply
-from mi_refgs.surfels.primitives import Footprints, FootprintSample, Primitive
-from mi_refgs.surfels.primitives.primitive import cutoff_radius_squared, rectangle
+from mi_refgs.surfels.primitives import primitive as base
+from mi_refgs.surfels.primitives.primitive import Footprints, cutoff_radius_squared, rectangle
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.tiny import train_command, write_data
 
@@ -33,7 +33,7 @@ RADIUS = Attribute("radius", (1,), "exp", 5e-3, ("radius",), geometry=True)
 
 
 @dataclass(frozen=True)
-class BallSample(FootprintSample):
+class BallSample(base.FootprintSample):
     gaussian: Any
     delta: Any
 
@@ -54,7 +54,7 @@ class BallAdjoint:
         return [sharpness, z, x * row[0], y * row[0], opacity]
 
 
-class Ball(Primitive):
+class Ball(base.Primitive):
     """A round Gaussian whose projection is round: α = o exp(-|δ|²/(2 σ²)), σ = max(f r/z, ½) pixels."""
 
     name = "ball"
@@ -102,9 +102,9 @@ class Ball(Primitive):
 @pytest.fixture(autouse=True)
 def registered() -> Iterator[None]:
     attributes.register(RADIUS)
-    primitives.register(Ball())
+    base.register(Ball())
     yield
-    primitives.PRIMITIVES.unregister("ball")
+    base.PRIMITIVES.unregister("ball")
     attributes.ATTRIBUTES.unregister("radius")
 
 

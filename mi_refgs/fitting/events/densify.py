@@ -23,7 +23,7 @@ from mi_refgs.methods.fields import Window, at_least, between
 from mi_refgs.splat import surfel_count
 from mi_refgs.splat.weights import blended_weights, listed_tiles
 from mi_refgs.surfels.attributes import logit, sigmoid
-from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 

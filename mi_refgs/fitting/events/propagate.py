@@ -14,7 +14,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import ITERATIONS, Window, at_least, between
 from mi_refgs.surfels.attributes import logit, sigmoid
-from mi_refgs.surfels.primitives import primitive_of
+from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 
 OPACITY = 0.9  # all surfels become at least this opaque
