@@ -26,7 +26,7 @@ from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.io.exr import read_exr_image
-from mi_refgs.io.files import inside, is_file, read_json, require_file
+from mi_refgs.io.files import inside, is_file, read_json
 from mi_refgs.io.images import ENDINGS, linear_from_srgb, read_png, read_tiff, with_ending
 from mi_refgs.io.ply import read_vertices
 
@@ -188,9 +188,7 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
 
 def read_points(path: Path) -> PointCloud | None:
     """Read x, y, z and red, green, blue (8 bits or 0 … 1, sRGB) of a PLY file; None without usable points."""
-    require_file(path)
-    with path.open("rb") as file:
-        vertices = read_vertices(path, file)
+    vertices = read_vertices(path)
     names = vertices.dtype.names or ()
     if not {"x", "y", "z"} <= {*names}:
         raise InputError("no x, y, z", path, "vertex", "export the points again")

@@ -53,6 +53,10 @@ class Header:
 def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or mesh.ply of a run") -> Header:
     """Read the header up to the data. Raises InputError for a file without PLY header (the remedy is to give
     `wanted`) and for a header that promises more rows than the file contains."""
+
+    def refuse(what: str) -> InputError:
+        return InputError(what, path, "header", "the file is truncated or broken, export it again")
+
     first = file.readline(MAX_LINE)
     if first.strip() != b"ply":
         require_file(path)
@@ -64,7 +68,7 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
         line = file.readline(MAX_LINE)
         words = line.decode("ascii", errors="replace").split()
         if not line.endswith(b"\n") and words != ["end_header"]:
-            raise InputError("no end_header", path, "header", "the file is truncated, export it again")
+            raise refuse("no end_header")
         match words:
             case ["format", name, *_]:
                 order = ORDERS.get(name, "")
@@ -79,19 +83,18 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
             case ["end_header"]:
                 break
             case _:
-                text = " ".join(words)[:40]
-                raise InputError(f"'{text}' is no line of a PLY header", path, "header", "export it again")
+                raise refuse(f"'{' '.join(words)[:40]}' is no line of a PLY header")
     else:
-        raise InputError(f"no end_header in {MAX_HEADER_LINES} lines", path, "header", "export it again")
+        raise refuse(f"no end_header in {MAX_HEADER_LINES} lines")
     if not order or not elements:
-        raise InputError("no format or no element", path, "header", "export it again")
+        raise refuse("no format or no element")
     left = os.fstat(file.fileno()).st_size - file.tell()
     for element in elements:
-        names = [name for name, _, _ in element.properties]
+        names = {name for name, _, _ in element.properties}
         if not names:
-            raise InputError(f"{element.name} has no property", path, "header", "export it again")
-        if len({*names}) < len(names):
-            raise InputError(f"a property of {element.name} occurs twice", path, "header", "export it again")
+            raise refuse(f"{element.name} has no property")
+        if len(names) < len(element.properties):
+            raise refuse(f"a property of {element.name} occurs twice")
         left -= element.count * element.row_bytes(order == "a")
         if left < (-1 if order == "a" else 0):  # text may end without a line break
             what, remedy = f"{element.count} rows are more than the file contains", "copy or export it again"
@@ -99,9 +102,11 @@ def read_header(path: Path, file: BinaryIO, wanted: str = "the surfels.ply or me
     return Header(order, (*elements,), (*comments,))
 
 
-def read_vertices(path: Path, file: BinaryIO) -> np.ndarray:
+def read_vertices(path: Path) -> np.ndarray:
     """The numbers of the `vertex` element as a structured array (N,). Raises InputError as `read_header`."""
-    return read_rows(path, file, read_header(path, file))
+    require_file(path)
+    with path.open("rb") as file:
+        return read_rows(path, file, read_header(path, file))
 
 
 def read_rows(path: Path, file: BinaryIO, header: Header) -> np.ndarray:
@@ -124,28 +129,26 @@ def read_rows(path: Path, file: BinaryIO, header: Header) -> np.ndarray:
 def _parsed(path: Path, file: BinaryIO, element: Element, order: str) -> np.ndarray:
     """Rows of an element that is text or has lists, whose numbers are float64."""
     rows = np.empty(element.count, dtype=[(name, "f8") for name, _ in element.fields])
-    words: Iterator[float] = iter(())
+    words: Iterator[bytes] = iter(())
 
     def take(code: str) -> float:
         if order == "a":
-            return next(words)
+            return float(next(words))
         return struct.unpack(order + np.dtype(code).char, file.read(int(code[1])))[0]
 
     for row in range(element.count):
         try:
-            words = map(float, file.readline().split() if order == "a" else ())
+            words = iter(file.readline().split() if order == "a" else ())
             numbers = []
             for _, code, length in element.properties:
-                if not length:
-                    numbers.append(take(code))
-                elif order == "a":
-                    [next(words) for _ in range(int(take(length)))]
+                if length:
+                    [take(code) for _ in range(int(take(length)))]
                 else:
-                    file.seek(int(take(length)) * int(code[1]), os.SEEK_CUR)
-            if next(words, None) is not None:
+                    numbers.append(take(code))
+            if any(words):
                 raise ValueError("more numbers than properties")
             rows[row] = (*numbers,)
-        except (ValueError, OverflowError, StopIteration, struct.error, OSError) as error:
+        except (ValueError, OverflowError, StopIteration, struct.error) as error:
             what = f"row {row} is broken or missing"
             raise InputError(what, path, element.name, "copy or export the file again") from error
     return rows

@@ -7,6 +7,7 @@ coefficient + rgb.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -24,55 +25,46 @@ def read_ply(path: str | Path) -> Surfels:
     """Read surfels from a binary or ASCII PLY file; unknown properties are ignored. Raises InputError that
     names file, property and remedy if that fails, or a property is missing or not finite."""
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            vertices = read_vertices(path, file)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path, "file", "check the path") from error
-    return decode_ply(path, {name: vertices[name] for name in vertices.dtype.names or ()})
+    vertices = read_vertices(path)
+    raw = raw_attributes(path, {name: vertices[name] for name in vertices.dtype.names or ()})
+    for name, table in raw.items():
+        if bad := np.count_nonzero(~np.isfinite(table)):
+            remedy = "remove those surfels or export it again"
+            raise InputError(f"{bad} values are NaN or infinite", path, name, remedy)
+    return Surfels.from_numpy(raw)
 
 
-def decode_ply(path: Path, columns: Mapping[str, np.ndarray]) -> Surfels:
-    """Surfels from columns (N,) of a PLY file by name; `path` and errors as in `read_ply`."""
-    names, arrays = (*columns,), {}
+def raw_attributes(
+    path: Path, columns: Mapping[str, np.ndarray], most: int = MAX_SH_DEGREE
+) -> dict[str, np.ndarray]:
+    """Raw attributes (N, D) float32 from the columns (N,) of a PLY file by name; `most`: largest degree of
+    spherical harmonics. Raises InputError where properties are missing."""
+
+    def table(properties: tuple[str, ...]) -> np.ndarray:
+        if missing := [name for name in properties if name not in columns]:
+            remedy = f"export the file again with all of {', '.join(sorted(properties))}"
+            raise InputError("the property is missing", path, missing[0], remedy)
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
+            return np.stack([np.asarray(columns[name], np.float32) for name in properties], axis=1)
+
+    raw = {}
     for name, attribute in ATTRIBUTES.items():
         if attribute.harmonics:
             prefix = attribute.properties[0]
-            if any(found.startswith(f"{prefix}_") for found in names):
-                degree = _sh_degree(path, names, prefix)
-                arrays[name] = _columns(path, columns, _sh_properties(prefix, degree))
-        elif there := [i for i, found in enumerate(attribute.properties) if found in names]:
+            rest = sum(found.startswith(f"{prefix}_rest_") for found in columns)
+            degree = math.isqrt(rest // 3 + 1) - 1
+            if rest != sh_columns(degree) - 3 or degree > most:
+                use = f"use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})"
+                raise InputError(f"{rest} properties", path, f"{prefix}_rest_*", use)
+            if rest or any(found.startswith(f"{prefix}_dc_") for found in columns):
+                raw[name] = table(_sh_properties(prefix, degree))
+        elif there := [i for i, found in enumerate(attribute.properties) if found in columns]:
             width = min(width for width in attribute.widths if width > max(there))
-            arrays[name] = _columns(path, columns, attribute.properties[:width])
-    primitive, missing = nearest_primitive(arrays)
+            raw[name] = table(attribute.properties[:width])
+    primitive, missing = nearest_primitive(raw)
     for name in missing:  # raises InputError that names the property
-        _columns(path, columns, ATTRIBUTES[name].properties[: primitive.widths[name]])
-    return Surfels.from_numpy(arrays)
-
-
-def _columns(path: Path, columns: Mapping[str, np.ndarray], properties: tuple[str, ...]) -> np.ndarray:
-    """The named properties as an (N, D) float32 array, all present and finite."""
-    table = np.empty((len(next(iter(columns.values()))), len(properties)), dtype=np.float32)
-    for column, name in enumerate(properties):
-        if name not in columns:
-            remedy = f"export the file again with all of {', '.join(sorted(properties))}"
-            raise InputError("the property is missing", path, name, remedy)
-        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
-            table[:, column] = columns[name]
-        bad = int(np.count_nonzero(~np.isfinite(table[:, column])))
-        if bad:
-            remedy = "remove those surfels or export it again"
-            raise InputError(f"{bad} values are NaN or infinite", path, name, remedy)
-    return table
-
-
-def _sh_degree(path: Path, names: tuple[str, ...], prefix: str) -> int:
-    rest = sum(name.startswith(f"{prefix}_rest_") for name in names)
-    degrees = {sh_columns(degree) - 3: degree for degree in range(MAX_SH_DEGREE + 1)}
-    if rest not in degrees:
-        use = f"use 0, 9, 24 or 45 (degrees 0 to {MAX_SH_DEGREE})"
-        raise InputError(f"{rest} properties", path, f"{prefix}_rest_*", use)
-    return degrees[rest]
+        table(ATTRIBUTES[name].properties[: primitive.widths[name]])
+    return raw
 
 
 def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ def changed(kind: str) -> dict[str, np.ndarray]:
     ("given", "words", "attribute", "expected"),
     [
         ({"opacity": -np.inf}, "opacity: 1 infinite", "opacity", -20),
-        ({"scale_2": -np.inf}, "scale_2: 1 infinite", "scale", [SIZE, SIZE, -20]),
+        ({"scale_2": -np.inf}, "scale: 1 infinite", "scale", [SIZE, SIZE, -20]),
         ({"x": np.nan}, "left out 1 of 300 rows: 1 with NaN or infinity, 0", "", None),
         ({"scale_0": np.inf}, "left out 1 of 300 rows: 1 with NaN", "", None),
         ("zeros", "left out 1 of 300 rows: 0 with NaN or infinity, 1 with zero rotation", "", None),
