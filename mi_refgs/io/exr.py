@@ -159,8 +159,7 @@ def _image(path: Path, names: list[str], planes: list[np.ndarray]) -> np.ndarray
         raise InputError(what, path, f"channel {names[bad[0, 2]]}", "render the image again")
     if names[-1].endswith("BY"):
         y, red, blue = image[..., 0], (image[..., 1] + 1) * image[..., 0], (image[..., 2] + 1) * image[..., 0]
-        green = (y - LUMINANCE[0] * red - LUMINANCE[2] * blue) / LUMINANCE[1]
-        image = np.stack([red, green, blue], axis=-1)
+        image = np.stack([red, (y - LUMINANCE[0] * red - LUMINANCE[2] * blue) / LUMINANCE[1], blue], axis=-1)
     return image
 
 

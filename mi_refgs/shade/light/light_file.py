@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -47,8 +46,7 @@ def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndar
     if min(height, width) < 2:
         raise InputError(f"{size} are no lat-long image", path, "environment", "give 2 × 2 at least")
     if layout == "cube" and height != 6 * width:
-        remedy = "export six square faces in a column, or a lat-long image"
-        raise InputError(f"a cube, but of {size}", path, "envmap", remedy)
+        raise InputError(f"a cube, but of {size}", path, "envmap", "export six square faces in a column")
     if layout != "lat-long" and (faces := _faces(image, layout)) is not None:
         if layout is None:
             note(path, f"{size} are read as the faces of a cube, in OpenGL's order")
@@ -110,11 +108,7 @@ def _is_disc(image: np.ndarray) -> bool:
     return height == width and outside.any() and _is_even(image[outside], image[radius < 1])
 
 
-Place: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""The number of a picture, and a place in it from -1 to 1, down and to the right."""
-
-
-def _on_cube(directions: np.ndarray, span: float) -> Place:
+def _on_cube(directions: np.ndarray, span: float) -> tuple[np.ndarray, ...]:
     """Where directions (m, 3) are on FACES, whose edges are at ± `span`."""
     along = (directions @ FACES.reshape(18, 3).T).reshape(-1, 6, 3)
     face = along[..., 0].argmax(axis=1)
@@ -122,7 +116,7 @@ def _on_cube(directions: np.ndarray, span: float) -> Place:
     return face, -up * span / depth, right * span / depth
 
 
-def _on_disc(directions: np.ndarray, rim: float) -> Place:
+def _on_disc(directions: np.ndarray, rim: float) -> tuple[np.ndarray, ...]:
     """Where directions (m, 3) are on an angular map: the distance from its middle is proportional to the
     angle from the front. [Debevec, "Rendering synthetic objects into real scenes", 1998]"""
     right, up, front = AXES @ directions.T
@@ -132,9 +126,10 @@ def _on_disc(directions: np.ndarray, rim: float) -> Place:
 
 
 def _lat_long(
-    pictures: np.ndarray, place: Callable[[np.ndarray], Place], height: int, turn: int
+    pictures: np.ndarray, place: Callable[[np.ndarray], tuple[np.ndarray, ...]], height: int, turn: int
 ) -> np.ndarray:
-    """A lat-long image of square pictures (k, n, n, 3) with `turn` pixels in 360°."""
+    """A lat-long image of square pictures (k, n, n, 3) with `turn` pixels in 360°; `place` returns the number
+    of a picture, and the place in it from -1 to 1, down and to the right."""
     n = pictures.shape[1]
     factor = next(f for f in range(max(turn // (4 * height), 1), 0, -1) if n % f == 0)
     pictures = np.stack([box_downscale(picture, factor) for picture in pictures])
