@@ -103,6 +103,8 @@ FOLDERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "Blender, scaled camera": (turned(lambda m: m @ np.diag([2, 3, 1, 1])), "made orthonormal"),
     "nerfstudio, other letters": (named("images/{:.1}.JPG"), ""),
     "nerfstudio, no endings": (named("images/{:.1}"), ""),
+    "nerfstudio, mixed letters": (frames(lambda frame: frame.update(file_path=frame["file_path"][:-4]),
+                                         shots=[replace(s, name=f"{s.name[0]}.Png") for s in SHOTS]), ""),
     "nerfstudio, Windows": (named("images\\{}"), ""),
     "instant-ngp, Windows": (named("./..\\scenes\\vase\\images/{}"), "7 images: the path leads"),
     "nerfstudio, absolute": (named("/home/me/vase/images/{}"), "such as '/home/me/vase/images/b.png'"),
