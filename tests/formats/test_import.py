@@ -148,48 +148,37 @@ def test_displayed_model_inverts_the_srgb_encoding() -> None:
     np.testing.assert_allclose(np.array(dr.grad(out.x)), slope, rtol=1e-4)
 
 
-def broken(kind: str, whole: bytes) -> bytes:
-    """A file that is wrong in one way."""
-    header, end, body = whole.partition(b"end_header\n")
-    return {
-        "missing": whole.replace(b"float rot_3\n", b"float other\n"),
-        "colourless": header.replace(b"f_dc_", b"a_dc_").replace(b"f_rest_", b"a_rest_") + end + body,
-        "materials": whole.replace(b"float nx\n", b"float metallic\n"),
-        "anchors": whole.replace(b"float nx\n", b"float f_anchor_feat_0\n"),
-        "zeros": header + end + bytes(len(body)),
-        "points": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar red\nend_header\n0\n",
-        "page": b"<!DOCTYPE html>\n",
-        "checkpoint": b"PK\x03\x04" + bytes(26) + b"archive/data.pkl",
-        "gzip": gzip.compress(whole),
-        "mesh": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
-        b"property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n",
-        "empty": header.replace(b"vertex 40", b"vertex 0") + end,
-        "degree": whole.replace(b"float f_rest_44\n", b"float nothing\n"),
-        "text": b"hello\n",
-    }[kind]
+HEADER = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar "
+FACES = b"element face 0\nproperty list uchar int vertex_indices\n"
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"),
+    ("content", "message"),
     [
-        ("missing", "rot_3: the property is missing"),
-        ("colourless", "f_dc_0: the property is missing"),
-        ("materials", "metallic: materials, which require their light"),
-        ("anchors", "f_anchor_feat_0: anchors of Scaffold-GS"),
-        ("zeros", "unusable are 40 of 40 rows: 0 with NaN or infinity, 40 with zero rotation"),
-        ("points", "vertex: points with colours, no Gaussians"),
-        ("page", "not a PLY file but a web page"),
-        ("checkpoint", "not a PLY file but PyTorch's or a zip file"),
-        ("gzip", "a compressed file, but not SPZ; decompress it first"),
-        ("mesh", "vertex: a mesh, no Gaussians"),
-        ("empty", "there are none"),
-        ("degree", "f_rest_*: 44 properties"),
-        ("text", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
+        ((b"float rot_3\n", b"float other\n"), "rot_3: the property is missing"),
+        ((b"float f_", b"float a_"), "f_dc_0: the property is missing"),
+        ((b"float f_rest_44\n", b"float nothing\n"), "f_rest_*: 44 properties"),
+        ((b"float nx\n", b"float metallic\n"), "metallic: materials, which require their light"),
+        ((b"float nx\n", b"float f_anchor_feat_0\n"), "f_anchor_feat_0: anchors of Scaffold-GS"),
+        ((b"vertex 40", b"vertex 0"), "there are none"),
+        (HEADER + b"red\nend_header\n0\n", "vertex: points with colours, no Gaussians"),
+        (HEADER + b"x\n" + FACES + b"end_header\n0\n", "vertex: a mesh, no Gaussians"),
+        (b"<!DOCTYPE html>\n", "not a PLY file but a web page"),
+        (b"PK\x03\x04" + bytes(26) + b"archive/data.pkl", "not a PLY file but PyTorch's or a zip file"),
+        (gzip.compress(b"hello"), "a compressed file, but not SPZ; decompress it first"),
+        (b"hello\n", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
+        (None, "unusable are 40 of 40 rows: 0 with NaN or infinity, 40 with zero rotation"),
     ],
 )
-def test_other_files_are_refused(kind: str, message: str, tmp_path: Path, rng: np.random.Generator) -> None:
-    path = tmp_path / "file.ply"
-    path.write_bytes(broken(kind, their_bytes(raw_of(3, 3, rng))))
+def test_other_files_are_refused(
+    content: bytes | tuple[bytes, bytes] | None, message: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Files, replacements in the header of a good file, and its header with zeros."""
+    path, whole = tmp_path / "file.ply", their_bytes(raw_of(3, 3, rng))
+    header, end, body = whole.partition(b"end_header\n")
+    if content is None:
+        content = header + end + bytes(len(body))
+    path.write_bytes(content if isinstance(content, bytes) else header.replace(*content) + end + body)
     refused(["import", path, "-o", tmp_path / "run"], path, message)
     assert not (tmp_path / "run").exists()
 

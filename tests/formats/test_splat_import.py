@@ -30,80 +30,70 @@ SIZE, FILTER = np.log(0.06), 0.05  # of the ball's Gaussians; of Mip-Splatting
 FUSED = 0.06**2 + FILTER**2
 
 
-def changed(kind: str) -> dict[str, np.ndarray]:
-    """The columns of the ball as another program writes them."""
-    columns = ball_columns()
-    if kind == "Mip-Splatting":
-        columns["filter_3D"] = np.full(COUNT, FILTER, np.float32)
-    elif kind == "degree 4":
-        columns |= {f"f_rest_{i}": np.full(COUNT, i, np.float32) for i in range(72)}
-    elif kind == "activated":
-        columns |= {f"scale_{i}": np.exp(columns[f"scale_{i}"]) for i in range(3)}
-        columns["opacity"] = sigmoid(columns["opacity"]).astype(np.float32)
-    elif kind == "half floats":
-        columns = {name: column.astype("f2").view("u2") for name, column in columns.items()}
-    elif kind == "8 bits":
-        for i, name in enumerate(("red", "green", "blue")):
-            columns[name] = np.full(COUNT, 51 * i, "u1")
-            del columns[f"f_dc_{i}"]
-    elif kind == "zeros":
-        columns = {name: np.where(np.arange(COUNT) > 0, column, 0) for name, column in columns.items()}
-    return {
-        name: column.astype(np.float32 if column.dtype == float else column.dtype)
-        for name, column in columns.items()
-    }
+BALL, ROW = ball_columns(), np.arange(COUNT)
+ACTIVATED = {name: np.exp(BALL[name]) for name in ("scale_0", "scale_1", "scale_2")}
+ACTIVATED |= {"opacity": sigmoid(BALL["opacity"])}
+MIP = {"filter_3D": np.full(COUNT, FILTER)}
+COLOURS = {name: np.full(COUNT, 51 * i, "u1") for i, name in enumerate(("red", "green", "blue"))}
+
+
+def first(name: str, value: float) -> dict[str, np.ndarray]:
+    """One column, whose first value is another one."""
+    return {name: np.where(ROW > 0, BALL[name], value)}
 
 
 @pytest.mark.parametrize(
-    ("given", "words", "attribute", "expected"),
+    ("change", "words", "attribute", "expected"),
     [
-        ({"opacity": -np.inf}, "opacity: 1 infinite", "opacity", -20),
-        ({"scale_2": -np.inf}, "scale: 1 infinite", "scale", [SIZE, SIZE, -20]),
-        ({"x": np.nan}, "left out 1 of 300 rows: 1 with NaN or infinity, 0", "", None),
-        ({"scale_0": np.inf}, "left out 1 of 300 rows: 1 with NaN", "", None),
-        ("zeros", "left out 1 of 300 rows: 0 with NaN or infinity, 1 with zero rotation", "", None),
-        ("Mip-Splatting", "antialiasing filter", "scale", 0.5 * np.log(FUSED)),
-        ("Mip-Splatting", "", "opacity", logit(sigmoid(4.0) * (0.06**2 / FUSED) ** 1.5)),
-        ("activated", "are activated", "scale", SIZE),
-        ("activated", "", "opacity", 4),
-        ("degree 4", "SH degree 4 is cut to 3", "radiance_sh", 38),  # f_rest_{24 + 14}
-        ("half floats", "", "opacity", 4),
-        ("8 bits", "", "radiance_sh", (0.2 - 0.5) / SH_DC),
+        (first("opacity", -np.inf), "opacity: 1 infinite", "opacity", -20),
+        (first("scale_2", -np.inf), "scale: 1 infinite", "scale", [SIZE, SIZE, -20]),
+        (first("x", np.nan), "left out 1 of 300 rows: 1 with NaN or infinity, 0", "position", BALL["x"][1]),
+        (first("scale_0", np.inf), "left out 1 of 300 rows: 1 with NaN", "position", BALL["x"][1]),
+        (first("rot_0", 0), "left out 1 of 300 rows: 0 with NaN or infinity, 1", "position", BALL["x"][1]),
+        (MIP, "antialiasing filter", "scale", 0.5 * np.log(FUSED)),
+        (MIP, "", "opacity", logit(sigmoid(4.0) * (0.06**2 / FUSED) ** 1.5)),
+        (ACTIVATED, "are activated", "scale", SIZE),
+        (ACTIVATED, "", "opacity", 4),
+        # The last of green: f_rest_{24 + 14}.
+        ({f"f_rest_{i}": np.full(COUNT, i) for i in range(72)}, "SH degree 4 is cut to 3", "radiance_sh", 38),
+        ({name: BALL[name].astype("f2").view("u2") for name in BALL}, "", "opacity", 4),
+        (COLOURS | {f"f_dc_{i}": None for i in range(3)}, "", "radiance_sh", (0.2 - 0.5) / SH_DC),
     ],
 )
 def test_splats_of_others_are_read(
-    given: str | dict[str, float],
+    change: dict[str, np.ndarray | None],
     words: str,
     attribute: str,
     expected: Any,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    columns = changed(given) if isinstance(given, str) else ball_columns(**given)
+    columns = {name: column for name, column in (BALL | change).items() if column is not None}
+    columns = {name: x if x.dtype.kind == "u" else x.astype(np.float32) for name, x in columns.items()}
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
     raw = read_splats(tmp_path / "a.ply").surfels.to_numpy()
-    assert words in capsys.readouterr().err
-    if attribute:
-        value = (
-            raw[attribute][0, -2] if attribute == "radiance_sh" else raw[attribute][0]
-        )  # the last of green
-        np.testing.assert_allclose(value, expected, atol=1e-4)
-    else:
-        np.testing.assert_array_equal(
-            raw["position"], np.stack([columns[name][1:] for name in "xyz"], axis=1)
-        )
+    assert words in capsys.readouterr().err and len(raw["position"]) == COUNT - ("left out" in words)
+    entry = {"radiance_sh": -2, "position": 0}.get(attribute, slice(None))
+    np.testing.assert_allclose(raw[attribute][0, entry], expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("comment", ["SplatRenderMode: {}", "antialiased {}", "train_flags {}"])
-def test_antialiasing_is_said(comment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    values = (
-        ("default", "mip") if "Mode" in comment else ("0", "1") if "ed" in comment else ("", "antialiasing")
-    )
-    for value in values:
-        header = f"comment {comment.format(value)}".encode()
-        (tmp_path / "a.ply").write_bytes(ply_bytes(ball_columns()).replace(b"comment by hand", header))
-        read_splats(tmp_path / "a.ply")
-        assert ("antialiasing filter" in capsys.readouterr().err) == (value == values[1])
+@pytest.mark.parametrize(
+    ("comment", "said"),
+    [
+        ("SplatRenderMode: default", False),
+        ("SplatRenderMode: mip", True),
+        ("antialiased 0", False),
+        ("antialiased 1", True),
+        ("train_flags antialiasing", True),
+    ],
+)
+def test_antialiasing_is_said(
+    comment: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = ply_bytes(BALL).replace(b"by hand", comment.encode())
+    (tmp_path / "a.ply").write_bytes(content)
+    read_splats(tmp_path / "a.ply")
+    assert ("antialiasing filter" in capsys.readouterr().err) == said
 
 
 def pixel(path: Path, light: float | None = None, **given: bool) -> np.ndarray:
@@ -149,7 +139,7 @@ def test_materials_of_others_are_lit(scales: int, tmp_path: Path, capsys: pytest
 def test_compressed_splats_are_converted(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    columns = ball_columns() | {f"f_rest_{i}": np.full(COUNT, 0.5, np.float32) for i in range(45)}
+    columns = BALL | {f"f_rest_{i}": np.full(COUNT, 0.5, np.float32) for i in range(45)}
     content = gaussforge.GaussForge().convert(ply_bytes(columns), "ply", kind)["data"]
     path = tmp_path / (f"a.{kind}" if "splat" in kind else "a.ply")  # others are known by their first bytes
     path.write_bytes(content)
