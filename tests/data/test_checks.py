@@ -16,6 +16,7 @@ from mi_refgs.cli import main
 from mi_refgs.data.checks import Finding, examine, heed
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
+from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png, write_png
 from tests.helpers import refused
 from tests.scenes.layouts import change_transforms
@@ -57,6 +58,10 @@ def write_model(
     return folder
 
 
+def refuse(what: str) -> None:
+    raise InputError(what)
+
+
 def found_in(data: Path) -> dict[str, Finding]:
     return {one.name: one for one in examine(read_dataset(data, "train", truth=False))}
 
@@ -85,13 +90,17 @@ def test_points_are_compared_with_keypoints(
     assert found.numbers["median"] == pytest.approx(median, abs=0.01)
 
 
-def test_contradictory_cameras_are_refused_unless_forced(tmp_path: Path) -> None:
+def test_contradictory_cameras_are_refused_unless_forced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data, said = write_model(tmp_path / "data", turn=lambda i: 0.35 * (i % 2)), list[str]()
     command = train_command(data, tmp_path / "run", write_method(tmp_path))
     refused(command, "sparse/0/images.txt: keypoints: ", "another model's images file", "--force")
     assert not (tmp_path / "run").exists()
     heed([*found_in(data).values()], said.append, force=True)
     assert any("are off by up to" in line for line in said)
+    monkeypatch.setattr("mi_refgs.data.checks.heed", lambda found, warn, force: refuse(f"forced: {force}"))
+    refused([*command, "--force"], "forced: True")
     behind = found_in(write_model(tmp_path / "behind", mirror=-1))["points"]
     assert (behind.level, behind.numbers["share"]) == ("refused", 0.0)
 
