@@ -212,7 +212,7 @@ def image_folder(root: Path, model: Path | None = None) -> tuple[Path, Path]:
     if not found and model is not None:
         found = [(parent, parent) for parent in parents if image_files(parent, deep=False)]
     if not found:
-        raise InputError("no such folder", root, FOLDERS[0], "put the images there")
+        raise InputError("no such folder", root, FOLDERS[0], "put the images there, or give its parent")
     return found[0]
 
 

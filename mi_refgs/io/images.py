@@ -157,7 +157,10 @@ def open_image(path: Path, *formats: str) -> Iterator[Any]:
     except InputError:
         raise
     except Exception as error:  # Pillow raises half a dozen types for broken files
-        raise InputError(f"not a readable image ({error})", path, "pixels", "export it again") from error
+        with path.open("rb") as file:
+            other = file.read(8)[4:] == b"ftyp"
+        what = "a HEIC, AVIF or video file of another name" if other else f"not a readable image ({error})"
+        raise InputError(what, path, "pixels", "export it again, as JPEG or PNG") from error
 
 
 def exif_tags(image: Any) -> tuple[dict[int, Any], dict[int, Any]]:

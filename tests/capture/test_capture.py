@@ -264,6 +264,8 @@ def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
     for name in ("a.jpg", "b.jpg", "c.jpg"):
         (photographs / name).write_bytes(b"0")
     refused(command, "a.jpg: pixels: not a readable image")
+    (photographs / "a.jpg").write_bytes(b"\0\0\0\x24ftypheic" + bytes(99))
+    refused(command, "a.jpg: pixels: a HEIC, AVIF or video file of another name")
     refused([*command, "--camera-model", "PIG"], "unknown lens model")
     refused([*command, "--region", 0, 0, "nan", 1], "--region: centre, radius: not three numbers")
     for name in ("a.jpg", "b.jpg", "c.jpg"):

@@ -76,6 +76,11 @@ def marked(write: Callable[[Path], Path], pattern: str) -> Callable[[Path], None
     return written
 
 
+def letters(folder: Path) -> None:
+    for path in (*(colmap(folder) / "images").iterdir(),):
+        path.rename(path.with_suffix(".Png"))
+
+
 def rigs(folder: Path) -> None:
     for name in ("rigs", "frames"):
         (colmap(folder) / SPARSE / f"{name}.bin").write_bytes(b"\x01")
@@ -87,6 +92,7 @@ FOLDERS: dict[str, tuple[Callable[[Path], Any], str]] = {
                            "sparse/1, of 9 images, is read; 1 smaller models are left out"),
     "COLMAP, folder in the names": (lambda f: colmap(f, "images/{}"), ""),
     "COLMAP, other letters": (lambda f: colmap(f, "{:.1}.PNG"), ""),
+    "COLMAP, other letters of files": (letters, ""),
     "COLMAP, no endings": (lambda f: colmap(f, "{:.1}"), ""),
     "COLMAP, flat": (lambda f: colmap(f, images="", place=""), ""),
     "COLMAP, distorted": (lambda f: colmap(f, images="input", place="distorted/sparse/0"), ""),
