@@ -59,7 +59,7 @@ def write_model(
 
 
 def refuse(what: str) -> None:
-    raise InputError(what)
+    raise InputError(what, "data", "checks", "none")
 
 
 def found_in(data: Path) -> dict[str, Finding]:
