@@ -92,7 +92,8 @@ def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, pro
     """
     run = Run(output)
     if resume:
-        run.require_resumable()
+        if not run.exists():
+            raise InputError("no run to continue", output, "--resume", "leave it out to start one")
         method = run.method()
         views = read_views(method, data, "train", truth=False)
         _require_same(run, method, choice, views)

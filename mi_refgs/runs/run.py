@@ -51,11 +51,6 @@ class Run:
             raise InputError("contains a run already", self.path, remedy=remedy)
         require_own(self.path, RUN)
 
-    def require_resumable(self) -> None:
-        """Raise InputError if there is no run to continue."""
-        if not self.exists():
-            raise InputError("no run to continue", self.path, "--resume", "leave it out to start one")
-
     def alone(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Lock the run for changes; raises BusyError if another process has it locked for `wait` seconds."""
         busy = "another process trains this run or writes it; wait until it ends, or choose another folder"

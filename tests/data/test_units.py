@@ -18,7 +18,7 @@ from mi_refgs.data.survey import survey
 from mi_refgs.fitting.initial import initial_surfels
 from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.fitting.schedule import FitSetup
-from tests.scenes import layouts
+from tests.scenes import dots, layouts
 from tests.scenes.tiny import write_data
 
 SCALES = (1e-6, 3e-3, 1e3, 1e6)
@@ -107,23 +107,22 @@ def test_data_set_is_independent_of_unit_and_origin(place: str, tmp_path: Path) 
     assert not any("one place" in note for note in survey(data)["notes"])
 
 
-def test_points_of_far_reconstruction_are_shifted_with_cameras(tmp_path: Path) -> None:
+class FarShot(dots.Shot):
+    """A camera that was moved with the points, far away."""
+
+    @property
+    def translation(self) -> np.ndarray:
+        return super().translation - self.rotation @ UTM
+
+
+def test_points_of_far_reconstruction_are_shifted_with_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They move with the cameras, before anything is float32."""
-    near = read_dataset(layouts.write_colmap(tmp_path / "near", "txt"), "train")
-    data = layouts.write_colmap(tmp_path / "far", "txt")
-    images, points = data / "sparse/0/images.txt", data / "sparse/0/points3D.txt"
-    lines = images.read_text().splitlines()
-    for i, shot in enumerate(layouts.SHOTS):
-        words = lines[1 + 2 * i].split()
-        words[5:8] = map(repr, (shot.translation - shot.rotation @ UTM).tolist())
-        lines[1 + 2 * i] = " ".join(words)
-    images.write_text("\n".join(lines) + "\n")
-    lines = points.read_text().splitlines()
-    for i, line in enumerate(lines[2:], 2):
-        words = line.split()
-        words[1:4] = map(repr, (np.array(words[1:4], float) + UTM).tolist())
-        lines[i] = " ".join(words)
-    points.write_text("\n".join(lines) + "\n")
+    data = layouts.write_colmap(tmp_path, "txt")
+    near = read_dataset(data, "train")
+    monkeypatch.setattr(layouts, "POINTS", layouts.POINTS + UTM)
+    layouts.write_text(data / "sparse/0", [FarShot(**vars(shot)) for shot in layouts.SHOTS])
     moved = read_dataset(data, "train")
     assert moved.points is not None and near.points is not None
     rest = UTM - moved.offset
