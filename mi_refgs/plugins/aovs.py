@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -25,30 +23,18 @@ def suffixes() -> dict[str, str]:
     return materials | geometry | dict.fromkeys(TERMS, "RGB")
 
 
-@dataclass(frozen=True)
-class AOV:
-    """One requested variable: its layer name in the image, and one of `suffixes`."""
-
-    name: str
-    type: str
-
-    def channels(self) -> list[str]:
-        """Names of the image channels, such as `n.X`, `n.Y`, `n.Z`."""
-        return [f"{self.name}.{suffix}" for suffix in suffixes()[self.type]]
-
-
-def parse_aovs(text: str) -> list[AOV]:
-    """Parse a comma-separated list of `name:type`; InputError for a bad pair, type or repeated name."""
-    aovs: list[AOV] = []
+def parse_aovs(text: str) -> dict[str, str]:
+    """Types, of `suffixes`, by layer name of a comma-separated list of `name:type`; else InputError."""
+    aovs: dict[str, str] = {}
     for pair in filter(None, (part.strip() for part in text.split(","))):
         name, colon, kind = (part.strip() for part in pair.partition(":"))
         if not colon or not name:
             raise InputError(f"'{pair}' is not a <name>:<type> pair", "refgs", "aovs", "write 'nn:normal'")
         if kind not in suffixes():
             raise InputError(f"unknown type '{kind}'", "refgs", "aovs", f"use one of {', '.join(suffixes())}")
-        if any(name == other.name for other in aovs):
+        if name in aovs:
             raise InputError(f"the name '{name}' occurs twice", "refgs", "aovs", "rename one of them")
-        aovs.append(AOV(name, kind))
+        aovs[name] = kind
     return aovs
 
 

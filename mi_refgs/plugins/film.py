@@ -13,13 +13,12 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import children_of
 from mi_refgs.kernels.memory import DERIVATIVE_SAMPLES, require_image
+from mi_refgs.plugins.aovs import aov_values
+from mi_refgs.render.display import composited
 from mi_refgs.render.passes import Band, bands
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.splat.camera import Camera
-
-Channels = Callable[[Frame, Camera, bool], list[Any]]
-"""R, G, B, (A), the weight and the AOVs of a frame, of width N or 1; the last argument: with alpha or not."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,8 @@ class FilmImage:
     sensor: Any
     spp: int  # see `render.samples`; 0: that of the sampler
     view: Callable[[Camera], Frame]
-    channels: Channels
-    aovs: list[str]  # names of the channels beyond the weight
+    types: list[str]  # of AOVs, see `plugins.aovs`
+    aovs: list[str]  # names of their channels
     neighbours: int  # see `Shading`
     surfels: int
 
@@ -128,7 +127,14 @@ class FilmImage:
         # Attached anew in each pass: a traversal removes the graph from the sensor to its camera.
         camera = band.camera.attached(sensor)
         frame = supersampled(self.view, camera, self._samples)
-        made = self.channels(frame, camera, self._alpha)
+        rgb, coverage = composited(frame)
+        more = [value for aov in self.types for value in aov_values(aov, frame, camera)]
+        made = [
+            *rgb,
+            *([coverage] if self._alpha else []),
+            mi.Float(1),
+            *more,
+        ]  # as the film's blocks have them
         pixels = dr.zeros(mi.Float, camera.width * camera.height)
         return dr.ravel(mi.ArrayXf([band.kept(channel + pixels) for channel in made]))
 

@@ -16,12 +16,11 @@ from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.plugins import properties
-from mi_refgs.plugins.aovs import aov_values
+from mi_refgs.plugins.aovs import parse_aovs, suffixes
 from mi_refgs.plugins.derivatives import require_derivatives
 from mi_refgs.plugins.film import FilmImage
 from mi_refgs.plugins.light import light_of, used_emitters, warn_of_ignored
 from mi_refgs.plugins.properties import BackgroundProperties
-from mi_refgs.render.display import composited
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.ambient import update_occluder_caches
@@ -101,14 +100,13 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         if not props.id():
             self.set_id("refgs")  # an address otherwise, and with it every parameter's key
         self.surfels = properties.read_surfels(props)
-        self.light, self.light_to_world = properties.read_light(props)
-        self.near = properties.read_near_field(props)
+        self.light, self.light_to_world, self.near = properties.read_light(props)
         self.seen = 0  # id of the scene whose ignored emitters and shapes were named
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
         self.shading, self.occluder = properties.read_shading(props, self.surfels)
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
         self.background = BackgroundProperties.read(props)
-        self.aovs = properties.read_aovs(props)
+        self.aovs = parse_aovs(str(properties.get(props, "aovs", "")))
         self.check()
         self.changed, self.next_check = False, 0.0  # since the last check; seconds of the monotonic clock
         self._warn_of_unusable()
@@ -118,8 +116,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
         primitive_of(self.surfels.raw)
         self.shading.require_inputs(self.surfels.raw, mesh=self.occluder is not None)
-        for name in (aov.type for aov in self.aovs if aov.type in ATTRIBUTES):
-            if not self.surfels.has(name):
+        for name in self.aovs.values():
+            if name in ATTRIBUTES and not self.surfels.has(name):
                 raise InputError("the surfels have no such attribute", "refgs", name, "add it, or do without")
         if self.background.surfels is not None:
             Surroundings(Surfels(self.background.surfels.raw)).check(self.surfels)
@@ -158,7 +156,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             self.caches_valid = False
 
     def aov_names(self) -> list[str]:
-        return [channel for aov in self.aovs for channel in aov.channels()]
+        return [f"{name}.{suffix}" for name, kind in self.aovs.items() for suffix in suffixes()[kind]]
 
     # ---------------- rendering ----------------
 
@@ -214,16 +212,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             raise InputError(what, "refgs", "dr.freeze", "call mi.render outside of the frozen function")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         require_derivatives(params, scene, sensor, self)
-        request = Request({aov.type for aov in self.aovs}, forward_only)
+        request = Request({*self.aovs.values()}, forward_only)
         view = partial(self.frame, scene, request)
         names, count = self.aov_names(), sum(model.count for model in self._models.values())
-        return FilmImage(sensor, spp, view, self._channels, names, self.shading.neighbours, count)
-
-    def _channels(self, frame: Frame, camera: Camera, alpha: bool) -> list[Any]:
-        """R, G, B, (A), W and the AOVs, as the film's blocks have them."""
-        rgb, coverage = composited(frame)
-        more = [value for aov in self.aovs for value in aov_values(aov.type, frame, camera)]
-        return [*rgb, *([coverage] if alpha else []), mi.Float(1), *more]
+        return FilmImage(sensor, spp, view, [*self.aovs.values()], names, self.shading.neighbours, count)
 
     def frame(self, scene: Any, request: Request, camera: Camera) -> Frame:
         """Render one sample per pixel."""

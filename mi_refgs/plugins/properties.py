@@ -10,7 +10,6 @@ import mitsuba as mi
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.plugins.aovs import AOV, parse_aovs
 from mi_refgs.plugins.light import own_light
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.surroundings import Surroundings, nothing_around
@@ -28,32 +27,28 @@ from mi_refgs.types import Color3f
 AROUND = "surroundings_"  # prefix of the parameters of the surroundings' surfels
 
 
-def _get(props: Any, name: str, default: Any) -> Any:
+def get(props: Any, name: str, default: Any) -> Any:
     try:
         return props.get(name, default)
     except UnicodeError as error:
         raise InputError("not UTF-8", "refgs", name, "save the scene as UTF-8") from error
 
 
-def read_aovs(props: Any) -> list[AOV]:
-    return parse_aovs(str(_get(props, "aovs", "")))
-
-
 def _path(props: Any, name: str) -> str | None:
     """A file property, which Mitsuba resolves beside the XML only while it constructs plugins."""
-    value = _get(props, name, None)
+    value = get(props, name, None)
     return None if value is None else str(mi.file_resolver().resolve(str(value)))
 
 
 def _choice(props: Any, name: str, default: str, options: tuple[str, ...]) -> Any:
-    value = str(_get(props, name, default))
+    value = str(get(props, name, default))
     if value not in options:
         raise InputError(f"'{value}' is unknown", "refgs", name, f"use {' or '.join(options)}")
     return value
 
 
 def _tensor(props: Any, name: str) -> Any:
-    value = _get(props, name, None)
+    value = get(props, name, None)
     if value is None:
         return None
     try:
@@ -120,7 +115,7 @@ class BackgroundProperties:
 
 def _behind(props: Any) -> Any:
     """What is behind everything: mi.Color3f, an EnvironmentLight, or None for transparency."""
-    value = _get(props, "background", None)
+    value = get(props, "background", None)
     if isinstance(value, str):
         return EnvironmentLight.from_file(_path(props, "background") or "")
     try:
@@ -134,21 +129,18 @@ def _behind(props: Any) -> Any:
         raise InputError(found, "refgs", "background", "give an rgb value or a map") from error
 
 
-def read_light(props: Any) -> tuple[Any, Any]:
-    """Read the integrator's own EnvironmentLight, or None, and its `to_world` (see `own_light`)."""
+def read_light(props: Any) -> tuple[Any, Any, NearField | None]:
+    """Read the integrator's own EnvironmentLight, or None, its `to_world` (see `own_light`), and the
+    distances of what it shows; None: infinitely far."""
+    path = _path(props, "near_field")
+    near = None if path is None else NearField.read(path)
     emitters = [child for _, child in props.objects() if isinstance(child, mi.Emitter)]
     if len(emitters) > 1:
         raise InputError("two emitters are nested in the integrator", "refgs", "light", "keep one")
     if emitters:
-        return own_light(emitters[0])
+        return *own_light(emitters[0]), near
     raw = _tensor(props, "light")
-    return None if raw is None else EnvironmentLight(raw), mi.Transform4f()
-
-
-def read_near_field(props: Any) -> NearField | None:
-    """Read the distances of what the light shows; None: infinitely far."""
-    path = _path(props, "near_field")
-    return None if path is None else NearField.read(path)
+    return None if raw is None else EnvironmentLight(raw), mi.Transform4f(), near
 
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
@@ -158,7 +150,7 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
     shading = Shading(at, reflectance, diffuse)
-    occlusion = _get(props, "occlusion", mesh is not None and shading.traceable)
-    quality = {name: _get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
+    occlusion = get(props, "occlusion", mesh is not None and shading.traceable)
+    quality = {name: get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
     shading = replace(shading, occlusion=occlusion, **quality)
     return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None
