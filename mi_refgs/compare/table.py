@@ -29,12 +29,6 @@ class Statistic:
     sd: float | None
     values: tuple[float, ...]
 
-    @staticmethod
-    def of(values: Sequence[float]) -> Statistic:
-        """Return the statistic of at least one value."""
-        sd = statistics.stdev(values) if len(values) > 1 else None
-        return Statistic(statistics.fmean(values), sd, tuple(map(float, values)))
-
 
 @dataclass
 class Row:
@@ -148,7 +142,8 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
     for column in COLUMNS:
         values = [m[column.key] for m in found]
         if values and all(value is not None for value in values):
-            row.numbers[column.key] = Statistic.of(values)
+            sd = statistics.stdev(values) if len(values) > 1 else None
+            row.numbers[column.key] = Statistic(statistics.fmean(values), sd, tuple(map(float, values)))
             continue
         row.numbers[column.key] = None
         reasons = [m.get(f"{column.reason}_reason") for m in found if m[column.key] is None]

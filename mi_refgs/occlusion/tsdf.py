@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +21,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.splat.camera import Camera
-from mi_refgs.types import Bool, Float, Int32, TensorXf
+from mi_refgs.types import Bool, Float, Int32
 
 ALPHA_SOLID = 0.5  # opacity from which a pixel has a surface: a box filter's silhouette
 TRUNCATION_VOXELS = 5.0  # of the signed distance. [Ref-Gaussian's released extraction; 2DGS, §6]
@@ -59,8 +58,8 @@ def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fuse(
-    depths: Iterable[Any],
-    alphas: Iterable[Any],
+    depths: Iterable[Float],
+    alphas: Iterable[Float],
     cameras: Iterable[Camera],
     bounds: tuple[np.ndarray, np.ndarray],
     resolution: int,
@@ -68,15 +67,11 @@ def fuse(
     """Fuse depth maps into a signed distance field over `bounds`. [Curless and Levoy 1996; weights behind the
     surface: Bylow et al. 2013]
 
-    `resolution`: voxels along the longest side. Depths (expected camera z, scene units) and alphas are
-    `mi.Float` or `mi.TensorXf` in raster order, read once; alpha < ALPHA_SOLID is free space. Detached.
-    Raises InputError for an empty box or a resolution that does not fit.
-    """
+    `resolution`: voxels along the longest side. Depths (expected camera z, scene units) and alphas, in
+    raster order, are read once; alpha < ALPHA_SOLID is free space. Detached. Raises InputError for a
+    resolution that does not fit."""
     lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
     extent = hi - lo
-    if not (np.all(np.isfinite(extent)) and np.all(extent > 0)):
-        what = f"box from {lo} to {hi} has no volume"
-        raise InputError(what, "tsdf", "bounds", "give lo < hi on every axis")
     if not 2 <= resolution <= RESOLUTION_MAX:
         what = f"{resolution} is outside 2..{RESOLUTION_MAX}"
         raise InputError(what, "tsdf", "resolution", "choose 64 to 256")
@@ -85,15 +80,8 @@ def fuse(
     with dr.suspend_grad():
         grid = _Grid(shape, lo, voxel)
         for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
-            grid.integrate(_flat(depth, camera), _flat(alpha, camera), camera)
+            grid.integrate(depth, alpha, camera)
         return TSDF(grid.volume().reshape(shape), lo, voxel)
-
-
-def _flat(image: Float | TensorXf, camera: Camera) -> Float:
-    values = image.array if isinstance(image, mi.TensorXf) else mi.Float(image)
-    if dr.width(values) != camera.width * camera.height:
-        raise ValueError(f"{dr.width(values)} values for an image of {camera.width}x{camera.height} pixels")
-    return values
 
 
 class _Grid:

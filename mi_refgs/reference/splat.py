@@ -77,11 +77,6 @@ class Blend:
         given, found = (tables, camera, rules, order, x, y), (sample, culled, alpha, z)
         return Blend(*given, *found, before, after, alive, shown, weight)
 
-    def sums(self, features: Array) -> Array:
-        """Maps (P, K + 2): features (N, K), depth, alpha."""
-        depth, alpha = np.sum(self.weight * self.z, 0), self.weight.sum(0)
-        return np.concatenate([self.weight.T @ features, depth[:, None], alpha[:, None]], axis=1)
-
     def band(self, width: float) -> Array:
         """Pixels (P,) with a declared discontinuity within this relative distance."""
         rules, z = self.rules, self.sample.z.real
@@ -97,7 +92,8 @@ class Blend:
         return found
 
     def adjoint(self, features: Array, δsums: Array) -> tuple[dict[str, Array], Array]:
-        """Derivatives of Σ δsums · sums by raw channels of the one table, and by features (N, K)."""
+        """Derivatives of Σ δsums · sums by raw channels of the one table, and by features (N, K); sums
+        (P, K + 2): of features, depth, alpha."""
         (raw,) = self.tables
         value = features @ δsums[:, :-2].T + self.z * δsums[:, -2] + δsums[:, -1]
         part = np.take_along_axis(self.weight * value, self.order, 0)
@@ -119,8 +115,9 @@ class Blend:
 def splat(raw: Raw, features: Array, camera: PinholeCamera, band: float = 1e-3) -> Maps:
     """Render raw channels with features (N, K); `band` is the relative width of the declared band."""
     blend, shape = _whole_image(raw, camera), (camera.height, camera.width)
-    sums = blend.sums(features).reshape(*shape, -1)
-    return Maps(sums[..., :-2], sums[..., -2], sums[..., -1], blend.band(band).reshape(shape))
+    maps = np.sum(blend.weight * blend.z, 0), blend.weight.sum(0), blend.band(band)
+    depth, alpha, near = (plane.reshape(shape) for plane in maps)
+    return Maps((blend.weight.T @ features).reshape(*shape, -1), depth, alpha, near)
 
 
 def differentiate(raw: Raw, features: Array, camera: PinholeCamera, weights: Array) -> dict[str, Array]:

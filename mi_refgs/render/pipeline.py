@@ -121,7 +121,13 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     require_supported_variant("mi_refgs.render_frame")
     primitive_of(scene.surfels.raw)
     scene.shading.require_inputs(scene.surfels.raw, scene.light is not None, scene.occluder is not None)
-    view = _View.of(*_without_empty_tables(scene.lit_for(camera), request), camera)
+    around, count = scene.surroundings, scene.surfels.count
+    if not count or (around is not None and not around.surfels.count):
+        request = replace(request, attribution=None)  # is nobody's
+    if around is not None:
+        around = replace(around, surfels=around.surfels.never_empty())
+    scene = replace(scene.lit_for(camera), surfels=scene.surfels.never_empty(), surroundings=around)
+    view = _View.of(scene, request, camera)
     frame = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
     return boundary(frame, "shade backward")
 
@@ -132,17 +138,6 @@ def render_depth(
     """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with their surroundings."""
     blended = splat(surfels if surroundings is None else (surfels, surroundings), [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
-
-
-def _without_empty_tables(scene: SurfelScene, request: Request) -> tuple[SurfelScene, Request]:
-    """The scene with `Surfels.never_empty`; an attribution is then nobody's."""
-    surfels, surroundings = scene.surfels, scene.surroundings
-    if surfels.count and (surroundings is None or surroundings.surfels.count):
-        return scene, request
-    if surroundings is not None:
-        surroundings = replace(surroundings, surfels=surroundings.surfels.never_empty())
-    scene = replace(scene, surfels=surfels.never_empty(), surroundings=surroundings)
-    return scene, replace(request, attribution=None)
 
 
 @dataclass(frozen=True)

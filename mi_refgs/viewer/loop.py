@@ -25,18 +25,11 @@ from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
 from mi_refgs.viewer.viewer_scene import DisplayOptions, displayed_planes
 
 
-@dataclass(frozen=True, eq=False)
-class DeliveredImage:
-    image: np.ndarray  # (H, W, 3) uint8
-    progress: int  # from resolution.COARSE to resolution.DONE
-    seconds: float  # of its last sample
-
-
 @dataclass(eq=False)
 class Client:
     """An open page: its view, and the progress of its image."""
 
-    deliver: Callable[[DeliveredImage], None]
+    deliver: Callable[[np.ndarray, int, float], None]  # (H, W, 3) uint8, COARSE … DONE, seconds of a sample
     pose: Pose | None = None
     window: tuple[int, int] = (0, 0)  # pixels
     side: int = resolution.COARSEST  # resolution level of the next image during motion
@@ -165,4 +158,4 @@ class RenderLoop:
                 return
         if shown is not None:
             self.delivered += 1
-            client.deliver(DeliveredImage(to_8_bits(shown), progress, taken))
+            client.deliver(to_8_bits(shown), progress, taken)

@@ -13,10 +13,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.formats.orbits import FIELD_OF_VIEW, shots_around
-from mi_refgs.viewer.loop import Client, DeliveredImage, RenderLoop
+from mi_refgs.viewer.loop import Client, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, COARSEST, DONE
@@ -121,19 +123,16 @@ class Page:
     async def _left(self, client: Any) -> None:
         self.loop.clients.pop(client.client_id, None)
 
-    def _deliver(self, client: Any, shown: DeliveredImage) -> None:
-        client.scene.set_background_image(
-            shown.image,
-            format="png" if shown.progress == DONE else "jpeg",
-            jpeg_quality=70 if shown.progress == COARSE else 92,
-        )
+    def _deliver(self, client: Any, image: np.ndarray, progress: int, seconds: float) -> None:
+        form, quality = "png" if progress == DONE else "jpeg", 70 if progress == COARSE else 92
+        client.scene.set_background_image(image, format=form, jpeg_quality=quality)
         client.flush()
         now = time.monotonic()
-        if shown.progress == DONE or now - self._told > STATUS_INTERVAL:
+        if progress == DONE or now - self._told > STATUS_INTERVAL:
             self._told = now
-            height, width = shown.image.shape[:2]
-            samples = max(shown.progress - COARSE, 1)
-            self.status(f"{width} × {height}, {samples} per pixel, {1000 * shown.seconds:.0f} ms")
+            height, width = image.shape[:2]
+            samples = max(progress - COARSE, 1)
+            self.status(f"{width} × {height}, {samples} per pixel, {1000 * seconds:.0f} ms")
 
     def close(self) -> None:
         with contextlib.redirect_stdout(io.StringIO()):

@@ -138,8 +138,7 @@ def test_nothing_seen_is_an_empty_mesh() -> None:
     """All-background, NaN depth, and no views at all."""
     poses = ring_of_views(directions(2))
     for value in (0.0, np.nan, np.inf):
-        depth = mi.TensorXf(np.full((SIZE, SIZE), value, np.float32))
-        alpha = mi.TensorXf(np.full((SIZE, SIZE), 1.0 if value else 0.0, np.float32))
+        depth, alpha = (dr.full(mi.Float, x, SIZE * SIZE) for x in (value, 1.0 if value else 0.0))
         fused = tsdf.fuse([depth] * 2, [alpha] * 2, [camera(p) for p in poses], BOX, 16)
         assert np.isfinite(fused.volume).all()
         assert len(meshes.extract_mesh(fused).faces) == 0
@@ -181,8 +180,7 @@ def test_bounds_ignore_floaters_but_keep_thin_ends() -> None:
     refused(lambda: tsdf.bounds_from_points(np.full((4, 3), np.nan)), "position")
 
 
-def test_bad_arguments() -> None:
-    refused(lambda: tsdf.fuse([], [], [], (np.zeros(3), np.zeros(3)), 32), "no volume")
+def test_a_resolution_that_does_not_fit_is_refused() -> None:
     refused(lambda: tsdf.fuse([], [], [], BOX, 4096), "resolution")
 
 
