@@ -10,6 +10,7 @@ import socket
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,7 @@ class Page:
         self.server.on_client_disconnect(self._left)
 
     async def _connected(self, client: Any) -> None:
-        new = Client(lambda shown: self._deliver(client, shown), side=self.moving_side)
+        new = Client(partial(self._deliver, client), side=self.moving_side)
         self.loop.clients[client.client_id] = new
         near = self.views[0].near if self.views else 0.0
 
