@@ -20,9 +20,8 @@ from mi_refgs.plugins.aovs import parse_aovs, suffixes
 from mi_refgs.plugins.derivatives import require_derivatives
 from mi_refgs.plugins.film import FilmImage
 from mi_refgs.plugins.light import light_of, used_emitters, warn_of_ignored
-from mi_refgs.plugins.properties import BackgroundProperties
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
@@ -105,7 +104,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
         self.shading, self.occluder = properties.read_shading(props, self.surfels)
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
-        self.background = BackgroundProperties.read(props)
+        self.around, self.behind = properties.read_background(props)
         self.aovs = parse_aovs(str(properties.get(props, "aovs", "")))
         self.check()
         self.changed, self.next_check = False, 0.0  # since the last check; seconds of the monotonic clock
@@ -119,8 +118,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         for name in self.aovs.values():
             if name in ATTRIBUTES and not self.surfels.has(name):
                 raise InputError("the surfels have no such attribute", "refgs", name, "add it, or do without")
-        if self.background.surfels is not None:
-            Surroundings(Surfels(self.background.surfels.raw)).check(self.surfels)
+        if self.around is not None:
+            Surroundings(Surfels(self.around.raw)).check(self.surfels)
         for name, light in self._maps.items():
             try:
                 EnvironmentLight(light.raw)  # checks the shape, which an update may have changed
@@ -129,21 +128,33 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     @property
     def _models(self) -> dict[str, Surfels]:
-        models = {"surfels": self.surfels, "surroundings": self.background.surfels}
+        models = {"surfels": self.surfels, "surroundings": self.around}
         return {name: model for name, model in models.items() if model is not None}
 
     @property
     def _maps(self) -> dict[str, EnvironmentLight]:
-        maps = {"light": self.light, "background": self.background.map}
-        return {name: found for name, found in maps.items() if found is not None}
+        maps = {"light": self.light, "background": self.behind}
+        return {name: found for name, found in maps.items() if isinstance(found, EnvironmentLight)}
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """What is splatted together with the object's surfels, and the map; None without both."""
+        if self.around is None and "background" not in self._maps:
+            return None
+        around = nothing_around(self.surfels) if self.around is None else self.around
+        return Surroundings(Surfels(around.raw, screened=True), self._maps.get("background"))
 
     # ---------------- parameters ----------------
 
     def traverse(self, cb: Any) -> None:
-        light: dict[str, Any] = {}
+        own: dict[str, Any] = dict(self.surfels.raw)
         if self.light is not None:
-            light = {"light": self.light.raw, "light_to_world": self.light_to_world}
-        for name, tensor in {**self.surfels.raw, **light, **self.background.parameters()}.items():
+            own |= {"light": self.light.raw, "light_to_world": self.light_to_world}
+        if self.around is not None:
+            own |= {properties.AROUND + name: tensor for name, tensor in self.around.raw.items()}
+        if "background" in self._maps:
+            own["background"] = self.behind.raw
+        for name, tensor in own.items():
             cb.put(name, tensor, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
@@ -225,10 +236,10 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             # Mitsuba does not announce changes of the scene's light, on which ambient ratios depend.
             self.caches_valid = self.light is not None or not self.shading.ambient_rays
         surfels = Surfels(self.surfels.raw, screened=True)
-        surroundings = self.background.splatted(self.surfels)
-        rendered = SurfelScene(surfels, self.shading, light, self.occluder, surroundings, self.near)
+        rendered = SurfelScene(surfels, self.shading, light, self.occluder, self.surroundings, self.near)
         frame = render(rendered, camera, request)
-        return replace(frame.only(request.aovs), background=self.background.behind(frame))
+        behind = frame.background if "background" in self._maps else self.behind
+        return replace(frame.only(request.aovs), background=behind)
 
     def _light(self, scene: Any, forward_only: bool) -> Light | None:
         """The light as the shading looks it up; its own is filtered once for images without derivatives."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -11,8 +11,6 @@ from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins.light import own_light
-from mi_refgs.render.pipeline import Frame
-from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.options import DIFFUSE, QUALITY, ShadingOptions
@@ -22,7 +20,6 @@ from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.primitives.primitive import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Color3f
 
 AROUND = "surroundings_"  # prefix of the parameters of the surroundings' surfels
 
@@ -78,50 +75,19 @@ def _attributes(props: Any, file: str, prefix: str) -> dict[str, Any]:
     return raw | {name: value for name, value in given.items() if value is not None}
 
 
-@dataclass(frozen=True)
-class BackgroundProperties:
-    """What the integrator shows around and behind the object: surfels, and a colour or a map."""
-
-    surfels: Surfels | None = None  # splatted together with the object's
-    colour: Color3f = None  # behind everything; transparent without a colour and a map
-    map: EnvironmentLight | None = None
-
-    @staticmethod
-    def read(props: Any) -> BackgroundProperties:
-        behind = _behind(props)
-        colour, light = (None, behind) if isinstance(behind, EnvironmentLight) else (behind, None)
-        raw = _attributes(props, "surroundings", AROUND)
-        names = {"radiance_sh", *(n for primitive in PRIMITIVES.values() for n in primitive.widths)}
-        around = Surfels({n: tensor for n, tensor in raw.items() if n in names}) if raw else None
-        return BackgroundProperties(around, colour, light)
-
-    def parameters(self) -> dict[str, Any]:
-        """Raw tensors by the names of the integrator's parameters."""
-        raw = {} if self.surfels is None else self.surfels.raw
-        found = {AROUND + name: tensor for name, tensor in raw.items()}
-        return found if self.map is None else {**found, "background": self.map.raw}
-
-    def splatted(self, surfels: Surfels) -> Surroundings | None:
-        """What is splatted together with the object's surfels, and the map; None without both."""
-        if self.surfels is None and self.map is None:
-            return None
-        around = nothing_around(surfels) if self.surfels is None else self.surfels
-        return Surroundings(Surfels(around.raw, screened=True), self.map)
-
-    def behind(self, frame: Frame) -> Color3f:
-        """Radiance behind everything; None where that is transparent."""
-        return frame.background if self.map is not None else self.colour
-
-
-def _behind(props: Any) -> Any:
-    """What is behind everything: mi.Color3f, an EnvironmentLight, or None for transparency."""
+def read_background(props: Any) -> tuple[Surfels | None, Any]:
+    """Read the surfels around the object, or None, and what is behind everything: an EnvironmentLight,
+    mi.Color3f, or None for transparency."""
+    raw = _attributes(props, "surroundings", AROUND)
+    names = {"radiance_sh", *(n for primitive in PRIMITIVES.values() for n in primitive.widths)}
+    around = Surfels({n: tensor for n, tensor in raw.items() if n in names}) if raw else None
     value = get(props, "background", None)
     if isinstance(value, str):
-        return EnvironmentLight.from_file(_path(props, "background") or "")
+        return around, EnvironmentLight.from_file(_path(props, "background") or "")
     try:
         if getattr(value, "ndim", 0) == 3:
-            return EnvironmentLight(mi.TensorXf(value))
-        return None if value is None else mi.Color3f(value)
+            return around, EnvironmentLight(mi.TensorXf(value))
+        return around, None if value is None else mi.Color3f(value)
     except InputError:
         raise
     except Exception as error:

@@ -12,7 +12,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.plugins.light import light_of, used_emitters
-from mi_refgs.render.surroundings import Surroundings, nothing_around
+from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, EnvironmentLight
 from mi_refgs.shade.light.latlong import lat_long
@@ -47,9 +47,8 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     if isinstance(seen, RotatedLight) or (light is None and seen is not None):
         height = DEFAULT_HEIGHT if light is None else light.height
         light = EnvironmentLight.from_radiance(lat_long(seen.radiance, height))
-    around, behind = integrator.background.surfels, integrator.background.map
-    if behind is not None or around is not None:
-        around = Surroundings((around or nothing_around(integrator.surfels)).detach(), behind)
+    if (around := integrator.surroundings) is not None:
+        around = Surroundings(Surfels(around.surfels.raw).detach(), around.background)
     return TrainedScene(
         integrator.surfels.detach(),
         None if light is None else EnvironmentLight(dr.detach(light.raw)),

@@ -183,8 +183,7 @@ class Losses:
         of = self.scene.integrator()
         camera = Camera.from_sensor(self.scene.sensors()[0])
         light = of.shading.light_of(of.light)
-        around = of.background.splatted(of.surfels)
-        frame = render(SurfelScene(of.surfels, of.shading, light, of.occluder, around), camera)
+        frame = render(SurfelScene(of.surfels, of.shading, light, of.occluder, of.surroundings), camera)
         weight = self.weight.array
         values = [*frame.radiance, frame.alpha, frame.depth]
         rows = dr.arange(mi.UInt32, dr.width(frame.alpha))
