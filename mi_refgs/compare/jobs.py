@@ -87,7 +87,7 @@ def plan(
     folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], shared: Shared
 ) -> list[Job]:
     """Plan and check the jobs of a comparison; seeds vary slowest. Raises InputError for data without test
-    views, methods that do not load, equal names, and existing runs with other settings."""
+    views, methods that do not load, equal names, and a comparison or runs with other settings."""
     for option, names, remedy in (
         ("DATA", [absolute(path).name for path in data], "give the folders different names"),
         ("--methods", [Path(method).stem for method in methods], "name each once"),
@@ -106,7 +106,11 @@ def plan(
         run = str(folder.resolve() / RUNS / path.name / Path(method).stem / f"seed{seed}")
         variant = str(Path(method).resolve()) if method.endswith(".toml") else method
         jobs.append(Job(folder=run, data=str(path), variant=variant, seed=seed, **vars(shared)))
-    require_settings(folder, shared)
+    before = settings_of(folder)
+    for option, now in (("preset", shared.preset), ("set", list(shared.settings))):
+        if (then := before.get(option, now)) != now:
+            what = f"the comparison was begun with {then}, not {now}"
+            raise InputError(what, folder / SETTINGS, f"--{option}", "repeat that, or choose another -o")
     _require_test_views(folder, jobs)
     for job in jobs:
         require_same(job)
@@ -160,15 +164,6 @@ def require_one_size(where: str, sizes: Mapping[str, list[int]], remedy: str) ->
     if len(named) > 1:
         each = ", ".join(f"{name} with {size[0]} × {size[1]} pixels" for size, name in named.items())
         raise InputError(f"{each}: scores of different sizes do not compare", where, "image sizes", remedy)
-
-
-def require_settings(folder: Path, shared: Shared) -> None:
-    """Raise InputError if `folder` has a comparison with another preset or other settings."""
-    before = settings_of(folder)
-    for option, now in (("preset", shared.preset), ("set", list(shared.settings))):
-        if (then := before.get(option, now)) != now:
-            what = f"the comparison was begun with {then}, not {now}"
-            raise InputError(what, folder / SETTINGS, f"--{option}", "repeat that, or choose another -o")
 
 
 def require_same(job: Job) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any, Unpack
 
 from mi_refgs.editing.change import Assignment, apply, assignments
@@ -15,18 +15,10 @@ from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 
 
-@dataclass(frozen=True, eq=False)
-class Edited:
-    """A scene after an edit."""
-
-    scene: TrainedScene
-    notes: tuple[str, ...]  # for the user: what stayed as fitted, which light is kept
-    record: dict[str, Any]  # for JSON: the options given, `selected` surfels `of` so many, `surfels` now
-
-
-def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
-    """Change surfels of a scene; with `materials`, the light stays that of the photographs. Raises InputError
-    for bad values, an unknown option, an empty selection, and if there is nothing to do."""
+def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> tuple[TrainedScene, dict[str, Any]]:
+    """Change surfels of a scene; with `materials`, the light stays that of the photographs. The record, for
+    JSON, has the options given, `selected` surfels `of` so many, `surfels` now, and `notes` for the user.
+    Raises InputError for bad values, an unknown option, an empty selection, and if there is nothing to do."""
     known = EditOptions.__annotations__
     for name in options.keys() - known:
         raise InputError("unknown option", "edit", name, f"use some of {', '.join(known)}")
@@ -45,7 +37,7 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> Edited:
     used = {name: value for name, value in (vars(selection) | vars(change)).items() if value is not None}
     record = json.loads(json.dumps(used, default=lambda x: x.tolist()))  # arrays and tuples as lists
     record = {name: value for name, value in record.items() if value}
-    return Edited(changed, tuple(notes), {**record, **counts, "notes": notes})
+    return changed, {**record, **counts, "notes": notes}
 
 
 def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list[str]:

@@ -20,11 +20,6 @@ def at_least(low: float) -> Metadata:
     return {"allowed": (lambda value: low <= value < math.inf, f"{low:,} or more")}
 
 
-def more_than(low: float) -> Metadata:
-    """Metadata of a finite number above `low`."""
-    return {"allowed": (lambda value: low < value < math.inf, f"more than {low:g}")}
-
-
 def between(low: float, high: float) -> Metadata:
     """Metadata of a number from `low` to `high`, both included."""
     return {"allowed": (lambda value: low <= value <= high, f"a number from {low:g} to {high:g}")}

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.methods.extensions import EVENTS, INITIALISERS, LOSSES, Event
-from mi_refgs.methods.fields import FLAT, ITERATIONS, Window, at_least, between, by_kind, by_name, more_than
+from mi_refgs.methods.fields import FLAT, ITERATIONS, Window, at_least, between, by_kind, by_name
 from mi_refgs.registry import load_again
 from mi_refgs.shade.light.kind import LIGHTS, LightKind
 from mi_refgs.shade.options import ShadingOptions
@@ -54,7 +54,7 @@ class SurfelOptions:
     # Densification stops at this number, times `capacity`.
     max_count: int = field(default=40_000, metadata=at_least(1))
     # Factor of `max_count`; a decision that raises it fills the room at once.
-    capacity: float = field(default=1.0, metadata=more_than(0))
+    capacity: float = field(default=1.0, metadata=at_least(1))
     # Largest number that a preset may set `max_count` to; absent: any.
     preset_limit: int | None = field(default=None, metadata=at_least(1))
     # Initialisers (`fitting.initialisers`), of which the first that fits the data says where surfels start.

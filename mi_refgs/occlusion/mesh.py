@@ -105,7 +105,8 @@ def read_mesh(path: Path | str) -> Mesh:
             header = read_header(path, file) if kind == "ply" else Header("", (), ())
             file.seek(0)
             data = io.BytesIO(file.read())  # in memory: no other file is resolved beside it
-        voxel = _voxel(header)
+        noted = [words for words in map(str.split, header.comments) if words[:1] == [VOXEL_COMMENT]]
+        voxel = float(noted[0][1]) if noted else None
         if any(element.name == "face" and not element.count for element in header.elements):
             return Mesh.empty(1.0 if voxel is None else voxel)
         options: Any = {"skip_materials": True} if kind in ("ply", "obj") else {}
@@ -125,9 +126,3 @@ def read_mesh(path: Path | str) -> Mesh:
         wrong = f"vertices not finite, or {VOXEL_COMMENT} not above 0"
         raise InputError(wrong, path, "mesh", "extract the mesh again")
     return Mesh(vertices, faces.astype(np.uint32), voxel)
-
-
-def _voxel(header: Header) -> float | None:
-    """The voxel size in a comment, None without one."""
-    noted = [words for words in map(str.split, header.comments) if words[:1] == [VOXEL_COMMENT]]
-    return float(noted[0][1]) if noted else None

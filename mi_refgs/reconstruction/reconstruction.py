@@ -241,10 +241,10 @@ class Reconstruction:
 
         options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}. Raises InputError for
         options that cannot be used."""
-        edited = editing.edit(self.trained, **options)
-        record = {"run": self.folder and str(self.folder), **edited.record}
+        edited, record = editing.edit(self.trained, **options)
+        record = {"run": self.folder and str(self.folder), **record}
         provenance = replace(self.provenance, edits=(*self.provenance.edits, record))
-        return replace(self.changed(edited.scene), provenance=provenance)
+        return replace(self.changed(edited), provenance=provenance)
 
     def changed(self, trained: TrainedScene) -> Reconstruction:
         """Return another scene of the same method and data, in memory."""

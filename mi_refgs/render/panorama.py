@@ -38,8 +38,13 @@ class Panorama:
 def panorama(surroundings: Surroundings, centre: np.ndarray, height: int, near: float) -> Panorama:
     """Render surroundings beyond `near` from a `centre` (3,), by six cameras, to maps of `height` rows."""
     shading, nothing = Shading(reflectance="radiance", at="surfel"), nothing_around(surroundings.surfels)
-    around = replace(surroundings, surfels=_small_from(centre, surroundings.surfels))
-    scene = SurfelScene(nothing, shading, surroundings=around)
+    if surroundings.surfels.primitive.first_order:  # without those whose projection from there is wrong
+        raw = surroundings.surfels.to_numpy()
+        distance = np.linalg.norm(raw["position"] - centre, axis=-1)
+        small = surroundings.surfels.primitive.extent(raw)[1].max(axis=-1) < LARGEST * distance
+        kept = Surfels.from_numpy({name: values[small] for name, values in raw.items()})
+        surroundings = replace(surroundings, surfels=kept)
+    scene = SurfelScene(nothing, shading, surroundings=surroundings)
     directions = map_directions(height)
     radiance, nearness = np.zeros((height, 2 * height, 3)), np.zeros((height, 2 * height))
     size = height + 2 * MARGIN
@@ -64,14 +69,3 @@ def panorama(surroundings: Surroundings, centre: np.ndarray, height: int, near: 
         depth = np.where(alpha > SURFACE, frame.depth.numpy(), np.inf).reshape(size, size)[at]
         nearness[own] = along[own] / depth
     return Panorama(np.asarray(centre, np.float64), radiance, nearness)
-
-
-def _small_from(centre: np.ndarray, surfels: Surfels) -> Surfels:
-    """The surfels without those whose projection from a centre is wrong."""
-    if not surfels.primitive.first_order:
-        return surfels
-    raw = surfels.to_numpy()
-    _, deviations = surfels.primitive.extent(raw)
-    distance = np.linalg.norm(raw["position"] - centre, axis=-1)
-    small = deviations.max(axis=-1) < LARGEST * distance
-    return Surfels.from_numpy({name: values[small] for name, values in raw.items()})

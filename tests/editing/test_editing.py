@@ -105,9 +105,9 @@ def test_values_are_activated_attributes(scene: TrainedScene) -> None:
 def test_set_is_exact_and_other_surfels_stay_bit_for_bit(scene: TrainedScene) -> None:
     before = scene.surfels.to_numpy()
     given = {"roughness": 0.25, "metallic": 0, "albedo": (0.9, 0.6, 0.1)}
-    edited = edit(scene, where=METAL_BALL, set=given)
-    assert (edited.record["selected"], edited.record["of"]) == (HALF, 2 * HALF)
-    after, now = edited.scene.surfels.to_numpy(), SurfelValues(edited.scene)
+    edited, record = edit(scene, where=METAL_BALL, set=given)
+    assert (record["selected"], record["of"]) == (HALF, 2 * HALF)
+    after, now = edited.surfels.to_numpy(), SurfelValues(edited)
     chosen = before["position"][:, 0] < 0
     for name in before:
         np.testing.assert_array_equal(before[name][~chosen], after[name][~chosen])
@@ -116,12 +116,12 @@ def test_set_is_exact_and_other_surfels_stay_bit_for_bit(scene: TrainedScene) ->
     np.testing.assert_allclose(now["roughness"][chosen], 0.25, rtol=1e-6)
     np.testing.assert_allclose(now["metallic"][chosen], 0, atol=2e-6)
     np.testing.assert_allclose(now["albedo.g"][chosen], 0.6, rtol=1e-6)
-    assert edited.scene.mesh is scene.mesh
+    assert edited.mesh is scene.mesh
 
 
 def test_assignments_are_made_in_order_and_each_sees_the_last(scene: TrainedScene) -> None:
     fields, given = SurfelValues(scene), ["albedo*=1,0.5,0", "roughness*=3", "albedo.r=0.25", "albedo.r*=0.5"]
-    now = SurfelValues(edit(scene, set=given).scene)
+    now = SurfelValues(edit(scene, set=given)[0])
     np.testing.assert_allclose(now["albedo.r"], 0.125, rtol=1e-6)
     np.testing.assert_allclose(now["albedo.g"], 0.5 * fields["albedo.g"], rtol=1e-5)
     np.testing.assert_allclose(now["roughness"], np.minimum(3 * fields["roughness"], 1), rtol=1e-5)
@@ -130,14 +130,14 @@ def test_assignments_are_made_in_order_and_each_sees_the_last(scene: TrainedScen
 def test_a_new_colour_scales_all_sh_degrees(scene: TrainedScene) -> None:
     """Radiance only: half the colour is half the image; a new colour keeps the view dependence."""
     plain = replace(balls(reflectance="radiance", occlusion=False), mesh=None)
-    doubled = edit(plain, set=["colour*=0.5"]).scene
+    doubled = edit(plain, set=["colour*=0.5"])[0]
     np.testing.assert_allclose(image(doubled)[:, :3], 0.5 * image(plain)[:, :3], atol=1e-5)
     before = plain.surfels.to_numpy()["radiance_sh"]
-    after = edit(plain, set={"colour": (0.2, 0.3, 0.4)}).scene.surfels.to_numpy()["radiance_sh"]
+    after = edit(plain, set={"colour": (0.2, 0.3, 0.4)})[0].surfels.to_numpy()["radiance_sh"]
     np.testing.assert_allclose(0.5 + SH_DC * after[:, :3], np.tile((0.2, 0.3, 0.4), (2 * HALF, 1)), rtol=1e-5)
     ratio = (0.2, 0.3, 0.4) / (0.5 + SH_DC * before[:, :3])
     np.testing.assert_allclose(after[:, 3:6], before[:, 3:6] * ratio, rtol=1e-4)
-    one = edit(plain, set=["colour.g=0.7"]).scene.surfels.to_numpy()["radiance_sh"]
+    one = edit(plain, set=["colour.g=0.7"])[0].surfels.to_numpy()["radiance_sh"]
     np.testing.assert_array_equal(one[:, [0, 2, 3, 5]], before[:, [0, 2, 3, 5]])
 
 
@@ -146,7 +146,7 @@ def test_the_background_stays(change: Any) -> None:
     """Pixels that show only the background are those of before."""
     near = NearField(np.zeros(3), np.full((8, 16), 0.2, np.float32))
     scene = replace(with_background(balls(), 0.3), near=near)
-    edited = edit(scene, **change).scene
+    edited = edit(scene, **change)[0]
     assert edited.near is near
     before, after = image(scene), image(edited)
     alone = [image(replace(x, surroundings=None))[:, 3] for x in (scene, edited)]
@@ -184,7 +184,7 @@ def test_bad_options_are_refused(scene: TrainedScene, given: dict[str, Any], mes
 def test_cut_removes_a_ball_its_shadow_and_its_reflection() -> None:
     """The rest renders like the other ball without any of the first, mesh included."""
     whole = balls(EnvironmentLight.from_radiance(sky(16)), **TRACED_LIGHT)
-    left = edit(whole, where=METAL_BALL, cut=True, invert=True).scene
+    left = edit(whole, where=METAL_BALL, cut=True, invert=True)[0]
     assert left.surfels.count == HALF and left.mesh is not None
     mesh = known_mesh()
     alone = replace(left, mesh=mesh.part(mesh.vertices[mesh.faces].mean(axis=1)[:, 0] < 0))
@@ -199,8 +199,8 @@ def test_the_background_keeps_its_triangles() -> None:
     scene = with_background(balls())
     assert scene.mesh is not None
     of_wall = scene.mesh.vertices[scene.mesh.vertices[:, 0] > 0.05]
-    for half in (edit(scene, where="z > 0", cut=True, invert=given) for given in (False, True)):
-        mesh = half.scene.mesh
+    for half, _ in (edit(scene, where="z > 0", cut=True, invert=given) for given in (False, True)):
+        mesh = half.mesh
         assert mesh is not None and len(mesh.faces) / len(scene.mesh.faces) == pytest.approx(0.75, abs=0.02)
         assert (mesh.vertices[:, 0] > 0.05).sum() == len(of_wall)
 
@@ -208,17 +208,17 @@ def test_the_background_keeps_its_triangles() -> None:
 def test_transparent_surfels_lose_their_triangles(scene: TrainedScene) -> None:
     assert scene.mesh is not None
     for opacity, kept in ((0.6, 1.0), (0.3, 0.5), (0.0, 0.5)):
-        mesh = edit(scene, where=METAL_BALL, set={"opacity": opacity}).scene.mesh
+        mesh = edit(scene, where=METAL_BALL, set={"opacity": opacity})[0].mesh
         assert mesh is not None and len(mesh.faces) == kept * len(scene.mesh.faces)
 
 
 def test_notes_name_what_stays_as_fitted(scene: TrainedScene) -> None:
-    assert edit(scene, set=["roughness=0.1"]).notes == ()
-    metal = edit(scene, set=["metallic=1"]).notes
+    assert edit(scene, set=["roughness=0.1"])[1]["notes"] == []
+    metal = edit(scene, set=["metallic=1"])[1]["notes"]
     assert any("albedo and metallic change what is reflected" in note for note in metal)
-    plain = edit(balls(reflectance="radiance", occlusion=False), set=["metallic=1"]).notes
+    plain = edit(balls(reflectance="radiance", occlusion=False), set=["metallic=1"])[1]["notes"]
     assert any("metallic: no image of this run depends" in note for note in plain)
-    assert edit(balls(diffuse="irradiance", occlusion=False), set=["metallic=1"]).notes == ()
+    assert edit(balls(diffuse="irradiance", occlusion=False), set=["metallic=1"])[1]["notes"] == []
 
 
 def test_an_edited_run_is_a_run(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
