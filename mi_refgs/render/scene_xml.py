@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -23,38 +22,37 @@ FAR_CLIP = RAW_LIMIT
 SQUARE = 1e-5  # relative difference of focal lengths, by rounding, up to which pixels are square
 
 
-@dataclass(frozen=True)
-class SceneFiles:
-    """Names of a scene's files, relative to the folder of the XML, so that it can be moved."""
-
-    ply: str
-    envmap: str | None = None
-    mesh: str | None = None
-    surroundings: str | None = None
-    background: Sequence[float] | str | None = None  # a lat-long map, linear radiance, or transparent
-    near_field: str | None = None  # distances of what the envmap shows
-
-
-def write_scene_xml(path: str | Path, files: SceneFiles, shading: Shading, cameras: Sequence[Camera]) -> None:
+def write_scene_xml(
+    path: str | Path,
+    shading: Shading,
+    cameras: Sequence[Camera],
+    ply: str,
+    envmap: str | None = None,
+    mesh: str | None = None,
+    surroundings: str | None = None,
+    background: Sequence[float] | str | None = None,  # a lat-long map, linear radiance, or transparent
+    near_field: str | None = None,  # distances of what the envmap shows
+) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and a sensor per camera, atomically; `spp` is 1 as in
-    training. Pixels are square: where fx ≠ fy, the film has more along one axis. Raises InputError for a
-    mirrored camera, occlusion without mesh, or a path that cannot be written."""
-    if shading.occlusion and files.mesh is None:
+    training. Names of files are relative to its folder. Pixels are square: where fx ≠ fy, the film has more
+    along one axis. Raises InputError for a mirrored camera, occlusion without mesh, or a path that cannot be
+    written."""
+    if shading.occlusion and mesh is None:
         raise InputError("there is none to trace", path, "mesh", "give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")
     scene.append(ElementTree.Comment(" needs `import mi_refgs` before mi.load_file "))
     ElementTree.SubElement(scene, "default", name="spp", value="1")
     integrator = ElementTree.SubElement(scene, "integrator", type="refgs", id="refgs")
-    put(integrator, filename=files.ply, shade_at=shading.at, reflectance=shading.reflectance)
+    put(integrator, filename=ply, shade_at=shading.at, reflectance=shading.reflectance)
     put(integrator, diffuse=shading.diffuse, occlusion=shading.occlusion)
-    put(integrator, **{name: getattr(shading, name) for name in shading.chosen()}, mesh=files.mesh)
-    if files.surroundings is not None:
+    put(integrator, **{name: getattr(shading, name) for name in shading.chosen()}, mesh=mesh)
+    if surroundings is not None:
         integrator.append(ElementTree.Comment(" without these two: the object alone, on transparency "))
-    put(integrator, surroundings=files.surroundings, background=files.background)
-    if files.envmap is not None:
+    put(integrator, surroundings=surroundings, background=background)
+    if envmap is not None:
         light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
-        put(light, filename=files.envmap)
-    put(integrator, near_field=files.near_field)
+        put(light, filename=envmap)
+    put(integrator, near_field=near_field)
     for index, camera in enumerate(cameras):
         add_sensor(scene, camera, f"sensor_{index}" if index else "sensor")
     write_xml(path, scene)

@@ -16,7 +16,7 @@ from mi_refgs.io.files import BusyError, make_folder, read_json, write_json
 from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import read_mesh, write_mesh
-from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
+from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.runs import trained_scene as names
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -51,8 +51,8 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Ca
         # Transparent without a background: images with alpha are composited after the sRGB encoding, which a
         # scene file cannot express. Without a background map it is black, as in `render`.
         black = (0.0, 0.0, 0.0) if around is not None and behind is None else None
-        files = SceneFiles(names.SURFELS, light, mesh, around, behind or black, near)
-        write_scene_xml(folder / names.SCENE, files, fitted.shading, [camera, *more])
+        files = names.SURFELS, light, mesh, around, behind or black, near
+        write_scene_xml(folder / names.SCENE, fitted.shading, [camera, *more], *files)
         # Written last: if it is there, the other files are complete.
         note = {"iteration": fitted.iteration, "seconds": fitted.seconds, "surfels": fitted.surfels.count}
         about: dict[str, Any] = {"files": written, "shading": asdict(fitted.shading)}

@@ -15,7 +15,7 @@ import pytest
 from mi_refgs.constants import TILE_SIZES, tile_size
 from mi_refgs.plugins.light import LOBES, DirectionalLight
 from mi_refgs.reference.camera import look_at
-from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
+from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
@@ -30,8 +30,8 @@ def test_parameter_keys_do_not_depend_on_the_address(tmp_path: Path) -> None:
     write_ply(tmp_path / "surfels.ply", Surfels.from_numpy(scenes.raw_channels()))
     EnvironmentLight.from_radiance(scenes.sky()).write(tmp_path / "envmap.exr")
     camera = Camera.from_sensor(mi.load_dict(scenes.sensor()))
-    files = SceneFiles("surfels.ply", "envmap.exr", background=(1, 0.5, 0.25))
-    write_scene_xml(tmp_path / "scene.xml", files, Shading(), [camera])
+    files: dict[str, Any] = {"ply": "surfels.ply", "envmap": "envmap.exr", "background": (1, 0.5, 0.25)}
+    write_scene_xml(tmp_path / "scene.xml", Shading(), [camera], **files)
     params = mi.traverse(mi.load_file(str(tmp_path / "scene.xml")))
     keys = [key.removeprefix("refgs.") for key in params.keys() if key.startswith("refgs.")]
     assert keys == [*scenes.raw_channels(), "light", "light_to_world"]
@@ -189,7 +189,7 @@ def test_an_exported_scene_has_the_trainers_tiles(
     focal = limit * factor
     pose = look_at(np.random.default_rng(1).normal(size=3), np.zeros(3))
     camera = Camera.from_pose(width, height, -focal, -focal, width / 2 + 3, height / 2 - 5, pose, 0.01)
-    write_scene_xml(tmp_path / "scene.xml", SceneFiles("a.ply"), Shading(), [camera])
+    write_scene_xml(tmp_path / "scene.xml", Shading(), [camera], "a.ply")
     root = ElementTree.parse(tmp_path / "scene.xml").getroot()
     root.remove(root.find("integrator"))  # type: ignore[arg-type]
     exported = Camera.from_sensor(mi.load_string(ElementTree.tostring(root, encoding="unicode")).sensors()[0])

@@ -14,7 +14,7 @@ import pytest
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
-from mi_refgs.render.scene_xml import SceneFiles, write_scene_xml
+from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.runs.export import export
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -101,12 +101,12 @@ def pixels(camera: Camera, point: Any) -> np.ndarray:
 def test_what_no_scene_can_say_is_refused(tmp_path: Path) -> None:
     camera = Camera.from_pose(8, 8, 10, -10, 4, 4, np.eye(4))
     with pytest.raises(InputError, match="fx, fy: 10 and -10 pixels mirror"):
-        write_scene_xml(tmp_path / "scene.xml", SceneFiles("a.ply"), Shading(), [camera])
+        write_scene_xml(tmp_path / "scene.xml", Shading(), [camera], "a.ply")
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be created"):
-        write_scene_xml(tmp_path / "file" / "scene.xml", SceneFiles("a.ply"), Shading(), [view()])
+        write_scene_xml(tmp_path / "file" / "scene.xml", Shading(), [view()], "a.ply")
     with pytest.raises(InputError, match="mesh: there is none"):
-        write_scene_xml(tmp_path / "s.xml", SceneFiles("a.ply"), Shading(occlusion=True), [view()])
+        write_scene_xml(tmp_path / "s.xml", Shading(occlusion=True), [view()], "a.ply")
 
 
 @pytest.mark.parametrize("options", [{}, {"visibility_rays": 2}, {"traced_bounces": 1}])
