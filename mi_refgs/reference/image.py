@@ -63,7 +63,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     raw, around = ({n: np.asarray(x, np.float64) for n, x in table.items()} for table in tables)
     camera, count = scene.camera, len(raw["position"])
     x, y = scene.pixels % camera.width + 0.5, scene.pixels // camera.width + 0.5
-    blend = Blend.of([raw, around] if around else [raw], camera, scene.order, x, y, scene.rules)
+    blend = Blend([raw, around] if around else [raw], camera, scene.order, x, y, scene.rules)
     features_of = Features(scene, raw)
     taps: Taps = []
     features = features_of(features_of.columns, taps).real

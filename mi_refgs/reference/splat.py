@@ -35,47 +35,29 @@ class Maps:
     band: Array
 
 
-@dataclass(frozen=True)
 class Blend:
-    """Footprints (N, P) of all tables, blended front to back."""
+    """Footprints (N, P) of all tables of raw channels at pixel centres x, y, blended front to back."""
 
-    tables: Sequence[Raw]  # raw channels
-    camera: PinholeCamera
-    rules: Rules
-    order: Array  # (N, P): rows from front to back at each pixel
-    x: Array  # (P,)
-    y: Array
-    sample: Sample
-    culled: Array  # (N,)
-    alpha: Array  # 0 where nothing is hit
-    z: Array  # 0 where nothing is hit
-    before: Array  # transmittance in front
-    after: Array  # … and behind
-    alive: Array  # the pixel has not ended before it
-    shown: Array  # it contributes
-    weight: Array
-
-    @staticmethod
-    def of(
-        tables: Sequence[Raw], camera: PinholeCamera, order: Array, x: Array, y: Array, rules: Rules
-    ) -> Blend:
-        """Blend tables of raw channels at pixel centres x, y."""
-        culled = np.concatenate([primitive_of(raw).culled(raw, camera, rules) for raw in tables])
+    def __init__(
+        self, tables: Sequence[Raw], camera: PinholeCamera, order: Array, x: Array, y: Array, rules: Rules
+    ) -> None:
+        """`order` (N, P): rows from front to back at each pixel."""
+        self.tables, self.camera, self.rules, self.order, self.x, self.y = tables, camera, rules, order, x, y
+        self.culled = np.concatenate([primitive_of(raw).culled(raw, camera, rules) for raw in tables])
         samples = [primitive_of(raw).footprint(raw, camera, rules, x, y) for raw in tables]
         fields = ([getattr(sample, field.name) for sample in samples] for field in dataclasses.fields(Sample))
-        sample = Sample(*(np.concatenate(parts) for parts in fields))
-        alpha, z = sample.alpha.real, sample.z.real
-        hit = (alpha >= rules.alpha_min) & (z > camera.near) & ~culled[:, None]
-        alpha, z = np.where(hit, alpha, 0), np.where(hit, z, 0)
-        behind = np.take_along_axis(np.log1p(-alpha), order, 0).cumsum(0)
+        self.sample = Sample(*(np.concatenate(parts) for parts in fields))
+        alpha, z = self.sample.alpha.real, self.sample.z.real
+        hit = (alpha >= rules.alpha_min) & (z > camera.near) & ~self.culled[:, None]
+        self.alpha, self.z = np.where(hit, alpha, 0), np.where(hit, z, 0)
+        behind = np.take_along_axis(np.log1p(-self.alpha), order, 0).cumsum(0)
         before = np.exp(np.concatenate([np.zeros((1, len(x))), behind[:-1]]))
         ends = math.log(rules.transmittance_min) if rules.transmittance_min else -math.inf
         alive = np.logical_and.accumulate(behind >= ends, axis=0)
-        before, alive, after = (_unsort(v, order) for v in (before, alive, np.exp(behind)))
-        shown = hit & alive
-        weight = np.where(shown, before * alpha, 0)
-        given, found = (tables, camera, rules, order, x, y), (sample, culled, alpha, z)
-        return Blend(*given, *found, before, after, alive, shown, weight)
+        # Transmittance in front and behind, and whether the pixel has not ended before.
+        self.before, self.after, self.alive = (_unsort(v, order) for v in (before, np.exp(behind), alive))
+        self.shown = hit & self.alive  # contributes
+        self.weight = np.where(self.shown, self.before * self.alpha, 0)
 
     def band(self, width: float) -> Array:
         """Pixels (P,) with a declared discontinuity within this relative distance."""
@@ -137,7 +119,7 @@ def sorted_rows(
 def _whole_image(raw: Raw, camera: PinholeCamera) -> Blend:
     pixels = np.arange(camera.width * camera.height)
     x, y = pixels % camera.width + 0.5, pixels // camera.width + 0.5
-    return Blend.of([raw], camera, sorted_rows([raw], camera, pixels), x, y, Rules())
+    return Blend([raw], camera, sorted_rows([raw], camera, pixels), x, y, Rules())
 
 
 def _unsort(values: Array, order: Array) -> Array:

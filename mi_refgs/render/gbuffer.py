@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -13,7 +12,6 @@ import mitsuba as mi
 from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.kernels.rows import joined
 from mi_refgs.splat import Composited
-from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.types import Array, Float
 
 OBJECT = "object"  # slot of the object's opacity; where it is blended, slots are divided by it
@@ -21,26 +19,18 @@ SURROUNDINGS = "surroundings"  # slot of the radiance of the surroundings
 Slots = Mapping[str, Any]  # values by name, such as mi.Color3f; each costs time in every pair
 
 
-@dataclass(frozen=True)
 class GBuffer:
     """Blended slots of a view, in raster order or in that of `pixels`. A slot that nobody needs is absent."""
 
-    alpha: Float  # accumulated opacity
-    depth: Float  # expected camera-z depth, 0 where nothing is seen; None if not asked for
-    slots: dict[str, Any]  # premultiplied by alpha, each of the type that was blended
-    inverse: Float  # 1/alpha or 1/opacity of the object where that is seen, else 0
-    pixels: CompactedPixels | None
-    attribution: Float = None  # the map of `Request.attribution`
-
-    @staticmethod
-    def of(blended: Composited, kinds: Slots) -> GBuffer:
+    def __init__(self, blended: Composited, kinds: Slots) -> None:
         """The maps of the `features` of slots, and of the attribution if it follows them."""
-        slots = _grouped(kinds, blended.features)
-        rest = blended.features[len(features(kinds)) :]
+        self.alpha, self.pixels = blended.alpha, blended.pixels
+        self.slots = _grouped(kinds, blended.features)  # premultiplied by alpha
+        self.attribution = next(iter(blended.features[len(features(kinds)) :]), None)
         inverse = inverse_alpha(blended.alpha)
-        own = inverse_alpha(slots[OBJECT]) if OBJECT in slots else inverse
-        mean_depth = None if blended.depth is None else blended.depth * inverse
-        return GBuffer(blended.alpha, mean_depth, slots, own, blended.pixels, rest[0] if rest else None)
+        self.depth = None if blended.depth is None else blended.depth * inverse  # of the camera's z
+        # 1/alpha, or 1/opacity of the object, where that is seen, else 0.
+        self.inverse = inverse_alpha(self.slots[OBJECT]) if OBJECT in self.slots else inverse
 
     def divided(self, name: str) -> Any:
         """A slot divided by alpha or the object's opacity: the mean of what is seen, 0 where nothing is."""

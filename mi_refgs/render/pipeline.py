@@ -127,7 +127,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     if around is not None:
         around = replace(around, surfels=around.surfels.never_empty())
     scene = replace(scene.lit_for(camera), surfels=scene.surfels.never_empty(), surroundings=around)
-    view = _View.of(scene, request, camera)
+    view = _View(scene, request, camera)
     frame = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
     return boundary(frame, "shade backward")
 
@@ -140,34 +140,25 @@ def render_depth(
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 
 
-@dataclass(frozen=True)
 class _View:
     """A scene, as a camera sees its surfels: what both orders start from."""
 
-    scene: SurfelScene
-    request: Request
-    camera: Camera
-    points: ShadingPoints  # the object's surfels, with the model's attributes
-    presence: dict[str, Any]  # the slot of the object's opacity, where alpha is not that
-    others: dict[str, Any]  # radiance of the surroundings' surfels; empty without any
-    geometry: list[Surfels]  # of the object, then of the surroundings
-    background: Color3f  # pixel by pixel; None without surroundings
-
-    @staticmethod
-    def of(scene: SurfelScene, request: Request, camera: Camera) -> _View:
+    def __init__(self, scene: SurfelScene, request: Request, camera: Camera) -> None:
         surfels, surroundings = scene.surfels, scene.surroundings
+        self.scene, self.request, self.camera = scene, request, camera
         seen = _seen(surfels, camera, request.sh_degree)
         attributes = {**scene.shading.model.values(surfels, seen, scene.shading)}
         normal = attributes.pop("normal", seen.normal)  # the model's own, or the surfels'
-        presence, others, geometry, background = {}, {}, [surfels], None
+        self.points = ShadingPoints(normal, -seen.direction, attributes)
+        self.geometry, self.background = [surfels], None
+        self.presence: dict[str, Any] = {}  # the slot of the object's opacity, where alpha is not that
+        self.others: dict[str, Any] = {}  # radiance of the surroundings' surfels, if there are any
         if surroundings is not None:
             beside = _seen(surroundings.surfels, camera, request.sh_degree)
-            radiance = beside.harmonic_colour(surroundings.surfels.value("radiance_sh"))
-            presence = {OBJECT: dr.full(mi.Float, 1, surfels.count)}
-            others = {"radiance": radiance}
-            geometry, background = [surfels, surroundings.surfels], surroundings.behind(camera)
-        points = ShadingPoints(normal, -seen.direction, attributes)
-        return _View(scene, request, camera, points, presence, others, geometry, background)
+            self.others["radiance"] = beside.harmonic_colour(surroundings.surfels.value("radiance_sh"))
+            self.presence[OBJECT] = dr.full(mi.Float, 1, surfels.count)
+            self.geometry.append(surroundings.surfels)
+            self.background = surroundings.behind(camera)
 
     @property
     def asked(self) -> frozenset[str]:
@@ -186,7 +177,7 @@ class _View:
             if self.request.attribution is not None:
                 values = [*values, self.request.attribution]
             blended = splat(self.geometry, values, self.camera)
-        return GBuffer.of(blended, slots)
+        return GBuffer(blended, slots)
 
     def frame(self, buffer: GBuffer, **fields: Any) -> Frame:
         """The frame of a G-buffer and of what was shaded, in raster order."""
