@@ -266,7 +266,7 @@ def _occluder_of(state: Mapping[str, np.ndarray]) -> Occluder:
         occluder.update(mesh)
         if f"{MESH}surfels" in state:
             count = len(state[f"{PARAMS}position"])
-            occluder.vertex_surfels = VertexSurfels.restored(mesh, count, checkpoint.part(state, MESH))
+            occluder.vertex_surfels = VertexSurfels(mesh, count, checkpoint.part(state, MESH))
         if f"{MESH}ambient" in state:
-            occluder.ambient = VertexColours.of(mesh, state[f"{MESH}ambient"])
+            occluder.ambient = VertexColours(mesh, state[f"{MESH}ambient"])
     return occluder

@@ -31,15 +31,15 @@ class SurfaceSample:
     surfel: UInt32  # the surfel nearest to the nearest vertex
 
 
-@dataclass(frozen=True)
 class VertexSurfels:
     """The surfels around every vertex of a mesh: V vertices, K neighbours, F faces."""
 
-    count: int  # surfels
-    faces: UInt32  # (3 F,)
-    surfel: list[UInt32]  # K × (V,), the nearest first
-    weight: list[Float]  # K × (V,), their sum is 1
-    normal: Vector3f  # (V,)
+    def __init__(self, mesh: Mesh, count: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """The neighbours among `count` surfels from their `arrays`."""
+        self.count, self.faces = count, upload(mesh.faces.ravel(), mi.UInt32)  # (3 F,)
+        self.surfel = [upload(row, mi.UInt32) for row in arrays["surfels"]]  # K × (V,), the nearest first
+        self.weight = [upload(row) for row in arrays["weights"]]  # K × (V,), their sum is 1
+        self.normal = mi.Vector3f(*(upload(row) for row in arrays["normals"]))  # (V,)
 
     @staticmethod
     def of(mesh: Mesh, surfels: Surfels) -> VertexSurfels:
@@ -72,23 +72,12 @@ class VertexSurfels:
         weight = np.where(total > WEIGHT_FLOOR, weight / np.maximum(total, WEIGHT_FLOOR), nearest)
         normal = _normals(mesh, normal[found], weight)
         arrays = {"surfels": found.T, "weights": weight.T, "normals": normal.T}
-        return VertexSurfels.restored(mesh, surfels.count, arrays)
+        return VertexSurfels(mesh, surfels.count, arrays)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Values for checkpoints: "surfels" and "weights" (K, V), "normals" (3, V)."""
         surfel, weight = (np.array([np.array(x) for x in columns]) for columns in (self.surfel, self.weight))
         return {"surfels": surfel, "weights": weight, "normals": np.array(self.normal)}
-
-    @staticmethod
-    def restored(mesh: Mesh, count: int, arrays: Mapping[str, np.ndarray]) -> VertexSurfels:
-        """The neighbours among `count` surfels from their `arrays`."""
-        return VertexSurfels(
-            count,
-            upload(mesh.faces.ravel(), mi.UInt32),
-            [upload(row, mi.UInt32) for row in arrays["surfels"]],
-            [upload(row) for row in arrays["weights"]],
-            mi.Vector3f(*(upload(row) for row in arrays["normals"])),
-        )
 
     def values(self, surfels: Surfels, names: Sequence[str]) -> dict[str, list[Float]]:
         """Present values at the vertices, by attribute: columns (V,), under AD; raises InputError."""
@@ -109,22 +98,17 @@ class VertexSurfels:
                     mixed[i] += weight * dr.gather(mi.Float, column, surfel)
         return found
 
-    def surface(self, surfels: Surfels, names: Sequence[str]) -> Surface:
-        """The mesh with the present `values`, to look up at hits."""
-        values = self.values(surfels, names)
-        columns = [column for own in values.values() for column in own] + [*self.normal]
-        columns += [mi.Float(0)] * (-len(columns) % GROUP)
-        widths = {name: len(own) for name, own in values.items()}
-        return Surface(self, dr.ravel(mi.ArrayXf(columns)), widths)
 
-
-@dataclass(frozen=True)
 class Surface:
-    """A mesh with materials, to look up at hits."""
+    """A mesh with present values of attributes of surfels, to look up at hits."""
 
-    vertex_surfels: VertexSurfels
-    rows: Float  # by vertices: columns of the attributes, normal, zeros up to a multiple of GROUP
-    widths: dict[str, int]  # columns of each attribute
+    def __init__(self, vertex_surfels: VertexSurfels, surfels: Surfels, names: Sequence[str]) -> None:
+        values = vertex_surfels.values(surfels, names)
+        columns = [column for own in values.values() for column in own] + [*vertex_surfels.normal]
+        columns += [mi.Float(0)] * (-len(columns) % GROUP)
+        self.vertex_surfels = vertex_surfels
+        self.rows = dr.ravel(mi.ArrayXf(columns))  # by vertices
+        self.widths = {name: len(own) for name, own in values.items()}  # columns of each attribute
 
     def at(self, triangle: UInt32, barycentric: Point2f, active: Bool) -> SurfaceSample:
         """Attributes at barycentric coordinates of the second and third corner."""
@@ -145,17 +129,12 @@ class Surface:
         return SurfaceSample(values, mi.Vector3f(*(next(columns) for _ in range(3))), surfel)
 
 
-@dataclass(frozen=True)
 class VertexColours:
     """One colour per vertex, linear over each face; detached."""
 
-    faces: UInt32  # (3 F,)
-    rows: Float  # (3 V,)
-
-    @staticmethod
-    def of(mesh: Mesh, colours: np.ndarray) -> VertexColours:
+    def __init__(self, mesh: Mesh, colours: np.ndarray) -> None:
         """Colours (V, 3) of the vertices of a mesh."""
-        return VertexColours(upload(mesh.faces.ravel(), mi.UInt32), upload(np.asarray(colours).ravel()))
+        self.faces, self.rows = upload(mesh.faces.ravel(), mi.UInt32), upload(np.asarray(colours).ravel())
 
     def at(self, triangle: UInt32, barycentric: Point2f, active: Bool) -> Color3f:
         """Colour at barycentric coordinates of the second and third corner; 0 where not `active`."""

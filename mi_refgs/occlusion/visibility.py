@@ -81,7 +81,7 @@ class Occluder:
         if self.vertex_surfels is None:
             remedy = "call Occluder.set_materials after update"
             raise InputError("none are set", "occluder", "materials", remedy)
-        return self.vertex_surfels.surface(surfels, names)
+        return Surface(self.vertex_surfels, surfels, names)
 
     def visible(
         self, origin: Point3f, direction: Vector3f, normal: Vector3f = None, active: Bool = True

@@ -71,7 +71,7 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
         start = (dr.zeros(mi.UInt32, dr.width(normal)), mi.Color3f(0), mi.Color3f(0))
         _, arrives, total = dr.while_loop(start, lambda index, *_: index < rays, body, label="ambient")
         ratio = dr.select(total > 0, arrives * dr.rcp(dr.select(total > 0, total, 1)), 1)
-        ratios = VertexColours.of(mesh, dr.clip(ratio, 0, BRIGHTEST).numpy().T)
+        ratios = VertexColours(mesh, dr.clip(ratio, 0, BRIGHTEST).numpy().T)
     assert ratios is not None
     return ratios
 

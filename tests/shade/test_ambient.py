@@ -113,7 +113,7 @@ def test_pixels_read_what_the_mesh_holds() -> None:
     with pytest.raises(InputError, match="update_occluder_caches"):
         ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, eye, mi.Vector3f(0, 0, -1)))
     colours = np.array([[0.1, 0.2, 0.3], [0.9, 0.4, 0.5], [0.6, 0.7, 0.8]])
-    occluder.ambient = ambient.VertexColours.of(mesh, colours)
+    occluder.ambient = ambient.VertexColours(mesh, colours)
     at = np.array([[0.2, 0.3], [0.6, 0.1], [0.1, 0.1], [2, 2]])
     ray, covered = vector(np.column_stack([at, -np.ones(4)])), mi.Bool([True, True, False, True])
     ratio = ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, eye, ray, covered))
