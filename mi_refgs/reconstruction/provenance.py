@@ -29,7 +29,7 @@ class Provenance:
     method: Method
     data: Path | None = None
     region: Region | None = None  # in images without alpha
-    edits: tuple[dict[str, Any], ...] = ()  # made since, in order: the records of `editing.edit`
+    edits: tuple[dict[str, Any], ...] = ()  # made since, in order: the records of `editing.change.edit`
     records: dict[str, Any] = field(default_factory=dict)
     """Corrections of the fit by file: of its cameras and of the exposure."""
 

@@ -18,8 +18,7 @@ import numpy as np
 from mi_refgs import formats
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
-from mi_refgs.editing import edit as editing
-from mi_refgs.editing.change import apply
+from mi_refgs.editing.change import apply, edit
 from mi_refgs.editing.options import EditOptions, Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError, counted
@@ -241,7 +240,7 @@ class Reconstruction:
 
         options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}. Raises InputError for
         options that cannot be used."""
-        edited, record = editing.edit(self.trained, **options)
+        edited, record = edit(self.trained, **options)
         record = {"run": self.folder and str(self.folder), **record}
         provenance = replace(self.provenance, edits=(*self.provenance.edits, record))
         return replace(self.changed(edited), provenance=provenance)

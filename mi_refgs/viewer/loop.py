@@ -20,9 +20,8 @@ from mi_refgs.render.display import image_array
 from mi_refgs.types import Float
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.reconstruction_view import DisplayOptions, ReconstructionView, displayed_planes
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE, NOTHING, SHOWN_AT
-from mi_refgs.viewer.viewer_scene import DisplayOptions, displayed_planes
 
 
 @dataclass(eq=False)

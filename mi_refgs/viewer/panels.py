@@ -24,9 +24,14 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.attributes import sigmoid
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.reconstruction_view import (
+    IMAGE,
+    DisplayOptions,
+    ReconstructionView,
+    displayed_planes,
+    planes_of,
+)
 from mi_refgs.viewer.resolution import FINEST, SAMPLES, SIDES
-from mi_refgs.viewer.viewer_scene import IMAGE, DisplayOptions, displayed_planes, planes_of
 
 STOPS = 6.0  # largest exposure either way
 COLOURS = {"train": (90, 160, 255), "test": (255, 160, 60)}  # colours of the frusta by split

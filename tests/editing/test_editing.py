@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.cli import main
-from mi_refgs.editing.edit import edit
+from mi_refgs.editing.change import edit
 from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import SurfelValues, select
 from mi_refgs.reconstruction.reconstruction import load

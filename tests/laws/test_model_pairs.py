@@ -29,8 +29,7 @@ from mi_refgs.runs.export import save
 from mi_refgs.shade.light import LIGHTS
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.surfels.attributes import ATTRIBUTES
-from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.viewer_scene import DisplayOptions, planes_of
+from mi_refgs.viewer.reconstruction_view import DisplayOptions, ReconstructionView, planes_of
 from tests.helpers import read_exr, refused, slow
 from tests.scenes.integrator import raw_channels, sky, two_balls
 from tests.scenes.tiny import METHOD, train_command, write_data

@@ -38,8 +38,13 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.viewer_scene import BACKGROUND, IMAGE, DisplayOptions, planes_of
+from mi_refgs.viewer.reconstruction_view import (
+    BACKGROUND,
+    IMAGE,
+    DisplayOptions,
+    ReconstructionView,
+    planes_of,
+)
 from tests.helpers import read_exr
 from tests.laws.covering import covering_array, marked
 from tests.laws.option_scenes import xml

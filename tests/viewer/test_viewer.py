@@ -36,9 +36,8 @@ from mi_refgs.viewer import resolution
 from mi_refgs.viewer.loop import Client, RenderLoop
 from mi_refgs.viewer.panels import light_of, write_view
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.reconstruction_view import ReconstructionView
+from mi_refgs.viewer.reconstruction_view import DisplayOptions, ReconstructionView, displayed_planes
 from mi_refgs.viewer.resolution import COARSE, DONE, LARGE
-from mi_refgs.viewer.viewer_scene import DisplayOptions, displayed_planes
 from tests.helpers import ROOT, refused
 from tests.scenes.known import with_background
 
