@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +35,11 @@ SURFACE_KEYS = ("surface_distance", "surface_accuracy", "surface_completeness")
 NO_SURFACE = f"the data set has no true surface: {SURFACE}, which `refgs dataset` writes"
 
 
-@dataclass(frozen=True, eq=False)
 class TrueSurface:
     """The true surface of a scene, and rays against it."""
 
-    mesh: Mesh
-    occluder: Occluder
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh, self.occluder = mesh, Occluder(mesh)
 
     @staticmethod
     def read(folder: Path, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> TrueSurface | None:
@@ -50,7 +49,7 @@ class TrueSurface:
             return None
         mesh = read_mesh(path)
         mesh = replace(mesh, vertices=(mesh.vertices - np.array(offset)).astype(np.float32))
-        return TrueSurface(mesh, Occluder(mesh)) if len(mesh.faces) else None
+        return TrueSurface(mesh) if len(mesh.faces) else None
 
     def concave(self, view: View) -> np.ndarray | None:
         """Pixels (H, W) of the true surface with visibility below CONCAVE_BELOW; None without truth."""

@@ -11,7 +11,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.formats import Shot
-from mi_refgs.formats.orbits import shots_around, turntable_cameras
+from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
@@ -82,13 +82,3 @@ class Provenance:
     def first_camera(self, trained: TrainedScene) -> Camera:
         """Return the camera of the first test view; without a data set, the first around the surfels."""
         return self.shots(trained, "test")[0].camera
-
-    def turntable(self, trained: TrainedScene, count: int) -> list[Camera]:
-        """Cameras on a circle around the object at the test views' distance; InputError below 1."""
-        if count < 1:
-            remedy = "give a number of cameras from 1"
-            raise InputError(f"{count} is out of range", "turntable", remedy=remedy)
-        cameras, region = [shot.camera for shot in self.shots(trained, "test")], None
-        if trained.surroundings is not None:  # the mesh contains the background, too
-            trained, region = replace(trained, mesh=None), self.region
-        return turntable_cameras(trained, cameras, count, region)

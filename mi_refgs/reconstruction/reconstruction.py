@@ -23,6 +23,7 @@ from mi_refgs.editing.options import EditOptions, Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError, counted
 from mi_refgs.evaluation import evaluate as evaluation
+from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.formats.splat_import import method_of, read_splats
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
@@ -104,8 +105,15 @@ class Reconstruction:
         return [shot.camera for shot in self.provenance.shots(self.trained, split)]
 
     def turntable(self, count: int) -> list[Camera]:
-        """Return cameras on a circle around the object, at the distance and height of the test views."""
-        return self.provenance.turntable(self.trained, count)
+        """Return cameras on a circle around the object, at the distance and height of the test views. Raises
+        InputError below 1."""
+        if count < 1:
+            remedy = "give a number of cameras from 1"
+            raise InputError(f"{count} is out of range", "turntable", remedy=remedy)
+        trained, region = self.trained, None
+        if trained.surroundings is not None:  # the mesh contains the background, too
+            trained, region = replace(trained, mesh=None), self.provenance.region
+        return turntable_cameras(trained, self.cameras(), count, region)
 
     def camera(self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None) -> Camera:
         """Convert a camera, a view, a Mitsuba sensor or an index of `cameras()` to a `Camera`.

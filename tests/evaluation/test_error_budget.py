@@ -11,7 +11,6 @@ from mi_refgs.evaluation.error_budget import CLASSES, ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.evaluation.surface import TrueSurface
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
 
 SIZE, DISTANCE = 60, 60.0
@@ -39,8 +38,7 @@ def walls(*sides: int) -> TrueSurface:
     faces = [
         [4 * i + a, 4 * i + b, 4 * i + c] for i in range(len(sides)) for a, b, c in ((0, 1, 2), (1, 3, 2))
     ]
-    mesh = Mesh(np.array(corners, np.float32), np.array(faces, np.uint32), 1e-3)
-    return TrueSurface(mesh, Occluder(mesh))
+    return TrueSurface(Mesh(np.array(corners, np.float32), np.array(faces, np.uint32), 1e-3))
 
 
 def expected(inner: str, edge: bool) -> np.ndarray:

@@ -32,8 +32,7 @@ def mesh_of(shape: Any) -> Mesh:
 
 
 def truth_of(*shapes: Any) -> surface.TrueSurface:
-    mesh = mesh_of(trimesh.util.concatenate(shapes))
-    return surface.TrueSurface(mesh, Occluder(mesh))
+    return surface.TrueSurface(mesh_of(trimesh.util.concatenate(shapes)))
 
 
 def around(count: int = 8) -> list[View]:

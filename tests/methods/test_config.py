@@ -20,6 +20,7 @@ from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.mesh import ExtractMesh
 from mi_refgs.fitting.events.propagate import Propagate
 from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.resources import resource_dir
 from mi_refgs.methods.build import scaled
 from mi_refgs.methods.extensions import EVENTS as REGISTERED
 from mi_refgs.methods.fields import ITERATIONS, Window
@@ -27,11 +28,15 @@ from mi_refgs.shade.shading import Shading
 from tests.helpers import refused
 from tests.scenes.highlight import ball
 
+FOLDER = resource_dir("scenes")
+OF_SCENES = [str(path.relative_to(FOLDER).with_suffix("")) for path in (FOLDER / "paper").rglob("*.toml")]
 
-@pytest.mark.parametrize("variant", methods.names())
+
+@pytest.mark.parametrize("variant", [*methods.names(), *sorted(OF_SCENES)])
 @pytest.mark.parametrize("preset", methods.PRESETS)
 def test_shipped_methods_load_and_read_back(variant: str, preset: str, tmp_path: Path) -> None:
     method = methods.load(variant, preset)
+    assert methods.load(method.file, preset) == method  # as a fit does that tries terms
     assert method.iterations == methods.PRESETS[preset].iterations == method.stages()[-1][1].until
     path = tmp_path / "config.toml"
     for losses in (method.loss, {"normal": methods.LossWeight(0.5)}, {}):  # one that a run lacks stays absent

@@ -91,15 +91,6 @@ def test_every_method_fits_and_evaluates(variant: str, data: Path, tmp_path: Pat
     assert main(["render", str(run), "-o", str(tmp_path / "view.exr")]) == 0
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_each_loads_and_is_read_back(name: str, preset: str, tmp_path: Path) -> None:
-    method = methods.load(name, preset)
-    (tmp_path / "config.toml").write_text(methods.dump(method))
-    assert methods.load_resolved(tmp_path / "config.toml") == method
-    assert methods.load(method.file, preset) == method  # as a fit does that tries terms
-
-
 @pytest.mark.parametrize("name", [name for name in NAMES if name.count("/") == 2 and "open" not in name])
 def test_settings_are_those_of_the_scene(name: str) -> None:
     _, folder, scene = name.split("/")
