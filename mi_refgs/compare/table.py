@@ -29,6 +29,12 @@ class Statistic:
     sd: float | None
     values: tuple[float, ...]
 
+    @staticmethod
+    def of(values: Sequence[float]) -> Statistic:
+        """Return the statistic of at least one value."""
+        sd = statistics.stdev(values) if len(values) > 1 else None
+        return Statistic(statistics.fmean(values), sd, tuple(map(float, values)))
+
 
 @dataclass
 class Row:
@@ -142,8 +148,7 @@ def _fill(row: Row, found: list[dict[str, Any]]) -> None:
     for column in COLUMNS:
         values = [m[column.key] for m in found]
         if values and all(value is not None for value in values):
-            sd = statistics.stdev(values) if len(values) > 1 else None
-            row.numbers[column.key] = Statistic(statistics.fmean(values), sd, tuple(map(float, values)))
+            row.numbers[column.key] = Statistic.of(values)
             continue
         row.numbers[column.key] = None
         reasons = [m.get(f"{column.reason}_reason") for m in found if m[column.key] is None]
@@ -157,8 +162,16 @@ def markdown(table: Table) -> str:
     for scene in table.scenes:
         columns = columns_of(scene)
         titles = ["method", *(f"{c.title} ({c.unit.strip()})" if c.unit else c.title for c in columns)]
-        body = [[label(row), *(cell(c, row.numbers.get(c.key)) for c in columns)] for row in scene.rows]
-        lines += [f"### {heading(scene)}", "", *aligned(titles, body), ""]
+        body = []
+        for row in scene.rows:
+            marks = f" [{','.join(map(str, row.footnotes))}]" if row.footnotes else ""
+            seeds = f" ({len(row.seeds)} seeds)" if len(row.seeds) > 1 else ""
+            cells = (cell(c, row.numbers.get(c.key)) for c in columns)
+            body.append([f"{row.variant}{marks}{seeds}", *cells])
+        scale = f", downscaled by {scene.downscale}" if scene.downscale not in (None, 1) else ""
+        size = " × ".join(map(str, scene.image_size))
+        images = f" ({scene.test_views} test views of {size} pixels{scale})" if size else ""
+        lines += [f"### {scene.name}{images}", "", *aligned(titles, body), ""]
         lines += [f"{remark}\n" for remark in remarks(scene)]
     if table.footnotes:
         lines += ["Deviations from the originals:", ""]
@@ -169,13 +182,6 @@ def markdown(table: Table) -> str:
         by = f"mi_refgs {about['version']}, preset {about['preset']}, {about['workers']} jobs at once"
         lines += [f"Made by {'; '.join([by, *machines])}:", "", f"    {about['command']}"]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def heading(scene: Scene) -> str:
-    """Return the name of the scene, and the images over which its numbers are means."""
-    scale = f", downscaled by {scene.downscale}" if scene.downscale not in (None, 1) else ""
-    size = " × ".join(map(str, scene.image_size))
-    return f"{scene.name} ({scene.test_views} test views of {size} pixels{scale})" if size else scene.name
 
 
 def remarks(scene: Scene) -> list[str]:
@@ -202,13 +208,6 @@ def cell(column: Score, number: Statistic | None) -> str:
     if number is None:
         return NOTHING
     return " ± ".join(column.form.format(x) for x in (number.mean, number.sd) if x is not None)
-
-
-def label(row: Row) -> str:
-    """Return the name of a row with its footnotes and number of seeds."""
-    marks = f" [{','.join(map(str, row.footnotes))}]" if row.footnotes else ""
-    seeds = f" ({len(row.seeds)} seeds)" if len(row.seeds) > 1 else ""
-    return f"{row.variant}{marks}{seeds}"
 
 
 def aligned(titles: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
