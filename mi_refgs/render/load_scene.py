@@ -70,9 +70,6 @@ def reason(error: BaseException) -> str:
         _, found, message = line.partition("InputError: ")
         if found:
             return message
-    remedy = (
-        "`refgs dataset -D NAME=VALUE` gives one"
-        if "undefined parameter" in str(error)
-        else "correct the scene"
-    )
+    undefined = "undefined parameter" in str(error)
+    remedy = "`refgs dataset -D NAME=VALUE` gives one" if undefined else "correct the scene"
     return f"{lines[-1] if lines else error}; {remedy}"
