@@ -74,9 +74,7 @@ def ambient_visibility(occluder: Occluder, point: Point3f, normal: Vector3f, act
         return index + 1, free + occluder.visible(point, direction, normal, active)
 
     start = (mi.UInt32(0), dr.zeros(mi.Float, dr.width(normal)))
-    _, free = dr.while_loop(
-        start, lambda index, _: active & (index < count), body, label="ambient_visibility"
-    )
+    _, free = dr.while_loop(start, lambda i, _: active & (i < count), body, label="ambient_visibility")
     return dr.select(active, free / OPEN_RAYS, 1)
 
 

@@ -89,9 +89,7 @@ def _build_dataclass(kind: Any, table: dict[str, Any], key: str) -> Any:
         if field.default is field.default_factory is MISSING and field.name not in table:
             raise InputError(f"missing key '{field.name}'", field=key or None, remedy="add it")
     below = f"{key}." if key else ""
-    built = {
-        name: build(known[name][0], inner, f"{below}{name}", known[name][1]) for name, inner in table.items()
-    }
+    built = {n: build(known[n][0], inner, f"{below}{n}", known[n][1]) for n, inner in table.items()}
     try:
         for field in fields:
             if field.metadata == FLAT:

@@ -129,12 +129,8 @@ class FilmImage:
         frame = supersampled(self.view, camera, self._samples)
         rgb, coverage = composited(frame)
         more = [value for aov in self.types for value in aov_values(aov, frame, camera)]
-        made = [
-            *rgb,
-            *([coverage] if self._alpha else []),
-            mi.Float(1),
-            *more,
-        ]  # as the film's blocks have them
+        # As the film's blocks have them.
+        made = [*rgb, *([coverage] if self._alpha else []), mi.Float(1), *more]
         pixels = dr.zeros(mi.Float, camera.width * camera.height)
         return dr.ravel(mi.ArrayXf([band.kept(channel + pixels) for channel in made]))
 

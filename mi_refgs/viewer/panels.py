@@ -105,9 +105,8 @@ class MaterialsPanel:
             hint = "An expression such as `metallic > 0.5 and z < 0`; empty: all surfels."
             self.where = gui.add_text("Where", "", hint=hint)
             self.note = gui.add_markdown(self._counted())
-            self.sliders = {
-                name: gui.add_slider(name.capitalize(), 0, 1, 0.01, 0) for name in scene.materials
-            }
+            values = (0, 1, 0.01, 0)
+            self.sliders = {name: gui.add_slider(name.capitalize(), *values) for name in scene.materials}
             reset = gui.add_button("As fitted")
         for name, slider in self.sliders.items():
             slider.on_update(partial(self._moved, name))
