@@ -88,8 +88,9 @@ def plan(
 ) -> list[Job]:
     """Plan and check the jobs of a comparison; seeds vary slowest. Raises InputError for data without test
     views, methods that do not load, equal names, and a comparison or runs with other settings."""
+    data = [Path(os.path.abspath(path)) for path in data]  # a link keeps its own name
     for option, names, remedy in (
-        ("DATA", [absolute(path).name for path in data], "give the folders different names"),
+        ("DATA", [path.name for path in data], "give the folders different names"),
         ("--methods", [Path(method).stem for method in methods], "name each once"),
         ("--seeds", [str(seed) for seed in seeds], "give each once"),
     ):
@@ -102,7 +103,7 @@ def plan(
     if any(setting.partition("=")[0].strip() == "seed" for setting in shared.settings):
         raise InputError("a comparison takes its seeds from --seeds", "--set", "seed", "drop it here")
     jobs = []
-    for seed, path, method in itertools.product(seeds, map(absolute, data), methods):
+    for seed, path, method in itertools.product(seeds, data, methods):
         run = str(folder.resolve() / RUNS / path.name / Path(method).stem / f"seed{seed}")
         variant = str(Path(method).resolve()) if method.endswith(".toml") else method
         jobs.append(Job(folder=run, data=str(path), variant=variant, seed=seed, **vars(shared)))
@@ -194,8 +195,3 @@ def finished(job: Job) -> bool:
 def jobs_in(folder: Path) -> list[Job]:
     """Return the jobs of all runs in the folder of a comparison."""
     return [Job.read(path.parent) for path in (folder / RUNS).glob(f"*/*/*/{JOB}")]
-
-
-def absolute(path: Path) -> Path:
-    """Return an absolute path without dots; a link keeps its own name."""
-    return Path(os.path.abspath(path))

@@ -15,7 +15,6 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.errors import InputError
 from mi_refgs.fitting.ssim import WINDOW_RADIUS, WINDOW_SIGMA
 from mi_refgs.io.images import psnr_of, srgb_from_linear
 from mi_refgs.render.display import displayed
@@ -67,11 +66,8 @@ def _lpips_network() -> Any:
     return package.LPIPS(net="alex", verbose=False).eval()  # as the authors recommend for comparing images
 
 
-def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    if np.shape(image) != np.shape(truth):
-        sizes = f"{np.shape(image)} and {np.shape(truth)}"
-        raise InputError(f"shapes {sizes} differ", "metrics", "image", "render at the size of the data set")
-    return np.clip(np.asarray(image, np.float64), 0, 1), np.clip(np.asarray(truth, np.float64), 0, 1)
+def _pair(*images: np.ndarray) -> list[np.ndarray]:
+    return [np.clip(np.asarray(image, np.float64), 0, 1) for image in images]
 
 
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> dict[str, float]:

@@ -35,12 +35,8 @@ def load() -> None:
             importlib.import_module(module)
 
 
-def _quiet_conversions() -> None:
-    """Mitsuba tries each tensor of a dictionary as a vector and as colours; for one with three rows, nanobind
-    prints a line for each failure. Only its C++ function can switch that off."""
-    with contextlib.suppress(StopIteration, OSError, AttributeError):  # elsewhere, the lines stay
-        library = ctypes.CDLL(str(next(Path(mi.__file__).parent.glob("libnanobind*"))))
-        library._ZN8nanobind6detail26set_implicit_cast_warningsEb(False)
-
-
-_quiet_conversions()
+# Mitsuba tries each tensor of a dictionary as a vector and as colours; for one with three rows, nanobind
+# prints a line for each failure. Only its C++ function can switch that off.
+with contextlib.suppress(StopIteration, OSError, AttributeError):  # elsewhere, the lines stay
+    library = ctypes.CDLL(str(next(Path(mi.__file__).parent.glob("libnanobind*"))))
+    library._ZN8nanobind6detail26set_implicit_cast_warningsEb(False)

@@ -20,9 +20,6 @@ from mi_refgs.viewer.panels import MaterialsPanel, add_cameras, add_display, add
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.region_panel import RegionPanel
 
-USUAL_SHAPES, WARM = (1.0, 1.6), 4
-"""Aspect ratios of desktop windows less the panel, and number of levels, that are compiled beforehand."""
-
 
 def serve(run: Run, address: tuple[str, int], output: Path | None, data: Path | None) -> Page:
     """Return the page of a run, with the views of its data set, or of that in `data`; writes nothing. Raises
@@ -61,7 +58,8 @@ def splits_of(run: Run, data: Path | None) -> dict[str, Dataset]:
 def warm_up(page: Page) -> None:
     """Compile the kernels of images during motion; choose their first level."""
     say("preparing: compiling for each image size")
-    for shape, side in itertools.product(USUAL_SHAPES, resolution.SIDES[:WARM]):
+    # Aspect ratios of desktop windows less the panel, and the first levels.
+    for shape, side in itertools.product((1.0, 1.6), resolution.SIDES[:4]):
         camera = page.start().camera(*resolution.size_of(side, shape))
         for _ in range(2):
             begin = time.monotonic()
