@@ -10,7 +10,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import fitted_gain
 from mi_refgs.data.view import View
 from mi_refgs.io.images import psnr_of
-from mi_refgs.render.display import displayed, image_array
+from mi_refgs.render.display import composited, displayed, image_array
 from mi_refgs.render.pipeline import Frame
 
 
@@ -23,11 +23,7 @@ def displayed_image(frame: Frame, view: View, data: Dataset, gain: np.ndarray | 
 
 def with_gain(frame: Frame, view: View, data: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """The `fitted_gain` (3,) of a rendered view, and its image (H, W, 3) with that gain."""
-    planes, alpha = list(frame.radiance), image_array(frame.alpha, view.height, view.width)
-    if frame.background is not None:  # the image is opaque
-        planes = [a + (1 - frame.alpha) * b for a, b in zip(planes, frame.background, strict=True)]
-        alpha = np.ones_like(alpha)
-    rendered = image_array(planes, view.height, view.width)
+    rendered, alpha = (image_array(planes, view.height, view.width) for planes in composited(frame))
     gain = fitted_gain(rendered, alpha, view, data.background)
     return gain, displayed_image(frame, view, data, gain)
 
