@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,33 +20,40 @@ STEPS = 14
 """Into the deferred stage, with the first mesh, a reset and two rounds of densifying."""
 
 
-def changed(change: Callable[[View], dict[str, Any]], linear: bool = False, views: int = 6) -> Dataset:
-    data = ball(views=views)
-    found = (with_pixels(view, **change(view)) for view in data.views)
-    found = (replace(view, is_linear_radiance=linear) for view in found)
+SIZE = (24, 24)
+
+
+def changed(
+    image: Callable[[View], np.ndarray] | None = None,
+    linear: bool = False,
+    views: int = 6,
+    **alpha: np.ndarray | None,
+) -> Dataset:
+    """The ball with other images, or other alpha."""
+    data, found = ball(views=views), []
+    for view in data.views:
+        pixels = alpha if image is None else {"image": image(view), **alpha}
+        found.append(replace(with_pixels(view, **pixels), is_linear_radiance=linear))
     return replace(data, views=tuple(found), is_linear_radiance=linear)
 
 
-def radiance(view: View, peak: float) -> dict[str, Any]:
+def radiance(view: View, peak: float) -> np.ndarray:
     """The ball in linear, premultiplied radiance on white; its highlight reaches `peak`."""
     linear = linear_from_srgb(view.image).astype(np.float32)
     assert view.alpha is not None
     linear[(view.alpha > 0) & (view.image.min(axis=-1) > 0.5)] = peak
-    return {"image": linear}
+    return linear
 
-
-BLACK = {"image": np.zeros((24, 24, 3), np.float32)}
-WHITE = {"image": np.ones((24, 24, 3), np.float32)}
 
 CASES: dict[str, Callable[[], Dataset]] = {
-    "black": lambda: changed(lambda view: BLACK),
-    "white": lambda: changed(lambda view: WHITE),
-    "under-exposed": lambda: changed(lambda view: {"image": np.round(view.image * 3) / 255}),
-    "over-exposed": lambda: changed(lambda view: {"image": np.minimum(50 * view.image, 1)}),
-    "opaque everywhere": lambda: changed(lambda view: {"alpha": np.ones((24, 24), np.float32)}),
-    "without alpha": lambda: changed(lambda view: {"alpha": None}),
-    "black without alpha": lambda: changed(lambda view: BLACK | {"alpha": None}),
-    "two views": lambda: changed(lambda view: {}, views=2),
+    "black": lambda: changed(lambda view: 0 * view.image),
+    "white": lambda: changed(lambda view: np.ones_like(view.image)),
+    "under-exposed": lambda: changed(lambda view: np.round(view.image * 3) / 255),
+    "over-exposed": lambda: changed(lambda view: np.minimum(50 * view.image, 1)),
+    "opaque everywhere": lambda: changed(alpha=np.ones(SIZE, np.float32)),
+    "without alpha": lambda: changed(alpha=None),
+    "black without alpha": lambda: changed(lambda view: 0 * view.image, alpha=None),
+    "two views": lambda: changed(views=2),
     "peak of 1e6": lambda: changed(lambda view: radiance(view, 1e6), linear=True),
     "peak of 1e30": lambda: changed(lambda view: radiance(view, 1e30), linear=True),
 }
@@ -67,7 +73,7 @@ def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [changed(lambda view: {"alpha": np.zeros((24, 24), np.float32)}), changed(lambda view: {}, views=1)],
+    [changed(alpha=np.zeros(SIZE, np.float32)), changed(views=1)],
     ids=["nothing but background", "one view"],
 )
 def test_what_cannot_be_begun_is_one_sentence(data: Dataset, tmp_path: Path) -> None:

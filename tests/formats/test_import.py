@@ -33,33 +33,23 @@ LAYOUTS = {"3DGS of degree 0": (3, 0), "3DGS of degree 3": (3, 3), "2DGS": (2, 2
 """Number of scales of a splat, and the SH degree of its colour."""
 
 
-def raw_of(sizes: int, degree: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Raw values as in the files, quaternions w first; colours go beyond black and white."""
-    terms = (degree + 1) ** 2
+def their_columns(sizes: int, degree: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """The columns as the released code writes them: f_rest channel after channel, zero normals; colours go
+    beyond black and white."""
     position = rng.uniform(-0.5, 0.5, (COUNT, 3))
     position[:, 2] = np.linspace(-0.6, 0.6, COUNT)  # far enough apart for every rule of sorting
     turn = np.concatenate([np.ones((COUNT, 1)), 0.25 * rng.normal(size=(COUNT, 3))], axis=1)
-    return {
-        "position": position.astype(np.float32),
-        "dc": (3 * rng.normal(size=(COUNT, 3))).astype(np.float32),
-        "rest": (0.3 * rng.normal(size=(COUNT, 3, terms - 1))).astype(np.float32),
-        "opacity": rng.normal(size=(COUNT, 1)).astype(np.float32),
-        "scale": np.log(rng.uniform(0.1, 0.25, (COUNT, sizes))).astype(np.float32),
-        "rotation": turn.astype(np.float32),
-    }
-
-
-def their_bytes(raw: dict[str, np.ndarray]) -> bytes:
-    """The file as the released code writes it: f_rest channel after channel, zero normals."""
-    columns = dict(zip("xyz", raw["position"].T, strict=True))
-    columns |= {name: np.zeros(COUNT, np.float32) for name in ("nx", "ny", "nz")}
-    rest = np.concatenate([*raw["rest"].transpose(1, 0, 2)], axis=1)
-    for name, values in (("f_dc", raw["dc"]), ("f_rest", rest)):
+    columns = dict(zip("xyz", position.T, strict=True))
+    columns |= {name: np.zeros(COUNT) for name in ("nx", "ny", "nz")}
+    for name, values in (
+        ("f_dc", 3 * rng.normal(size=(COUNT, 3))),
+        ("f_rest", 0.3 * rng.normal(size=(COUNT, 3 * (degree + 1) ** 2 - 3))),
+        ("scale", np.log(rng.uniform(0.1, 0.25, (COUNT, sizes)))),
+        ("rot", turn),
+    ):
         columns |= {f"{name}_{i}": column for i, column in enumerate(values.T)}
-    columns["opacity"] = raw["opacity"][:, 0]
-    for name, values in (("scale", raw["scale"]), ("rot", raw["rotation"])):
-        columns |= {f"{name}_{i}": column for i, column in enumerate(values.T)}
-    return ply_bytes(columns)
+    columns["opacity"] = rng.normal(size=COUNT)
+    return {name: column.astype(np.float32) for name, column in columns.items()}
 
 
 def pinhole() -> PinholeCamera:
@@ -69,30 +59,36 @@ def pinhole() -> PinholeCamera:
     return PinholeCamera(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose, 0.01)
 
 
-def their_image(raw: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+def their_image(columns: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
     """Encoded colours, composited as they are, in float64; and where a cut may fall either way."""
-    table = {name: raw[name].astype(np.float64) for name in ("position", "rotation", "scale", "opacity")}
-    table["rotation"] = table["rotation"][:, [1, 2, 3, 0]]
-    towards = table["position"] - camera.to_world[:3, 3]
+
+    def table(*starts: str) -> np.ndarray:
+        found = [columns[name] for start in starts for name in columns if name.startswith(start)]
+        return np.stack(found, axis=1).astype(np.float64)
+
+    raw = {name: table(name) for name in ("scale", "opacity")}
+    raw |= {"position": table("x", "y", "z"), "rotation": table("rot_1", "rot_2", "rot_3", "rot_0")}
+    towards = raw["position"] - camera.to_world[:3, 3]
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    coefficients = np.concatenate([raw["dc"][:, :, None], raw["rest"]], axis=2)
-    columns = coefficients.transpose(0, 2, 1).reshape(COUNT, -1).astype(np.float64)
-    maps = oracle.splat(table, np.maximum(0, harmonics(columns, towards) + 0.5), camera)
+    dc = table("f_dc")
+    rest = table("f_rest").reshape(COUNT, 3, -1) if "f_rest_0" in columns else np.zeros((COUNT, 3, 0))
+    sh = np.concatenate([dc[:, :, None], rest], axis=2).transpose(0, 2, 1).reshape(COUNT, -1)
+    maps = oracle.splat(raw, np.maximum(0, harmonics(sh, towards) + 0.5), camera)
     return maps.features + (1 - maps.alpha[..., None]) * BACKGROUND, maps.band
 
 
 @pytest.fixture
 def theirs(tmp_path: Path, rng: np.random.Generator) -> Path:
     path = tmp_path / "theirs.ply"
-    path.write_bytes(their_bytes(raw_of(3, 0, rng)))
+    path.write_bytes(ply_bytes(their_columns(3, 0, rng)))
     return path
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_splat_file_matches_float64_reference(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
-    raw, path, c = raw_of(*LAYOUTS[name], rng), tmp_path / "theirs.ply", pinhole()
-    path.write_bytes(their_bytes(raw))
-    goal, band = their_image(raw, c)
+    columns, path, c = their_columns(*LAYOUTS[name], rng), tmp_path / "theirs.ply", pinhole()
+    path.write_bytes(ply_bytes(columns))
+    goal, band = their_image(columns, c)
     scene = read_splats(path)
     assert scene.surfels.sh_degree() == LAYOUTS[name][1]
     frame = scene.renderer()(Camera.from_pose(SIZE, SIZE, c.fx, c.fy, c.cx, c.cy, c.to_world, c.near))
@@ -124,7 +120,7 @@ def test_import_splats_equals_the_command(theirs: Path, tmp_path: Path) -> None:
 def test_imported_gaussians_are_exported_as_is(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
     """Encoded colours are not fitted anew; Gaussians come back bit for bit."""
     theirs, again = tmp_path / "theirs.ply", tmp_path / "again.ply"
-    theirs.write_bytes(their_bytes(raw_of(*LAYOUTS[name], rng)))
+    theirs.write_bytes(ply_bytes(their_columns(*LAYOUTS[name], rng)))
     mi_refgs.import_splats(theirs).export("3dgs-ply", again)
     before, after = (read_splats(path).surfels.to_numpy() for path in (theirs, again))
     columns = before["radiance_sh"].shape[1]
@@ -174,7 +170,7 @@ def test_other_files_are_refused(
     content: bytes | tuple[bytes, bytes] | None, message: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     """Files, replacements in the header of a good file, and its header with zeros."""
-    path, whole = tmp_path / "file.ply", their_bytes(raw_of(3, 3, rng))
+    path, whole = tmp_path / "file.ply", ply_bytes(their_columns(3, 3, rng))
     header, end, body = whole.partition(b"end_header\n")
     if content is None:
         content = header + end + bytes(len(body))
