@@ -4,6 +4,7 @@ get those of the surfels around the mesh's vertices."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,7 +17,7 @@ from scipy import ndimage
 
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError, SceneError
-from mi_refgs.formats.format import Shot, import_extra
+from mi_refgs.formats.format import Shot
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
 from mi_refgs.occlusion.mesh import Mesh, clean
@@ -69,7 +70,9 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
     memory = BASE + PER_TEXEL * texture**2 + PER_SHOWN_SURFEL * trained.count
     require(memory, f"--texture: {texture} × {texture} texels", "bake a smaller texture")
     for package in PACKAGES:
-        import_extra(package)
+        if importlib.util.find_spec(package) is None:
+            remedy = 'pip install "mi_refgs[export]"'
+            raise InputError(f"{package} is not installed", "--to", remedy=remedy)
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
         remedy = "fit one with occlusion, as `--for relighting` does"

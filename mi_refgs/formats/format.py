@@ -76,15 +76,6 @@ def options_of(names: Iterable[str]) -> dict[str, Option]:
     return {option.name: option for name in names for option in FORMATS[name].options}
 
 
-def import_extra(name: str) -> Any:
-    """Import a module of the extra `export`; raises InputError that says how to install it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        remedy = 'pip install "mi_refgs[export]"'
-        raise InputError(f"{name} is not installed", "--to", remedy=remedy) from None
-
-
 def write(
     trained: TrainedScene,
     names: Sequence[str],

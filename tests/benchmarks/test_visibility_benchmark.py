@@ -51,18 +51,14 @@ def test_bounces_approach_the_path_tracer_at_full_depth() -> None:
 def test_setting_is_chosen_on_other_scenes_within_budget() -> None:
     """`lucky` is best here, `steady` on the other scene, which decides; `dear` is over the budget."""
     here = {"mirror ray": (1.0, 10.0), "lucky": (0.1, 29.0), "steady": (0.2, 20.0), "dear": (0.01, 31.0)}
-    there = {"mirror ray": 1.0, "lucky": 0.9, "steady": 0.3, "dear": 0.01}
-    fixed = {"roughness": 0.3}
+    there = {"mirror ray": (1.0, 10.0), "lucky": (0.9, 10.0), "steady": (0.3, 10.0), "dear": (0.01, 10.0)}
+    paper = {HARMONICS: (0.4, None)}
     rows: list[dict[str, Any]] = [
-        {"scene": "here", "method": name, "relmse": error, "frame_ms": time, **fixed}
-        for name, (error, time) in here.items()
+        {"scene": scene, "method": name, "relmse": error, "frame_ms": time, "roughness": 0.3}
+        for scene, found in (("here", here | paper), ("there", there | paper))
+        for name, (error, time) in found.items()
     ]
-    rows += [
-        {"scene": "there", "method": name, "relmse": error, "frame_ms": 10.0, **fixed}
-        for name, error in there.items()
-    ]
-    paper = {"method": HARMONICS, "relmse": 0.4, "frame_ms": None, **fixed}
-    found = tradeoffs([*rows, *({"scene": scene, **paper} for scene in ("here", "there"))])[0]
+    found = tradeoffs(rows)[0]
     assert (found["scene"], found["method"]) == ("here", "steady")
     assert found["gain"] == pytest.approx(2) and found["price"] == pytest.approx(2)
     assert found["best_gain"] == pytest.approx(4) and found["mirror_relmse"] == 1

@@ -59,16 +59,14 @@ def test_l1_of_clipped_highlights(images: Images) -> None:
     image, target = images
     target = target.copy()
     target[3:9, 4:12] = 1.0
-    image = image * 1.6
+    image, goal = image * 1.6, planes(target)
     clipped = target >= 254.5 / 255
     assert np.any(clipped & (image > 1)) and np.any(clipped & (image < 1))
-    check(
-        lambda x: losses.l1(
-            losses.clip_highlights(x, planes(target), losses.saturated(planes(target))), planes(target)
-        ),
-        lambda x: reference.l1(x, target, clipped),
-        image,
-    )
+
+    def loss(x: list[Any]) -> Any:
+        return losses.l1(losses.clip_highlights(x, goal, losses.saturated(goal)), goal)
+
+    check(loss, lambda x: reference.l1(x, target, clipped), image)
 
 
 def test_only_objects_own_colour_is_highlight() -> None:
@@ -96,19 +94,17 @@ def test_display_image(rng: np.random.Generator) -> None:
     alpha = 0.05 + 0.9 * rng.random((HEIGHT, WIDTH, 1))
     radiance = 2 * alpha * rng.random((HEIGHT, WIDTH, 3)) ** 2
     both = np.concatenate([radiance, alpha], axis=-1)
-    weights = rng.normal(size=(HEIGHT, WIDTH, 3)) / 100
+    weights = (rng.normal(size=(HEIGHT, WIDTH, 3)) / 100).astype(np.float32)
     background = (1.0, 0.5, 0.0)
 
     def loss(x: list[Any]) -> Any:
         image = display.display_image(x[:3], x[3], background)
         return dr.sum(sum((a * b for a, b in zip(image, planes(weights), strict=True)), mi.Float(0)))
 
-    rounded = weights.astype(np.float32)
-    check(
-        loss,
-        lambda x: float(np.sum(rounded * reference.display_image(x[..., :3], x[..., 3], background))),
-        both,
-    )
+    def define(x: np.ndarray) -> float:
+        return float(np.sum(weights * reference.display_image(x[..., :3], x[..., 3], background)))
+
+    check(loss, define, both)
 
 
 def test_display_image_shows_background_of_empty_pixels() -> None:
@@ -192,7 +188,5 @@ def test_difference_of_lights(rng: np.random.Generator) -> None:
     free = (photographed > losses.CLIPPED) & (radiance > photographed) & (seen == 1)[:, None]
     assert free.any() and not slope[free].any()
     brighter = photographed * np.float32(1.5) + np.float32(0.5)  # same log ratio in all channels
-    unseen = losses.light_difference(
-        mi.Color3f(brighter.T), mi.Color3f(photographed.T), mi.Float(np.zeros(40)), mi.Float(area)
-    )
-    assert float(unseen[0]) < 1e-6
+    unseen = mi.Color3f(brighter.T), mi.Color3f(photographed.T), mi.Float(np.zeros(40)), mi.Float(area)
+    assert float(losses.light_difference(*unseen)[0]) < 1e-6

@@ -47,24 +47,18 @@ def test_equals_published_algorithm(rng: np.random.Generator) -> None:
     """Ten steps of two tensors with a schedule and per-column rates; gradients as small as a mean over pixels
     gives."""
     start = {"position": rng.normal(size=(7, 3)), "radiance_sh": rng.normal(size=(7, 12))}
-    groups = {
-        "position": LearningRate(1e-2, 1e-4, 10),
-        "radiance_sh": LearningRate(7.5e-3, head=3, tail=1 / 20),
-    }
+    sh = LearningRate(7.5e-3, head=3, tail=1 / 20)
+    groups = {"position": LearningRate(1e-2, 1e-4, 10), "radiance_sh": sh}
     params = {name: tensor(values) for name, values in start.items()}
     optimiser = Adam(params, groups)
-    gradients = {
-        name: [1e-7 * rng.normal(size=values.shape) for _ in range(10)] for name, values in start.items()
-    }
+    gradients = {name: 1e-7 * rng.normal(size=(10, *values.shape)) for name, values in start.items()}
     for step in range(10):
         advance(optimiser, step, **{name: found[step] for name, found in gradients.items()})
     columns = np.where(np.arange(12) < 3, 1, 1 / 20)
-    rates = {
-        "position": [1e-2 * 100 ** (-step / 10) for step in range(10)],
-        "radiance_sh": [7.5e-3 * columns] * 10,
-    }
+    rates = {"position": [1e-2 * 100 ** (-step / 10) for step in range(10)]}
+    rates["radiance_sh"] = [7.5e-3 * columns] * 10
     for name, values in start.items():
-        wanted = reference.adam(values.astype(np.float32), gradients[name], rates[name])
+        wanted = reference.adam(values.astype(np.float32), [*gradients[name]], rates[name])
         moved = np.linalg.norm(wanted - values)
         assert np.linalg.norm(params[name].numpy() - wanted) < 2e-4 * moved + 1e-6
         assert moved > 1e-3 and dr.grad_enabled(params[name])
@@ -213,22 +207,25 @@ def test_resume_is_bitwise(rng: np.random.Generator) -> None:
         assert value.tobytes() == resumed.state_dict()[key].tobytes()
 
 
-def test_relative_rate_scales_lamps() -> None:
-    """A relative group: what is above 1 moves by the rate times itself, what is below by the rate."""
-    start = np.array([[-3.0], [0.5], [1.0], [4.0], [50.0]])
-    params, optimiser = adam(start, LearningRate(0.1, relative=True))
-    advance(optimiser, 0, x=-np.ones((5, 1)))
-    moved = params["x"].numpy() - start
-    np.testing.assert_allclose(moved, 0.1 * np.maximum(start, 1), rtol=1e-3)
-
-
-def test_rate_of_positions_grows_with_their_distance() -> None:
-    """Each row of a group with a centre moves by the rate times its distance from there, in its unit."""
-    start = np.array([[1.0, 2, 3], [1, 2, 5], [1 + 30, 2, 3 + 40], [1, 1.5, 3]])
-    params, optimiser = adam(start, LearningRate(0.1, centre=(1.0, 2.0, 3.0), unit=2.0))
-    advance(optimiser, 0, x=-np.ones((4, 3)))
-    moved = params["x"].numpy() - start
-    np.testing.assert_allclose(moved, 0.1 * np.array([0, 1, 25, 0.25])[:, None] * np.ones(3), rtol=1e-3)
+@pytest.mark.parametrize(
+    ("start", "options", "factors"),
+    [
+        # What is above 1 moves by the rate times itself, what is below by the rate.
+        ([[-3.0], [0.5], [1.0], [4.0], [50.0]], {"relative": True}, [[1], [1], [1], [4], [50]]),
+        # Each row moves by the rate times its distance from the centre, in its unit.
+        (
+            [[1.0, 2, 3], [1, 2, 5], [1 + 30, 2, 3 + 40], [1, 1.5, 3]],
+            {"centre": (1.0, 2.0, 3.0), "unit": 2.0},
+            [[0] * 3, [1] * 3, [25] * 3, [0.25] * 3],
+        ),
+    ],
+)
+def test_rates_of_lamps_and_of_distant_positions_grow(
+    start: list[list[float]], options: dict[str, Any], factors: list[list[float]]
+) -> None:
+    params, optimiser = adam(np.array(start), LearningRate(0.1, **options))
+    advance(optimiser, 0, x=-np.ones_like(start))
+    np.testing.assert_allclose(params["x"].numpy() - start, 0.1 * np.array(factors), rtol=1e-3)
 
 
 def test_every_tensor_has_its_bit_however_many_there_are() -> None:

@@ -117,11 +117,3 @@ def test_small_run_continues(tmp_path: Path) -> None:
     before = path.stat().st_mtime_ns
     assert run_process(*command).returncode == 0 and (tmp_path / "images.json").is_file()
     assert path.stat().st_mtime_ns == before
-
-
-def test_data_file_is_read_as_it_was_written(tmp_path: Path) -> None:
-    """Rows of the same keys, of different ones, and none."""
-    for rows in ([], [{"a": 1, "b": "x"}, {"a": 0.5, "b": None}], [{"a": 1}, {"b": 2}]):
-        result = {"build": {"commit": "abc"}, "seconds": 1.5, "rows": rows}
-        write_result(tmp_path / "a.json", result)
-        assert read_result(tmp_path / "a.json") == result
