@@ -11,7 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mi_refgs.editing.options import Assignments, Change, EditOptions, Selection
+from mi_refgs.editing.options import Assignments, EditOptions, Selection
 from mi_refgs.editing.selection import COLOUR, SurfelValues, activated, select
 from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.occlusion.mesh import Mesh
@@ -64,21 +64,19 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> tuple[TrainedSc
     for name in options.keys() - known:
         raise InputError("unknown option", "edit", name, f"use some of {', '.join(known)}")
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
-    selection = Selection(**{f.name: given.pop(f.name) for f in fields(Selection) if f.name in given})
     made = assignments(given.get("set", ()))
-    change = Change(**given | {"set": tuple(assignment.text for assignment in made)})
-    if not (change.materials or change.set or change.cut):
+    given["set"] = [assignment.text for assignment in made]
+    materials, cut = (given.get(name, False) for name in ("materials", "cut"))
+    if not (materials or made or cut):
         raise InputError("nothing to do", "edit", remedy="give --set, --cut or another change")
-    if change.materials:
+    if materials:
         scene = replace(relightable(scene), surroundings=scene.surroundings, near=scene.near)
-    chosen = select(scene, selection)
-    notes = notes_of(scene, made, change.cut)
-    changed = apply(scene, chosen, made, change.cut)
+    chosen = select(scene, Selection(**{f.name: given[f.name] for f in fields(Selection) if f.name in given}))
+    changed = apply(scene, chosen, made, cut)
     counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}
-    used = {name: value for name, value in (vars(selection) | vars(change)).items() if value is not None}
-    record = json.loads(json.dumps(used, default=lambda x: x.tolist()))  # arrays and tuples as lists
+    record = json.loads(json.dumps(given, default=lambda x: x.tolist()))  # arrays and tuples as lists
     record = {name: value for name, value in record.items() if value}
-    return changed, {**record, **counts, "notes": notes}
+    return changed, {**record, **counts, "notes": notes_of(scene, made, cut)}
 
 
 def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list[str]:

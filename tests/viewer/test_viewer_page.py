@@ -1,4 +1,4 @@
-"""`refgs view` in a real browser: every panel of a page, and the page of a running fit."""
+"""`refgs view` in a real browser: every panel of a page."""
 
 from __future__ import annotations
 
