@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Self
 
 
@@ -45,6 +46,13 @@ class UnknownNameError(InputError):
 
 class SceneError(InputError):
     """A scene lacks what a request needs. Where a run is read, its folder precedes the message."""
+
+
+def require_between(value: float, option: str, least: float, most: float = math.inf) -> None:
+    """Raise InputError for a number that is not in least … most."""
+    if not least <= value <= most:
+        remedy = f"give a number from {least}" if most == math.inf else f"give {least} to {most}"
+        raise InputError(f"{value} is out of range", option, remedy=remedy)
 
 
 def counted(count: int, noun: str) -> str:

@@ -15,7 +15,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from mi_refgs import llvm
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, require_between
 from mi_refgs.io.resources import resource_dir
 from mi_refgs.registry import load_plugins
 
@@ -81,15 +81,13 @@ class Rendering(Common):
         import drjit as dr
         import mitsuba as mi
 
-        variant, most = self.mitsuba_variant, 4 * (os.cpu_count() or 1)
+        variant = self.mitsuba_variant
         usable = [name for name in mi.variants() if name.endswith("_ad_rgb")]
         if variant not in usable:
             what, remedy = f"{variant}: cannot be used", f"give one of {', '.join(usable)}"
             raise InputError(what, "--mitsuba-variant", remedy=remedy)
         if self.threads is not None:
-            if not 1 <= self.threads <= most:
-                what = f"{self.threads} is out of range"
-                raise InputError(what, "--threads", remedy=f"give 1 to {most}")
+            require_between(self.threads, "--threads", 1, 4 * (os.cpu_count() or 1))
             dr.set_thread_count(self.threads)
         try:
             mi.set_variant(variant)

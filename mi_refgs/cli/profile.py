@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mi_refgs.cli.command import OtherData, Rendering, Result, RunFolder
-from mi_refgs.errors import InputError
+from mi_refgs.errors import require_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +31,7 @@ class Profile:
         from mi_refgs.runs.run import Run
         from mi_refgs.runs.views import views_of_run
 
-        if self.steps < 1:
-            raise InputError(f"{self.steps} is out of range", "--steps", remedy="give a number from 1")
+        require_between(self.steps, "--steps", 1)
         folder = Run(self.run_folder)
         method = folder.method()
         trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, optional, separated
-from mi_refgs.errors import InputError, counted
+from mi_refgs.errors import InputError, counted, require_between
 
 AOVS = "albedo, metallic, roughness, normal, depth, alpha, visibility, diffuse, specular, indirect"
 
@@ -50,9 +50,7 @@ class Render:
             raise InputError("its folder does not exist", out, "output", remedy)
         require_no_run(out)
         require_no_data(out)
-        if self.samples is not None and self.samples < 1:
-            what = f"{self.samples} is out of range"
-            raise InputError(what, "--samples", remedy="give a number from 1")
+        require_between(1 if self.samples is None else self.samples, "--samples", 1)
         cameras = None if self.camera is None else read_cameras(self.camera)
         scene = read(self.scene, separated(self.aov), self.object)
         own = scene.sensors()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.compare.worker import DONE, FAILURE, GRACE
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, require_between
 from mi_refgs.io.files import cannot_write, read_json
 from mi_refgs.runs.interrupt import held_interrupts
 
@@ -131,6 +131,5 @@ def _process(job: Job, stop: threading.Event | None) -> int:
 def threads_each(workers: int, threads: int | None) -> int | None:
     """Return the threads per process: `threads`, or an equal share of the cores."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if not 1 <= workers <= 4 * cores:
-        raise InputError(f"{workers} is out of range", "--workers", remedy=f"give 1 to {4 * cores}")
+    require_between(workers, "--workers", 1, 4 * cores)
     return threads if threads is not None or workers == 1 else max(cores // workers, 1)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refgs import __version__
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, require_between
 from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.decide import differences
 from mi_refgs.io.files import read_json, write_json
@@ -97,9 +97,7 @@ def plan(
         if twice := [name for name in names if names.count(name) > 1]:
             raise InputError(f"'{twice[0]}' is given twice", option, remedy=remedy)
     for seed in seeds:
-        if not 0 <= seed <= MAX_SEED:
-            remedy = f"give whole numbers from 0 to {MAX_SEED}"
-            raise InputError(f"{seed} is out of range", "--seeds", remedy=remedy)
+        require_between(seed, "--seeds", 0, MAX_SEED)
     if any(setting.partition("=")[0].strip() == "seed" for setting in shared.settings):
         raise InputError("a comparison takes its seeds from --seeds", "--set", "seed", "drop it here")
     jobs = []

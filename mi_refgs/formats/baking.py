@@ -16,7 +16,7 @@ import trimesh
 from scipy import ndimage
 
 from mi_refgs.data.view import evenly_spread
-from mi_refgs.errors import InputError, SceneError
+from mi_refgs.errors import InputError, SceneError, require_between
 from mi_refgs.formats.format import Shot
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
@@ -63,10 +63,8 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
     """Bake the object to a mesh of at most about `faces` triangles with textures of texture² texels.
     Background Gaussians are left out (`runs.relightable` says which materials the object gets). Raises
     InputError for a scene without mesh, light or materials, numbers out of range, and missing packages."""
-    if faces < 100:
-        raise InputError(f"{faces} is out of range", "--faces", remedy="give a number from 100")
-    if not 16 <= texture <= 8192:
-        raise InputError(f"{texture} is out of range", "--texture", remedy="give 16 to 8192")
+    require_between(faces, "--faces", 100)
+    require_between(texture, "--texture", 16, 8192)
     memory = BASE + PER_TEXEL * texture**2 + PER_SHOWN_SURFEL * trained.count
     require(memory, f"--texture: {texture} × {texture} texels", "bake a smaller texture")
     for package in PACKAGES:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import require_between
 from mi_refgs.formats.format import Shot
 from mi_refgs.io.exr import write_exr_layers
 from mi_refgs.plugins.aovs import aov_values, suffixes
@@ -24,9 +24,7 @@ def write(
     image: linear radiance, premultiplied. Every other layer is NAME.R, NAME.G, NAME.B, for vectors NAME.X …,
     and for one number NAME.V; depth is depth.Z, scene units along the viewing axis. The background map is the
     layer background, which R, G, B do not contain: add (1 - A) times it."""
-    if not 0 <= view < len(shots):
-        remedy = f"there are {len(shots)}, give 0 to {len(shots) - 1}"
-        raise InputError(f"{view} is out of range", "--view", remedy=remedy)
+    require_between(view, "--view", 0, len(shots) - 1)
     camera = shots[view].camera
     shown = replace(trained, surroundings=None) if object else trained
     frame = shown.renderer(samples=samples)(camera)

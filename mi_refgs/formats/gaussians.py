@@ -26,7 +26,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import evenly_spread
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, require_between
 from mi_refgs.formats.format import Shot
 from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
@@ -61,8 +61,7 @@ def write_ply(
 
 def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_only: bool) -> Surfels:
     """The scene as 3D Gaussians with display-encoded radiance_sh; `object_only`: without background ones."""
-    if not 0 <= degree <= MAX_SH_DEGREE:
-        raise InputError(f"{degree} is out of range", "--degree", remedy=f"give 0 to {MAX_SH_DEGREE}")
+    require_between(degree, "--degree", 0, MAX_SH_DEGREE)
     if object_only:
         trained = replace(trained, surroundings=None)
     around, tables = trained.surroundings, [trained.surfels.detach()]

@@ -21,7 +21,7 @@ from mi_refgs.data.view import View
 from mi_refgs.editing.change import apply, edit
 from mi_refgs.editing.options import EditOptions, Selection
 from mi_refgs.editing.selection import select
-from mi_refgs.errors import InputError, counted
+from mi_refgs.errors import InputError, counted, require_between
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.formats.splat_import import method_of, read_splats
@@ -107,9 +107,7 @@ class Reconstruction:
     def turntable(self, count: int) -> list[Camera]:
         """Return cameras on a circle around the object, at the distance and height of the test views. Raises
         InputError below 1."""
-        if count < 1:
-            remedy = "give a number of cameras from 1"
-            raise InputError(f"{count} is out of range", "turntable", remedy=remedy)
+        require_between(count, "turntable", 1)
         trained, region = self.trained, None
         if trained.surroundings is not None:  # the mesh contains the background, too
             trained, region = replace(trained, mesh=None), self.provenance.region

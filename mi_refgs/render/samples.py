@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR
-from mi_refgs.errors import InputError
+from mi_refgs.errors import require_between
 from mi_refgs.kernels.linear import linear
 from mi_refgs.kernels.trees import mapped
 from mi_refgs.render.gbuffer import inverse_alpha
@@ -21,8 +21,7 @@ from mi_refgs.types import Arrays, Color3f, Float
 
 def samples_per_axis(samples: int) -> int:
     """k of the k × k regular samples for a sample count: ⌈√samples⌉; raises InputError for less than 1."""
-    if samples < 1:
-        raise InputError(f"{samples} is out of range", "samples", remedy="give a number from 1")
+    require_between(samples, "samples", 1)
     return math.ceil(math.sqrt(samples))
 
 
