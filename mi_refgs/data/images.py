@@ -18,7 +18,7 @@ import numpy as np
 
 from mi_refgs.data.lens import Undistortion
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.io.exr import exr_has_alpha, read_exr_image
+from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import is_file
 from mi_refgs.io.images import (
     ENDINGS,
@@ -85,8 +85,7 @@ class ImageFile:
 
     def has_alpha(self) -> bool:
         """Whether there is alpha, by the file's header."""
-        header = exr_has_alpha if self.is_linear_radiance else has_alpha
-        return self.mask is not None or header(self.path)
+        return self.mask is not None or has_alpha(self.path)
 
     def decode(self) -> np.ndarray:
         """(H, W, 3 or 4): uint8 as in the file, else float32, averaged and premultiplied."""

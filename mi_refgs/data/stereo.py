@@ -64,8 +64,13 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     distance = float(np.median([np.linalg.norm(view.to_world[:3, 3] - centre) for view in small]))
     farthest = distance + FARTHEST * region.radius
     nearness = np.linspace(1 / (NEAREST * distance), 1 / farthest, DEPTHS, dtype=np.float32)
+    outward = np.array([view.to_world[:3, 3] for view in small]) - centre
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), NORM_FLOOR)
+    away = abs(np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1))) - BASELINE)
+    np.fill_diagonal(away, np.inf)
+    nearest = np.argsort(away, kind="stable")[:, : min(NEIGHBOURS, len(small) - 1)].tolist()
     swept = []
-    for i, near in enumerate(_neighbours(small, centre)):
+    for i, near in enumerate(nearest):
         others = [(small[j], grey[j]) for j in near]
         swept.append(_Swept(small[i], near, *_sweep(small[i], grey[i], others, nearness)))
     tolerance = AGREEMENT * float(nearness[0] - nearness[1])
@@ -89,15 +94,6 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     rays, rng = [np.concatenate(parts) for parts in zip(*off, strict=True)], np.random.default_rng(0)
     some, rest = rng.permutation(len(points))[:MOST], rng.permutation(len(rays[0]))[:MOST]
     return Stereo(PointCloud(points[some], colours[some]), spaced, PixelRays(*(part[rest] for part in rays)))
-
-
-def _neighbours(views: Sequence[View], centre: np.ndarray) -> list[list[int]]:
-    """For each view, those whose angle to it, seen from the centre, is nearest to BASELINE."""
-    outward = np.array([view.to_world[:3, 3] for view in views]) - centre
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), NORM_FLOOR)
-    away = abs(np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1))) - BASELINE)
-    np.fill_diagonal(away, np.inf)
-    return np.argsort(away, kind="stable")[:, : min(NEIGHBOURS, len(views) - 1)].tolist()
 
 
 def _sweep(

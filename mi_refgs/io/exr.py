@@ -185,14 +185,10 @@ def read_exr_light(path: Path) -> tuple[np.ndarray, str | None]:
     return (image[..., :3] if len(names) > 2 else image[..., [0, 0, 0]]), part.layout
 
 
-def exr_has_alpha(path: Path) -> bool:
-    """Whether `read_exr_image` returns colour with alpha, by the header; raises InputError as that does."""
-    return len(_read(path, pixels=False)[1]) == 4
-
-
-def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of an EXR file's display window; raises InputError as `read_exr_image`."""
-    return _read(path, pixels=False)[0].size
+def exr_header(path: Path) -> tuple[int, int, bool]:
+    """Width and height of the display window, and whether colour has alpha; raises as `read_exr_image`."""
+    part, names = _read(path, pixels=False)
+    return *part.size, len(names) == 4
 
 
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:

@@ -68,8 +68,16 @@ def _row(data: bytes, position: int, row: np.ndarray) -> int:
     if 8 <= width < 32768 and data[position : position + 4] == bytes((2, 2, width >> 8, width & 255)):
         position += 4
         for channel in range(4):
-            values, position = _runs(data, position, width)
-            row[:, channel] = np.frombuffer(values, np.uint8)
+            values = bytearray()
+            while len(values) < width:
+                count, position = data[position], position + 1
+                if count > 128:
+                    values += data[position : position + 1] * (count - 128)
+                    position += 1
+                else:
+                    values += data[position : position + count]
+                    position += count
+            row[:, channel] = np.frombuffer(values, np.uint8)  # fails if a run is longer than its row
         return position
     count = min(width, (len(data) - position) // 4)
     pixels = np.frombuffer(data, np.uint8, 4 * max(count, 0), position).reshape(-1, 4)
@@ -88,21 +96,3 @@ def _row(data: bytes, position: int, row: np.ndarray) -> int:
         raise ValueError("a run longer than its row")
     row[:] = np.repeat(pixels[last[:used]], counts[:used], axis=0)
     return position + 4 * used
-
-
-def _runs(data: bytes, position: int, width: int) -> tuple[bytes, int]:
-    """One channel of a row, and the position of the next; raises ValueError if it is too long."""
-    values = bytearray()
-    while len(values) < width:
-        count = data[position]
-        if count > 128:
-            values += data[position + 1 : position + 2] * (count - 128)
-            position += 2
-        else:
-            values += data[position + 1 : position + 1 + count]
-            position += 1 + count
-        if not count:
-            raise ValueError("an empty run")
-    if len(values) > width:
-        raise ValueError("a run longer than its row")
-    return bytes(values), position

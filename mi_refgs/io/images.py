@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.errors import InputError
-from mi_refgs.io.exr import exr_size
+from mi_refgs.io.exr import exr_header
 from mi_refgs.io.files import check_size, is_file, replace_file, require_file
 
 SRGB_LINEAR_LIMIT = 0.0031308  # linear value below which the sRGB curve is a straight line (IEC 61966-2-1)
@@ -77,7 +77,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of a PNG, JPEG or EXR file, from its header; raises InputError as its reader does."""
     path = Path(path)
     if path.suffix.lower() == ".exr":
-        return exr_size(path)
+        return exr_header(path)[:2]
     with open_image(path) as image:
         width, height = image.size
         return int(width), int(height)
@@ -132,8 +132,11 @@ def read_tiff(path: str | Path) -> np.ndarray:
 
 
 def has_alpha(path: str | Path) -> bool:
-    """Whether a PNG or JPEG file has alpha, from its header."""
-    with open_image(Path(path)) as image:
+    """Whether a PNG, JPEG or EXR file has alpha, from its header."""
+    path = Path(path)
+    if path.suffix.lower() == ".exr":
+        return exr_header(path)[2]
+    with open_image(path) as image:
         return _transparent(image)
 
 

@@ -90,10 +90,14 @@ class PrefilteredLight:
     def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
         """Radiance averaged over the GGX lobe: linear between levels in 1/roughness, which keeps energy and
         peak, and in roughness⁴ below the first. [split sum, Karis 2013]"""
-        place = _level(roughness)
-        lower = dr.minimum(mi.UInt32(dr.detach(place)), len(LEVEL_ROUGHNESS) - 1)
+        first, r = LEVEL_ROUGHNESS[0], dr.clip(roughness, 0, 1)
+        sharp, inverse = dr.minimum(r, first) * (1 / first), dr.rcp(dr.maximum(r, first))
+        level = dr.square(dr.square(sharp))
+        for a, b in pairwise(LEVEL_ROUGHNESS):
+            level += dr.clip((inverse - 1 / a) * (1 / (1 / b - 1 / a)), 0, 1)
+        lower = dr.minimum(mi.UInt32(dr.detach(level)), len(LEVEL_ROUGHNESS) - 1)
         at = azimuth_polar(direction)
-        return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), place - mi.Float(lower))
+        return dr.lerp(self._bilinear(*at, lower), self._bilinear(*at, lower + 1), level - mi.Float(lower))
 
     def _bilinear(self, u: Any, v: Any, level: Any) -> Any:
         """Colour at the fractions u of a turn and v of a meridian."""
@@ -147,18 +151,6 @@ def azimuth_polar(direction: Any) -> tuple[Any, Any]:
     # At the pole itself sqrt has no derivative, and only the sign of y distinguishes the two poles.
     sin = dr.select(off_pole, dr.sqrt(dr.select(off_pole, sin2, 1)), 0)
     return u, dr.atan2(sin, dr.select(off_pole, y, dr.select(y < 0, -1, 1))) * (1 / dr.pi)
-
-
-def _level(roughness: Any) -> Any:
-    """Fractional level 0 … L of a roughness."""
-    first = LEVEL_ROUGHNESS[0]
-    r = dr.clip(roughness, 0, 1)
-    sharp = dr.minimum(r, first) * (1 / first)
-    level = dr.square(dr.square(sharp))
-    inverse = dr.rcp(dr.maximum(r, first))
-    for a, b in pairwise(LEVEL_ROUGHNESS):
-        level += dr.clip((inverse - 1 / a) * (1 / (1 / b - 1 / a)), 0, 1)
-    return level
 
 
 @dataclass(frozen=True)

@@ -75,24 +75,20 @@ class NearField:
         return interpolated(lambda i: dr.gather(mi.Float, texels, i), u, v, h, 2 * h)
 
     def seen_from(self, position: Point3f, direction: Vector3f) -> Vector3f:
-        """Unit directions from the centre to what rays from `position` in unit directions meet. The distance
-        is looked up in the direction of the last point that was found, under AD."""
+        """Unit directions from the centre to what rays x + t r from `position` in unit directions meet, under
+        AD. The distance 1 / n is looked up in the direction of the last point that was found; on the sphere
+        of that radius t = τ / n, τ = √((x·r n)² + 1 - |x|² n²) - x·r n, and the direction is r + x n / τ,
+        also where n is 0. Where x is outside, t is SHORTEST radii or more."""
         offset = mi.Vector3f(position) - mi.Vector3f(self.on_device[1])
         towards, nearness = mi.Vector3f(direction), mi.Float(0)
         for index in range(LOOKUPS):
             found = self.at(towards)
             nearness = dr.lerp(found, nearness, DAMPING) if index else found
-            towards = _met(offset, direction, nearness)
+            along = dr.dot(offset, direction) * nearness
+            inside = dr.square(along) + 1 - dr.squared_norm(offset) * dr.square(nearness)
+            τ = dr.sqrt(dr.maximum(inside, SHORTEST**2)) - along
+            towards = safe_normalize(dr.fma(offset, nearness * dr.rcp(dr.maximum(τ, SHORTEST)), direction))
         return towards
-
-
-def _met(offset: Vector3f, ray: Vector3f, nearness: Float) -> Vector3f:
-    """Unit direction of x + t r on the sphere of radius 1 / n: that of r + x n / τ, t = τ / n, also where n
-    is 0; τ = √((x·r n)² + 1 - |x|² n²) - x·r n. Where x is outside, t is SHORTEST radii or more."""
-    along = dr.dot(offset, ray) * nearness
-    inside = dr.square(along) + 1 - dr.squared_norm(offset) * dr.square(nearness)
-    τ = dr.sqrt(dr.maximum(inside, SHORTEST**2)) - along
-    return safe_normalize(dr.fma(offset, nearness * dr.rcp(dr.maximum(τ, SHORTEST)), ray))
 
 
 @dataclass(frozen=True)

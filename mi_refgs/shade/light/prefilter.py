@@ -33,12 +33,8 @@ class Operator:
     matrix: csc_matrix  # float32, from coefficients of the map to those of all levels, one after the other
     info: UInt32  # 4 a level: first texel, h, w, 0; level 0 is the map itself
     shapes: tuple[tuple[int, int], ...]  # (first texel, h) of each level, the same on the host
+    texels: int  # of all levels
     kernels: Kernels | None  # in place of `apply` and `apply_transposed`
-
-    @property
-    def texels(self) -> int:
-        first, height = self.shapes[-1]
-        return first + 2 * height**2
 
     def apply(self, radiance: np.ndarray) -> np.ndarray:
         """Levels (texels, TEXEL) float32 of radiance (h, 2h, 3)."""
@@ -84,8 +80,7 @@ def _product(matrix: csc_matrix, coefficients: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=4)
-def _matrix(height: int) -> tuple[csc_matrix, list[int]]:
-    """The matrix of an operator, and the rows of its levels."""
+def _operator(variant: str, height: int) -> Operator:
     built, values, rows, columns, first = build_levels(height), [], [], [], 0
     for weights in built:
         i, k, m = np.nonzero(weights)
@@ -95,18 +90,12 @@ def _matrix(height: int) -> tuple[csc_matrix, list[int]]:
         first += len(weights) * (len(weights) + 1)
     places = np.concatenate(rows), np.concatenate(columns)
     matrix = csc_matrix((np.concatenate(values), places), shape=(first, height * (height + 1)))
-    return matrix, [len(weights) for weights in built]
-
-
-@functools.lru_cache(maxsize=4)
-def _operator(variant: str, height: int) -> Operator:
-    matrix, heights = _matrix(height)
-    firsts = np.cumsum([0, *(2 * h * h for h in (height, *heights[:-1]))]).tolist()
-    shapes = tuple(zip(firsts, (height, *heights), strict=True))
+    heights = [height, *(len(weights) for weights in built)]
+    *firsts, texels = np.cumsum([0, *(2 * h * h for h in heights)]).tolist()
+    shapes = tuple(zip(firsts, heights, strict=True))
     info = upload(np.array([(first, h, 2 * h, 0) for first, h in shapes]), mi.UInt32)
-    texels = shapes[-1][0] + 2 * heights[-1] ** 2
     kernels = Kernels.of(height, shapes, matrix, texels) if variant.startswith("cuda") else None
-    return Operator(height, matrix, info, shapes, kernels)
+    return Operator(height, matrix, info, shapes, texels, kernels)
 
 
 def operator(height: int) -> Operator:
