@@ -59,7 +59,7 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
     traced = ShadingOptions(**options.settings() | {"traced_bounces": 1, "diffuse": "irradiance"})
     ratios: VertexColours | None = None  # the first round is unoccluded
     for _bounce in range(BOUNCES):
-        scene = MeshRadiance.of(occluder, surfels, light, traced, ratios)
+        scene = MeshRadiance(occluder, surfels, light, traced, ratios)
 
         def body(index: Any, arrives: Any, total: Any, scene: MeshRadiance = scene) -> tuple[Any, ...]:
             direction = ambient_direction(frame, turn, index, rays)

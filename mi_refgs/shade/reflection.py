@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import FACING_TOLERANCE
-from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample, VertexColours
+from mi_refgs.occlusion.surface_materials import SurfaceSample, VertexColours
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.light import Light
@@ -36,38 +36,30 @@ class MeshHit:
     next: MeshHit | None = None  # what blocks it, if that is shaded too
 
 
-@dataclass(frozen=True)
 class MeshRadiance:
     """Radiance of the mesh, shaded with the attributes of surfels, harmonics of the nearest. What blocks a
     hit's mirror direction is another hit, `traced_bounces` times; what is blocked at last is dark."""
 
-    occluder: Occluder
-    surface: Surface
-    light: Light
-    options: ShadingOptions
-    harmonics: dict[str, tuple[Float, int]]  # by attribute: coefficients (3 C N,) by rows, and C
-    ambient: VertexColours | None  # ratios of irradiance that arrive, see `shade.ambient`
-
-    @staticmethod
-    def of(
+    def __init__(
+        self,
         occluder: Occluder,
         surfels: Surfels,
         light: Light,
         options: ShadingOptions,
-        ambient: VertexColours | None,
-    ) -> MeshRadiance:
+        ambient: VertexColours | None,  # ratios of irradiance that arrive, see `shade.ambient`
+    ) -> None:
         """Take the present values of all arguments, and evaluate them."""
+        self.occluder, self.light, self.options, self.ambient = occluder, light, options, ambient
         surfels = surfels.cleaned()  # one that became unusable after `set_materials` may still be looked up
         names = MODELS[options.reflectance].required_attributes(options)
-        surface = occluder.surface(surfels, [name for name in names if not attribute(name).harmonics])
-        harmonics = {}
+        self.surface = occluder.surface(surfels, [name for name in names if not attribute(name).harmonics])
+        self.harmonics: dict[str, tuple[Float, int]] = {}  # coefficients (3 C N,) by rows, and C
         for name in (name for name in names if attribute(name).harmonics):
             # In rows, whose adjoint is a table of its own: the columns must not be written to in that kernel.
             coefficients = surfels.value(name)
             rows = dr.ravel(mi.ArrayXf([x for c in coefficients for x in c]))
-            harmonics[name] = rows, len(coefficients)
-        dr.eval(surface.rows, harmonics)
-        return MeshRadiance(occluder, surface, light, options, harmonics, ambient)
+            self.harmonics[name] = rows, len(coefficients)
+        dr.eval(self.surface.rows, self.harmonics)
 
     def trace(
         self, point: Point3f, direction: Vector3f, normal: Vector3f, active: Bool, bounces: int
@@ -119,7 +111,7 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
         return points.replaced(visibility=dr.full(mi.Float, 1, dr.width(context.ray)), indirect=None)
     if bounces:
         assert context.light is not None  # by `Shading.require_inputs`
-        scene = MeshRadiance.of(occluder, context.surfels, context.light, options, occluder.ambient)
+        scene = MeshRadiance(occluder, context.surfels, context.light, options, occluder.ambient)
     with dr.suspend_grad():
         start = point, facing, seen = context.start(dr.detach(points.normal))
         mirror = reflect(view=points.view, normal=facing)
