@@ -32,11 +32,10 @@ from mi_refgs.evaluation.images import (
     normal_colours,
     panels,
 )
-from mi_refgs.io.files import is_file, read_json, write_bytes, write_json
+from mi_refgs.io.files import is_file, read_json, resource_dir, write_bytes, write_json
 from mi_refgs.io.images import read_png, to_8_bits
 from mi_refgs.io.ownership import own_folder
 from mi_refgs.io.progress import say
-from mi_refgs.io.resources import resource_dir
 from mi_refgs.reconstruction import relight as relighting
 from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.new_light import NewLight

@@ -16,7 +16,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from mi_refgs import llvm
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, require_between
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import resource_dir
 from mi_refgs.registry import load_plugins
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from mi_refgs.cli.command import Output, Preset, Rendering, Result, Settings, joined
 from mi_refgs.cli.evaluate import table
+from mi_refgs.io.files import resource_dir
 from mi_refgs.io.progress import say
-from mi_refgs.io.resources import resource_dir
 
 SCENE = "glossy_demo.xml"
 VIEWS, TEST_VIEWS, SIZE, SAMPLES = 60, 8, 112, 64  # chosen for less than 8 minutes on two cores

@@ -21,7 +21,7 @@ from mi_refgs.fitting.decide import HOLDOUT, as_decided, differences, waiting
 from mi_refgs.fitting.per_view import gains_of
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import resource_dir
 from mi_refgs.methods.method import POSE, Method
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run

@@ -21,6 +21,7 @@ from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import linear_from_srgb, srgb_from_linear, to_8_bits
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import SH_DC, sigmoid
+from mi_refgs.surfels.table import Surfels
 
 Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))  # glTF's world from ours
 Y_UP_QUATERNION = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)  # the same (x, y, z, w): the turn by -90° about x
@@ -64,7 +65,7 @@ def write_gaussians(
 
     Colours are display-encoded (srgb_rec709_display). glTF has +y up: a node turns the scene, whose +z is up.
     """
-    columns = _attributes(gaussians(trained, shots, degree, object).to_numpy())
+    columns = _attributes(gaussians(trained, shots, degree, object))
     # Accessors and views of one buffer, in the order of the attributes.
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
@@ -102,17 +103,15 @@ def write_gaussians(
     return [target]
 
 
-def _attributes(raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _attributes(table: Surfels) -> dict[str, np.ndarray]:
     """Return the vertex attributes (N, …) of Gaussians by name."""
+    raw, rotation = table.to_numpy(), table.rotation()
     sh, opacity = raw["radiance_sh"], sigmoid(raw["opacity"])
     colour = linear_from_srgb(np.clip(0.5 + SH_DC * sh[:, :3], 0, 1))
-    rotation = raw["rotation"].astype(np.float64)
-    length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    rotation = np.where(length > 0, rotation / np.where(length > 0, length, 1), [0, 0, 0, 1])
     columns = {
         "POSITION": raw["position"],
         "COLOR_0": np.concatenate([colour, opacity], axis=1),
-        f"{EXTENSION}:ROTATION": rotation,
+        f"{EXTENSION}:ROTATION": np.stack([rotation.x, rotation.y, rotation.z, rotation.w], axis=1),
         f"{EXTENSION}:SCALE": np.exp(raw["scale"].astype(np.float64)),
         f"{EXTENSION}:OPACITY": opacity,
     }

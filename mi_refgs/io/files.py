@@ -1,4 +1,4 @@
-"""Atomic writes, locks, names from untrusted files, JSON, and size checks before decoding."""
+"""Files of the package, atomic writes, locks, names from untrusted files, JSON, and size checks."""
 
 from __future__ import annotations
 
@@ -124,6 +124,16 @@ def _lock_of(path: Path) -> IO[str] | None:
         except OSError:  # no locks on this file system
             return file
         file.close()
+
+
+def resource_dir(name: str) -> Path:
+    """Folder "variants" or "scenes": inside an installed package, or beside that of a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    checkout = [package.parent] if (package.parent / "pyproject.toml").is_file() else []
+    for parent in (package, *checkout):
+        if (parent / name).is_dir():
+            return parent / name
+    raise InputError("the folder is missing from this installation", package, name, "install mi_refgs again")
 
 
 def remove_temporaries(folder: Path) -> None:

@@ -16,8 +16,7 @@ import tomli_w
 
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, UnknownNameError, abbreviated
-from mi_refgs.io.files import is_file
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import is_file, resource_dir
 from mi_refgs.methods.build import build, plain, scaled, settings as keys_of
 from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method
 from mi_refgs.registry import load_again, plugin_files

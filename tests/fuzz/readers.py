@@ -22,8 +22,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.formats.cameras import read_cameras
 from mi_refgs.formats.splat_import import read_splats
 from mi_refgs.io.exr import read_exr_image
+from mi_refgs.io.files import resource_dir
 from mi_refgs.io.images import read_mask, read_png, read_tiff
-from mi_refgs.io.resources import resource_dir
 from mi_refgs.occlusion.mesh import Mesh, read_mesh, write_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.runs.run import Run

@@ -12,7 +12,7 @@ import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.errors import InputError
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import resource_dir
 from mi_refgs.kernels import memory
 from tests.helpers import refused
 from tests.scenes.integrator import scene, sensor

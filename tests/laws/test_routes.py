@@ -1,6 +1,6 @@
 """One image by every route: whichever way a scene is rendered, its image and every AOV are the same.
 
-Every shading of every method and model goes through every route, and every pair of the other features occurs;
+Every shading of every method and model goes through every route, and every pair of the other features occurs.
 """
 
 from __future__ import annotations
@@ -70,11 +70,9 @@ def shadings() -> list[tuple[Shading, str]]:
             found[Shading(Shading(order, name).shaded_at, name), "surfel"] = None
         plain = Shading(Shading(model.shaded_at[0], name).shaded_at, name, diffuse="irradiance")
         traced = replace(plain, occlusion=plain.traceable)
-        options = {
-            key: scenes.OTHER_OPTIONS[key] for key in model.honoured if traced.occlusion or key not in TRACED
-        }
-        if options:
-            found[replace(traced, **options), "surfel"] = None
+        honoured = [key for key in model.honoured if traced.occlusion or key not in TRACED]
+        if honoured:
+            found[replace(traced, **{key: scenes.OTHER_OPTIONS[key] for key in honoured}), "surfel"] = None
     return [*found]
 
 
@@ -85,8 +83,8 @@ def lens(crop: bool) -> dict[str, Any]:
     film: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
     film |= {"pixel_format": "rgba", "component_format": "float32"}
     if crop:
-        names = "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"
-        film |= dict(zip(names, CROP, strict=True))
+        x, y, width, height = CROP
+        film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
     return scenes.sensor(fov=FOV, near_clip=NEAR, film=film)
 
 
@@ -166,14 +164,6 @@ def by_scene_file(case: Case) -> Maps:
     return maps | {IMAGE: mi.render(scene, spp=case.samples).numpy()}
 
 
-def by_command_of_a_run(case: Case) -> Maps:
-    return of_command(case, case.folder)
-
-
-def by_command_of_a_scene(case: Case) -> Maps:
-    return of_command(case, case.folder / SCENE)
-
-
 def by_command_with_a_camera(case: Case) -> Maps:
     """The camera in a file, which has no crop window."""
     camera, path = Camera.from_sensor(sensor()), case.scratch / "camera.json"
@@ -218,16 +208,16 @@ def by_layers(case: Case) -> Maps:
     return found | of_layers(layers, [name for name in case.names if name not in ("depth", "alpha")])
 
 
-ROUTES: tuple[Callable[[Case], Maps], ...] = (
-    by_reconstruction,
-    by_its_mitsuba_scene,
-    by_scene_file,
-    by_command_of_a_run,
-    by_command_of_a_scene,
-    by_command_with_a_camera,
-    by_viewer_of_a_run,
-    by_layers,
-)
+ROUTES: dict[str, Callable[[Case], Maps]] = {
+    "reconstruction": by_reconstruction,
+    "its Mitsuba scene": by_its_mitsuba_scene,
+    "scene file": by_scene_file,
+    "command of a run": lambda case: of_command(case, case.folder),
+    "command of a scene": lambda case: of_command(case, case.folder / SCENE),
+    "command with a camera": by_command_with_a_camera,
+    "viewer of a run": by_viewer_of_a_run,
+    "layers": by_layers,
+}
 
 
 def of_mitsuba(scene: Any, view: Any, case: Case) -> Maps:
@@ -292,20 +282,15 @@ def through_a_ply(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, 
     return import_splats(path, linear=not encoded), run
 
 
-STATES = (as_fitted, saved_and_loaded, exported, edited)
-CHANGED = (edited,)
-"""States that show another image than the scene had before."""
-
 FEATURES: dict[str, tuple[Any, ...]] = {
     "samples": (1, 4),
     "crop": (False, True),
     "around": ("nothing", "surroundings", "surroundings and a map", "surroundings, left out"),
     "meshed": (False, True),
-    "state": STATES,
+    "state": (as_fitted, saved_and_loaded, exported, edited),
 }
 
 ROWS = covering_array(FEATURES, (), seed=5)
-
 LOSSLESS = [
     (Shading("pixel", "displayed"), "gaussian"),
     (Shading("surfel", "radiance"), "gaussian"),
@@ -349,11 +334,11 @@ def test_every_route_gives_one_image(
     state, folder = row["state"](made, tmp_path)
     crop_sensor_of(folder / SCENE, row["crop"])
     case = Case(state, folder, row["samples"], row["crop"], alone, tmp_path, part)
-    before = state if row["state"] in CHANGED else made
-    expected = ROUTES[0](replace(case, made=before))
+    before = state if row["state"] is edited else made
+    expected = by_reconstruction(replace(case, made=before))
     assert 0.2 < np.mean(expected["alpha"] > 0.1) and expected[IMAGE][..., :3].max() > 0.1
-    for route in ROUTES:
-        assert_same(expected, route(case), route.__name__)
+    for name, route in ROUTES.items():
+        assert_same(expected, route(case), name)
 
 
 def crop_sensor_of(path: Path, crop: bool) -> None:

@@ -20,7 +20,7 @@ from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.mesh import ExtractMesh
 from mi_refgs.fitting.events.propagate import Propagate
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import resource_dir
 from mi_refgs.methods.build import scaled
 from mi_refgs.methods.extensions import EVENTS as REGISTERED
 from mi_refgs.methods.fields import ITERATIONS, Window

@@ -13,7 +13,7 @@ import pytest
 from mi_refgs import methods
 from mi_refgs.cli import main
 from mi_refgs.fitting.events.propagate import Propagate
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import resource_dir
 from tests.helpers import ROOT
 from tests.laws.covering import marked
 from tests.scenes.tiny import SETTINGS, write_data

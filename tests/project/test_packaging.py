@@ -20,7 +20,7 @@ import pytest
 import mi_refgs
 from mi_refgs.cli.doctor import EXTRAS
 from mi_refgs.errors import InputError
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import resource_dir
 from tests.helpers import ROOT, imported_packages, run_process
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -74,7 +74,7 @@ def test_installed_package_works(environment: Path) -> None:
     code = """
 import mi_refgs, json, mitsuba as mi
 from mi_refgs.methods.read import load
-from mi_refgs.io.resources import resource_dir
+from mi_refgs.io.files import resource_dir
 mi.set_variant("llvm_ad_rgb")
 plugin = type(mi.load_dict({"type": "refgs_bsdf"})).__name__
 print(json.dumps([mi_refgs.__file__, str(resource_dir("scenes")), load("relighting").name, plugin]))
