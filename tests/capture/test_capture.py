@@ -258,7 +258,6 @@ def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     photographs = _made(tmp_path / "photographs")
     command = ["capture", photographs, "-o", tmp_path / "data"]
-    refused(["capture", tmp_path / "none", "-o", tmp_path / "data"], "no such folder")
     (photographs / "a.HEIC").write_bytes(b"0")
     refused(command, "convert its .HEIC files to JPEG")
     for name in ("a.jpg", "b.jpg", "c.jpg"):

@@ -98,14 +98,10 @@ def test_the_map_that_a_run_saves_is_the_light(rng: np.random.Generator) -> None
     assert not light.unusable() and Sun().of(mi.TensorXf(np.full((2, 3), np.nan, np.float32))).unusable() == 6
 
 
-def method(folder: Path, text: str) -> Path:
-    (folder / "own.toml").write_text(text)
-    return folder / "own.toml"
-
-
 def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     """Learnt, saved as a map that scene.xml reads, made again from a checkpoint; and relit."""
-    data, own = write_data(tmp_path / "data"), method(tmp_path, METHOD)
+    data, own = write_data(tmp_path / "data"), tmp_path / "own.toml"
+    own.write_text(METHOD)
     assert main(train_command(data, tmp_path / "run", own)) == 0
     run: Any = mi_refgs.load(tmp_path / "run")
     saved = run.trained.light.radiance().numpy()

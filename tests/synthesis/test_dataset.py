@@ -186,16 +186,13 @@ def test_settings_out_of_range(made: Path, tmp_path: Path, field: str, value: An
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (None, "missing"),
         ("<scene", "not XML"),
         ('<scene version="3.0.0"><shape type="blob"/></scene>', "scene.xml: scene: "),
         ('<scene version="3.0.0"><shape type="sphere"/></scene>', "emitters: the scene has none"),
     ],
 )
-def test_bad_scene(tmp_path: Path, text: str | None, words: str) -> None:
-    scene = tmp_path / "scene.xml"
-    if text is not None:
-        scene.write_text(text)
+def test_bad_scene(tmp_path: Path, text: str, words: str) -> None:
+    (scene := tmp_path / "scene.xml").write_text(text)
     refused(lambda: make_dataset(scene, tmp_path / "out", **OPTIONS), scene, words)
 
 
