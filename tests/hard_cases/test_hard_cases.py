@@ -58,9 +58,6 @@ def test_losses_of_extreme_images(image: Any) -> None:
     assert not found["non_finite"] and max(found["value"], found["slope"]) <= IMAGE_LIMIT, found
 
 
-# ---------------- the measurement itself ----------------
-
-
 def test_reference_gradients_match_differences() -> None:
     """Complex steps and sums, against central differences of the loss, for every class of parameters."""
     case = plain("plain").rounded()

@@ -65,9 +65,6 @@ def mean_weight(of: Any, wi: Any, ctx: Any = None, side: int = 512, arriving: An
     return mi.Color3f(*(dr.mean(c) for c in weight * arriving(sampled.wo)))
 
 
-# ---------- The formula ----------
-
-
 @pytest.mark.parametrize(
     ("roughness", "metallic"),
     [(0.03, 0.4), (0.2, 0.0), (0.6, 1.0), (1.0, 0.4), slow(0.03, 1.0), slow(1.0, 0.0)],
@@ -113,9 +110,6 @@ def test_reciprocity(rng: np.random.Generator) -> None:
         assert metallic == 1 or np.abs(whole - value(of, context(), b, a)).max() > 0.02
 
 
-# ---------- Energy ----------
-
-
 @pytest.mark.parametrize("roughness", [0.01, 0.2, 1.0, slow(0.05), slow(0.6)])
 def test_white_furnace_is_the_split_sum(roughness: float) -> None:
     """Under constant light each component reflects what `shade` says, in the mean over its own samples."""
@@ -134,9 +128,6 @@ def test_white_furnace_is_the_split_sum(roughness: float) -> None:
             (context(), f0 * a + b + diffuse),
         ):
             np.testing.assert_allclose(np.ravel(mean_weight(mixed, wi, ctx)), expected, atol=2e-3)
-
-
-# ---------- Samples ----------
 
 
 @pytest.mark.parametrize(
@@ -217,9 +208,6 @@ def test_samples_under_a_sky_give_its_integral(degrees: int, roughness: float, m
     np.testing.assert_allclose(np.ravel(found), expected, rtol=5e-3)
 
 
-# ---------- Derivatives ----------
-
-
 @pytest.mark.parametrize("roughness", [0.2, 1.0, slow(0.7)])
 def test_derivatives_of_sampled_weights(roughness: float) -> None:
     """Those of the weights give those of the reflectance, as samples, densities and the choice have none."""
@@ -268,9 +256,6 @@ def test_everything_is_finite() -> None:
         dr.backward(dr.sum(dr.sum(value + weight)))
         for x in (value, density, sampled.wo, sampled.pdf, weight, *map(dr.grad, (*inputs, si.wi, out))):
             assert np.isfinite(np.array(x)).all()
-
-
-# ---------- As a plugin ----------
 
 
 def test_parameters_and_text() -> None:

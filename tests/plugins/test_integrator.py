@@ -75,9 +75,6 @@ def test_the_lobe_of_a_directional_light_is_normalised() -> None:
         assert np.sum(values * np.sin(w)) * 2 * np.pi * w[0] == pytest.approx(1, abs=1e-2), roughness
 
 
-# ---------------- parameters ----------------
-
-
 @pytest.mark.parametrize("bounces", [0, 1])
 def test_surfel_count_may_change(bounces: int, tmp_path: Path) -> None:
     """Also where the mesh has their materials."""
@@ -105,9 +102,6 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
     params[f"integrator.{key}"] = dr.zeros(mi.TensorXf, shape)
     with pytest.raises(Exception, match=words):
         params.update()
-
-
-# ---------------- Dr.Jit and torch ----------------
 
 
 def test_a_node_of_a_torch_pipeline_may_be_a_render() -> None:
@@ -138,9 +132,6 @@ def test_recording_by_dr_freeze_is_refused() -> None:
     of = scenes.scene()
     refused(lambda: dr.freeze(lambda t: mi.render(of) * t)(mi.Float(1)), "dr.freeze: cannot be recorded")
     assert scenes.image(of).max() > 0.1
-
-
-# ---------------- refusals ----------------
 
 
 @pytest.mark.parametrize(
@@ -195,9 +186,6 @@ def test_an_exported_scene_has_the_trainers_tiles(
     exported = Camera.from_sensor(mi.load_string(ElementTree.tostring(root, encoding="unicode")).sensors()[0])
     assert exported.focal == pytest.approx(focal, rel=2e-6)
     assert exported.tile == camera.tile == tile_size(focal)
-
-
-# ---------------- variants ----------------
 
 
 def test_variants() -> None:

@@ -48,9 +48,6 @@ class Moved:
         return mi.render(self.of, self.params, **arguments)
 
 
-# ---------------- against float64 ----------------
-
-
 @dataclass(frozen=True)
 class Pair:
     """A case in the plugin and in the float64 reference."""
@@ -141,8 +138,6 @@ def test_derivatives_are_those_of_float64(name: str, tmp_path: Path) -> None:
 
     require_slopes(total, define, START)
 
-
-# ---------------- against differences of images ----------------
 
 CROP = {"crop_offset_x": 5, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
 AOVS = "nn:normal,d:depth,a:albedo"

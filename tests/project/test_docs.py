@@ -100,9 +100,6 @@ def test_reference_is_complete() -> None:
     assert not without, f"settings without a description: {without}"
 
 
-# ---------- The site ----------
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site, built with warnings as errors."""

@@ -35,9 +35,6 @@ def random_map(rng: np.random.Generator, h: int) -> np.ndarray:
     return radiance
 
 
-# ---------------- orientation, files ----------------
-
-
 def test_mirror_is_mitsubas_envmap(rng: np.random.Generator) -> None:
     radiance = random_map(rng, 16)
     d = np.concatenate([AXES, unit(rng.normal(size=(2000, 3)))])
@@ -72,9 +69,6 @@ def test_bad_input(tmp_path: Path) -> None:
     refused(lambda: EnvironmentLight.constant(1, 8).write(tmp_path / "file" / "a.exr"), "cannot be created")
 
 
-# ---------------- activation ----------------
-
-
 def test_softplus_is_exact_positive_and_finite() -> None:
     x = np.concatenate([np.linspace(-80, 80, 999), [-1e30, 0, 1e30]])
     raw = mi.Float(x.astype(np.float32))
@@ -85,9 +79,6 @@ def test_softplus_is_exact_positive_and_finite() -> None:
     np.testing.assert_allclose(y, np.logaddexp(0, x32), rtol=1e-6)
     assert np.all(np.array(y)[:-3] > 0)
     np.testing.assert_allclose(dr.grad(raw), np.exp(-np.logaddexp(0, -x32)), atol=2e-5)
-
-
-# ---------------- prefilter ----------------
 
 
 @pytest.mark.parametrize("height", [16, 64])
@@ -189,9 +180,6 @@ def test_prefilter_adjoint_and_tangent(height: int, rng: np.random.Generator) ->
     _, levels = prefilter.prefilter(radiance)
     tangent = dr.forward_to(levels)
     np.testing.assert_allclose(tangent, op.apply(x[::-1].reshape(radiance.shape)).ravel(), atol=1e-6)
-
-
-# ---------------- lookups ----------------
 
 
 def test_specular_against_the_oracle(rng: np.random.Generator) -> None:

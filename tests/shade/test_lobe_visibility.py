@@ -18,8 +18,6 @@ from mi_refgs.shade.points import ShadingPoints
 from tests.helpers import slow, unit, vector
 from tests.scenes.corner import floor_points, mirrored, seen, wall_blocks
 
-# ---------------- the points ----------------
-
 
 def test_points_repeat_differ_between_pixels_and_are_even() -> None:
     """The mean of a smooth function over k points: error of a lattice, 1/k and not 1/√k, for every pixel."""
@@ -85,9 +83,6 @@ def test_limits_of_the_lobe() -> None:
         up = weight > 0
         assert ((direction * normal).sum(1)[up] > 0).all() and up.mean() > 0.3
     np.testing.assert_array_equal(sample(7.0)[0], sample(1.0)[0])
-
-
-# ---------------- visibility ----------------
 
 
 def true_fraction(place: np.ndarray, points: ShadingPoints, roughness: float, f0: float) -> np.ndarray:

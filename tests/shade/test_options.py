@@ -151,9 +151,6 @@ def test_bad_settings_are_refused(name: str, values: tuple[Any, ...]) -> None:
             ShadingOptions(**{name: value})
 
 
-# ---------------- what they are for ----------------
-
-
 @pytest.mark.parametrize("roughness", [0.3, 0.9, slow(0.5), slow(0.7)])
 def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -> None:
     """Under a gradient, against brute force: nearer in sum, and over twice as near where lobes are wide."""

@@ -190,9 +190,6 @@ def test_safe_normalize() -> None:
     np.testing.assert_allclose(gradient[1], across / 5, atol=1e-6)
 
 
-# ---------------- lights ----------------
-
-
 def test_lights_give_same_to_model() -> None:
     """A constant light is its own filter, and one look-up of the map needs no filter."""
     d, roughness = mi.Vector3f(0.6, 0, 0.8), mi.Float(0.3)

@@ -28,8 +28,6 @@ from tests.scenes import corner as scenes
 from tests.scenes.shading_points import exact_light, exact_terms
 from tests.scenes.splats import discs
 
-# ---------------- materials on the mesh ----------------
-
 
 def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
     """Three surfels by the formula, exp(-½ (u²/s_u² + v²/s_v² + distance²/voxel²)); one alone far away."""
@@ -60,9 +58,6 @@ def test_misuse_is_refused() -> None:
         occluder.surface(surfels.gather(dr.arange(mi.UInt32, 399)))
     with pytest.raises(InputError, match="none to take"):
         occluder.set_materials(surfels.gather(mi.UInt32()))
-
-
-# ---------------- traced light ----------------
 
 
 def oracle_of_walls(light: PrefilteredLight, surfels: Surfels, diffuse: Any) -> exact.Outgoing:
@@ -155,9 +150,6 @@ def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
             plain = weight[k][blocked] @ radiance[blocked] / weight[k][blocked].sum()
             held += bool((expected < 0.9 * plain).any())
     assert held > 2
-
-
-# ---------------- derivatives ----------------
 
 
 @pytest.mark.parametrize(
