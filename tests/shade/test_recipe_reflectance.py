@@ -1,7 +1,4 @@
-"""CONTRIBUTING's recipe "add a reflectance model", followed: Lambert and Phong under a light.
-
-One channel, one class and two `register`s are all that is added.
-"""
+"""CONTRIBUTING's recipe "add a reflectance model", followed: Phong's, by one attribute and one class."""
 
 from __future__ import annotations
 
