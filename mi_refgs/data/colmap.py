@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.data.colmap_model import TEST_LIST, Image, read_cameras, read_images, read_points
-from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, fitted, held_out, make_view
+from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
 from mi_refgs.data.images import ImageFile, find_image, image_files, image_folder, mask_of
 from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.transforms import read_points as read_ply_points
@@ -89,13 +89,12 @@ class Reconstruction:
         pose = from_world_to_camera(image.rotation, image.translation, f"{self.source}: {image.name}")
         path = self.files[image.name]
         file = ImageFile.of(path, self.options.downscale, mask_of(path, self.root))
-        size, source = (camera.width, camera.height), f"{self.source.parent.name}/{self.source.name}"
-        pinhole = fitted(camera.intrinsics, size, file, self.options, source)
-        view = make_view(file, self.options, where, image.name, pinhole, pose, lens)[0]
+        size = (camera.width, camera.height)
+        view, _ = make_view(file, self.options, where, image.name, size, camera.intrinsics, pose, lens)
         tracks, observed = None, image.observed
         if self.table is not None and len(numbers := self.table.number):
             at = np.searchsorted(numbers, observed[:, 2]) % len(numbers)
-            keypoints = observed[:, :2] * (file.width / camera.width, file.height / camera.height)
+            keypoints = observed[:, :2] * np.divide((file.width, file.height), size)
             tracks = np.hstack([keypoints, self.table.position[at]])[numbers[at] == observed[:, 2]]
         return replace(view, tracks=tracks)
 

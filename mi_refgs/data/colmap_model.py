@@ -100,12 +100,6 @@ class _Cursor:
             raise ValueError(f"{number} records are more than the file contains")
         return int(number)
 
-    def skip(self, row: int) -> int:
-        """Skip a list of records of `row` bytes each, after their number, which is returned."""
-        number = self.count(row)
-        self.at += number * row
-        return number
-
     def name(self) -> str:
         start, self.at = self.at, self.data.find(b"\0", self.at, self.at + MAX_NAME) + 1
         if not self.at:
@@ -220,7 +214,9 @@ def _text_images(lines: Iterator[str]) -> Records:
 def _binary_points(cursor: _Cursor) -> Records:
     for _ in range(cursor.count(51)):
         number, *numbers = cursor.take("Q3d3Bd")
-        yield *numbers, cursor.skip(8), number  # the track: image and index of the observation
+        length = cursor.count(8)
+        cursor.at += 8 * length  # the track: image and index of the observation
+        yield *numbers, length, number
 
 
 def _text_points(lines: Iterator[str]) -> Records:

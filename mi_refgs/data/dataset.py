@@ -146,33 +146,27 @@ def require_few_sizes(file: Path, field: str, sizes: dict[tuple[int, int], str],
         raise InputError(f"{len(sizes)} different sizes, such as {some}", file, field, remedy)
 
 
-def fitted(
-    given: tuple[float, ...], size: tuple[float, float], image: ImageFile, options: ReadOptions, source: str
-) -> tuple[float, ...]:
-    """fx, fy, cx, cy of an image of `size`, as `source` has it, for the file, perhaps a smaller copy; raises
-    InputError for another aspect ratio."""
-    own, said = (image.width, image.height), f"{size[0]:g} × {size[1]:g}"
-    if not is_copy(own, size):
-        remedy = "turn it, as its EXIF data may say" if is_copy(own[::-1], size) else "restore the image"
-        what = f"{own[0]} × {own[1]} pixels are no copy of {said}, which {source} says"
-        raise InputError(what, image.path, "size", remedy)
-    if own != size:
-        what = "focal length and principal point are of a larger or smaller copy, and scaled"
-        options.say(what, str(image.path), f"{said} for the {own[0]} × {own[1]} pixels of {image.path.name}")
-    return tuple((np.array(given) * np.tile(np.divide(own, size), 2)).tolist())
-
-
 def make_view(
     image: ImageFile,
     options: ReadOptions,
     where: str,
     name: str,
-    intrinsics: tuple[float, ...],  # fx, fy, cx, cy, pixels of the file
+    size: tuple[float, float],  # of the image, of which the file may be a smaller copy
+    pinhole: tuple[float, ...],  # fx, fy, cx, cy, pixels of an image of that size
     to_world: np.ndarray,
     lens: Lens | None = None,
 ) -> tuple[View, Undistortion | None]:
     """Make the view of an image; also returns how maps of the averaged image's size are undistorted. Raises
-    InputError, which begins with `where`, for an impossible focal length or lens."""
+    InputError, which names `where`, for another aspect ratio, an impossible focal length or lens."""
+    own, said = (image.width, image.height), f"{size[0]:g} × {size[1]:g}"
+    if not is_copy(own, size):
+        remedy = "turn it, as its EXIF data may say" if is_copy(own[::-1], size) else "restore the image"
+        what = f"{own[0]} × {own[1]} pixels are no copy of {said}, the size in {where}"
+        raise InputError(what, image.path, "size", remedy)
+    if own != size:
+        what = "focal length and principal point are of a larger or smaller copy, and scaled"
+        options.say(what, name, f"{said} for the {own[0]} × {own[1]} pixels of {image.path.name}")
+    intrinsics = (np.array(pinhole) * np.tile(np.divide(own, size), 2)).tolist()
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
             raise InputError(f"{focal:.3g} pixels is out of range", where, "focal length", "correct it")
@@ -180,10 +174,10 @@ def make_view(
         what, other = ("an EXR file", "exr") if image.is_linear_radiance else ("no EXR file", "png")
         raise InputError(what, image.path, "images", f"give data.images={other}")
     fx, fy, cx, cy = intrinsics
-    file = FileCamera(image.path, image.width, image.height, (fx, fy, cx, cy), lens, image.mask)
+    file = FileCamera(image.path, *own, (fx, fy, cx, cy), lens, image.mask)
     if (mask := image.mask) is not None and mask.below is None:
-        if (size := image_size(mask.path)) != (image.width, image.height):
-            what = f"{mask.path} of {size[0]} × {size[1]} for {image.width} × {image.height} pixels"
+        if (masked := image_size(mask.path)) != own:
+            what = f"{mask.path} of {masked[0]} × {masked[1]} for {own[0]} × {own[1]} pixels"
             options.say("the mask is of another size, and resized", name, what)
         elif mask.path.parent.name not in (MASKS, image.path.parent.name):
             options.say("a mask was found", name, mask.path)
@@ -314,13 +308,13 @@ def read_dataset(
         notes = (*notes, f"no alpha and no mask for {which}; give all images masks, or none")
     # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training)
-    near, region = NEAR_EXTENTS * _extent(views, offset), read_region(path)
-    if region is not None:
+    views = tuple(_moved(view, offset) for view in views)
+    views = tuple(replace(view, near=NEAR_EXTENTS * _extent(views)) for view in views)
+    if (region := read_region(path)) is not None:
         region = region.moved(-offset)
     elif without:
         with contextlib.suppress(InputError):  # views that share no point have none
             region = region_of([_moved(view, offset) for view in training])
-    views = tuple(replace(_moved(view, offset), near=near) for view in views)
     x, y, z = map(float, offset)
     if offset.any():
         points = None if points is None else replace(points, position=points.position - offset)
@@ -351,8 +345,8 @@ def _opaque(views: tuple[View, ...]) -> bool:
     return bool(own) and all(alpha is None or alpha.min() >= 1 for alpha in loaded)
 
 
-def _extent(views: tuple[View, ...], offset: np.ndarray | float = 0.0) -> float:
-    origins = np.array([view.to_world[:3, 3] for view in views]) - offset
+def _extent(views: tuple[View, ...]) -> float:
+    origins = np.array([view.to_world[:3, 3] for view in views])
     middle = origins.mean(axis=0) if len(np.unique(origins, axis=0)) > 1 else 0
     return EXTENT_MARGIN * float(np.linalg.norm(origins - middle, axis=1).max()) or 1.0
 

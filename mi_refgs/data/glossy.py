@@ -53,8 +53,8 @@ def _view(folder: Path, number: int, options: ReadOptions) -> View:
         raise InputError("no matrix of focal lengths and a principal point", file, "K", "copy the file again")
     to_world = from_world_to_camera(pose[:, :3], pose[:, 3], f"{file}: pose")
     image = ImageFile.of(folder / f"{number}.png", options.downscale, Mask(depths, BACKGROUND))
-    pinhole = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    view, _ = make_view(image, options, str(file), str(number), pinhole, to_world)
+    size, pinhole = (image.width, image.height), (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    view, _ = make_view(image, options, str(file), str(number), size, pinhole, to_world)
     if not options.truth:
         return view
     grey = read_grey(depths)[0][..., None]

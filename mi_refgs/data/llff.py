@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
-from mi_refgs.data.dataset import ReadOptions, Recording, fitted, held_out, make_view
+from mi_refgs.data.dataset import ReadOptions, Recording, held_out, make_view
 from mi_refgs.data.images import ImageFile, image_files, image_folder, mask_of
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
@@ -66,5 +66,5 @@ def _view(source: Path, options: ReadOptions, path: Path, row: np.ndarray) -> Vi
     pose = np.eye(4)
     pose[:3] = np.stack([right, -down, backwards, position], axis=-1)
     to_world = rigid(pose, f"{source}: {name}") @ MITSUBA_FROM_OPENGL
-    pinhole = fitted((focal, focal, width / 2, height / 2), (width, height), image, options, source.name)
-    return make_view(image, options, f"{source}: {name}", name, pinhole, to_world)[0]
+    size, pinhole = (width, height), (focal, focal, width / 2, height / 2)
+    return make_view(image, options, f"{source}: {name}", name, size, pinhole, to_world)[0]

@@ -11,6 +11,7 @@ of the poses; `train_filenames` and `test_filenames` (or `val_filenames`) list t
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.colmap_model import MODELS
-from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, fitted, held_out, make_view
+from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
 from mi_refgs.data.images import FOLDERS, ImageFile, Mask, block_mean, find_image, mask_of
 from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
@@ -34,7 +35,6 @@ SUFFIXES = (*ENDINGS, ".exr")  # that `file_path` may have or omit, in the order
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of unsupported lenses, refused unless they are 0 or false."""
 MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}  # channels of ground truth
-NORMALS, DISPARITY = "_normal.png", "_disp.tiff"  # after the stem of an image's name
 NORMAL_LENGTH = 0.5  # smallest length of an 8-bit normal: no normal is stored as (½, ½, ½)
 
 
@@ -137,8 +137,8 @@ class Frame:
                 raise self.refuse(key, what, "undistort the images, or set it to 0")
         return Lens.of(fisheye, given)
 
-    def focal_lengths(self, width: float, height: float) -> tuple[float, float]:
-        """fx and fy, pixels of an image of this size."""
+    def pinhole(self, width: float, height: float) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy, pixels of an image of this size."""
         focal: list[float | None] = []
         for length, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
             pixels, radians = self.number(length, positive=True), self.number(angle, positive=True)
@@ -149,7 +149,8 @@ class Frame:
             focal.append(pixels)
         if focal[0] is None:
             raise InputError("missing", self.file, "camera_angle_x", "give radians, or fl_x in pixels")
-        return focal[0], focal[1] or focal[0]
+        cx, cy = self.number("cx", positive=True), self.number("cy", positive=True)
+        return focal[0], focal[1] or focal[0], cx or width / 2, cy or height / 2
 
 
 def _frames(folder: Path, split: str) -> list[Frame]:
@@ -211,9 +212,12 @@ def _view(frame: Frame, options: ReadOptions) -> View:
         raise frame.refuse("mask_path", "it is the image", "name a mask")
     found = Mask(mask) if mask else mask_of(file, frame.file.parent, beside=not image.has_alpha())
     image = replace(image, mask=found)
-    name, pinhole = _stem(str(Path(frame.name))), _intrinsics(frame, image, options)
-    pose, lens, where = frame.to_world(options), frame.lens(), f"{frame.file}: {frame.place}"
-    view, straight = make_view(image, options, where, name, pinhole, pose, lens)
+    name, where = _stem(str(Path(frame.name))), f"{frame.file}: {frame.place}"
+    width, height = frame.number("w", positive=True), frame.number("h", positive=True)
+    width = width or image.width * (height or image.height) / image.height
+    height = height or image.height * width / image.width
+    camera = (frame.pinhole(width, height), frame.to_world(options), frame.lens())
+    view, straight = make_view(image, options, where, name, (width, height), *camera)
     if not options.truth:
         return view
     size = (image.height, image.width)
@@ -243,16 +247,6 @@ def _image(frame: Frame, options: ReadOptions) -> Path:
     return path if is_file(path) else stem.with_name(stem.name + ENDINGS[0])
 
 
-def _intrinsics(frame: Frame, image: ImageFile, options: ReadOptions) -> tuple[float, ...]:
-    """fx, fy, cx, cy in pixels of the image file."""
-    width, height = frame.number("w", positive=True), frame.number("h", positive=True)
-    width = width or image.width * (height or image.height) / image.height
-    height = height or image.height * width / image.width
-    cx, cy = frame.number("cx", positive=True), frame.number("cy", positive=True)
-    given = (*frame.focal_lengths(width, height), cx or width / 2, cy or height / 2)
-    return fitted(given, (width, height), image, options, frame.file.name)
-
-
 def _map(
     file: Path, field: str, expected: tuple[int, int, int], downscale: int, straight: Undistortion | None
 ) -> np.ndarray:
@@ -273,10 +267,16 @@ def _stem(name: str) -> str:
     return str(Path(name).with_suffix("")) if Path(name).suffix.lower() in SUFFIXES else name
 
 
-def _beside(image: Path, ending: str) -> Path | None:
-    """The map of an image whose name has this ending; None without one."""
+def _beside(
+    image: Path, ending: str, read: Callable[[Path], np.ndarray], shape: tuple[int, int]
+) -> np.ndarray | None:
+    """The map (H, W, …) of an image whose name has this ending; None without one."""
     file = image.with_name(image.stem + ending)
-    return file if is_file(file) else None
+    pixels = read(file) if is_file(file) else None
+    if pixels is not None and pixels.shape[:2] != shape:
+        what = f"{pixels.shape[1]} × {pixels.shape[0]} pixels, but the image has {shape[1]} × {shape[0]}"
+        raise InputError(what, file, "size", "restore the map, or remove it")
+    return pixels
 
 
 def _shiny_blender_maps(
@@ -285,20 +285,13 @@ def _shiny_blender_maps(
     """World normals n (h, w, 3) in 8 bits as (n + 1) / 2, and depths z (h, w, 1) as 1 / (1 + z), 0 off the
     object, beside an image of Shiny Blender; None without a file. [Ref-NeRF, Verbin et al. 2022]"""
     normal = depth = None
-    if file := _beside(image, NORMALS):
-        pixels = 2 * _of_shape(file, read_png(file)[..., :3], shape) - 1
+    if (pixels := _beside(image, "_normal.png", read_png, shape)) is not None:
+        pixels = 2 * pixels[..., :3] - 1
         stored = np.linalg.norm(pixels, axis=-1, keepdims=True) > NORMAL_LENGTH
         normal = block_mean(pixels, stored, downscale, straight)[0]
-    if file := _beside(image, DISPARITY):
-        disparity = _of_shape(file, read_tiff(file), shape)[..., None]
+    if (pixels := _beside(image, "_disp.tiff", read_tiff, shape)) is not None:
+        disparity = pixels[..., None]
         covered = (disparity > 0) & (disparity < 1)
         depths = np.where(covered, 1 / np.where(covered, disparity, 1) - 1, 0).astype(np.float32)
         depth = block_mean(depths, covered, downscale, straight)[0]
     return normal, depth
-
-
-def _of_shape(file: Path, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    if pixels.shape[:2] != shape:
-        what = f"{pixels.shape[1]} × {pixels.shape[0]} pixels, but the image has {shape[1]} × {shape[0]}"
-        raise InputError(what, file, "size", "restore the map, or remove it")
-    return pixels

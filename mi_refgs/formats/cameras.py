@@ -114,12 +114,6 @@ def _camera(frame: Frame) -> Camera:
     width, height = (frame.number(key) or 0.0 for key in ("w", "h"))
     if not all(1 <= side <= SIZE_MAX and side.is_integer() for side in (width, height)):
         raise frame.refuse("w", f"{width:g} × {height:g} is no size of an image", "correct w and h")
-    fx, fy = frame.focal_lengths(width, height)
-    cx, cy = (frame.number(key, positive=True) for key in ("cx", "cy"))
-    return Camera.from_pose(
-        *(int(width), int(height), -fx, -fy),
-        width / 2 if cx is None else cx,
-        height / 2 if cy is None else cy,
-        frame.to_world(),
-        max(frame.number("near") or 0.0, 0.0),
-    )
+    fx, fy, cx, cy = frame.pinhole(width, height)
+    near = max(frame.number("near") or 0.0, 0.0)
+    return Camera.from_pose(int(width), int(height), -fx, -fy, cx, cy, frame.to_world(), near)

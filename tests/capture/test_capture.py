@@ -114,6 +114,14 @@ def test_captured_data_set_is_read(captured: Path) -> None:
     assert [view.name for view in test.views] == [NAMES[0], NAMES[8]] and len(train.views) == COUNT - 2
     assert all(view.alpha is not None and {0.0, 1.0} == {*np.unique(view.alpha)} for view in train.views)
     assert train.region is not None and train.points is not None
+    # What pycolmap has written is what its own reader finds.
+    model = _model(captured / "data")
+    [camera], solved = model.cameras.values(), Solved.of(model)
+    assert {(view.fx, view.fy, view.cx, view.cy) for view in train.views} == {tuple(camera.params)}
+    for view in train.views:
+        i = NAMES.index(view.name)
+        np.testing.assert_allclose(view.to_world[:3, 3], solved.origin[i], atol=1e-9)
+        np.testing.assert_allclose(view.to_world[:3, 2], solved.axis[i], atol=1e-9)
 
 
 @needs_colmap

@@ -19,7 +19,7 @@ from mi_refgs.data.region import region_of
 from mi_refgs.io.images import linear_from_srgb
 from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
-from tests.scenes.layouts import SHOTS, VALUES, WRITERS, write_binary, write_colmap, write_text
+from tests.scenes.layouts import SHOTS, VALUES, WRITERS, write_binary, write_colmap
 
 KINDS = ("txt", "bin")
 
@@ -181,23 +181,3 @@ def test_truncated_binary_files_are_refused(tmp_path: Path) -> None:
         refused(partial(read, path), "are more than the file contains")
         assert time.process_time() - began < 1
         path.write_bytes(whole)
-
-
-def test_files_written_by_colmap_are_read(tmp_path: Path) -> None:
-    """Its own library writes our text as binary, and our reader finds the same in both."""
-    pycolmap = pytest.importorskip("pycolmap")
-    ours, theirs = tmp_path / "a", tmp_path / "b"
-    write_text(ours, SHOTS, "OPENCV", LENSES["OPENCV"][0])
-    theirs.mkdir()
-    images, points = ours / "images.txt", ours / "points3D.txt"  # without tracks, which are made up
-    images.write_text(images.read_text().replace("1.5 2.5 3 10.0 20.0 -1", ""))
-    points.write_text("\n".join(x[: x.find("0.5 ") + 3] for x in points.read_text().splitlines()))
-    pycolmap.Reconstruction(str(ours)).write_binary(str(theirs))
-    assert read_cameras(ours / "cameras.txt") == read_cameras(theirs / "cameras.bin")
-    for a, b in zip(read_images(images), read_images(theirs / "images.bin"), strict=True):
-        assert (a.name, a.camera) == (b.name, b.camera)
-        np.testing.assert_allclose(a.rotation, b.rotation, atol=1e-12)
-        np.testing.assert_allclose(a.translation, b.translation, atol=1e-12)
-    found = (read_points(points), read_points(theirs / "points3D.bin"))
-    text, binary = (x.position[np.argsort(x.position[:, 0])] for x in found)
-    np.testing.assert_allclose(text, binary)

@@ -14,13 +14,12 @@ from PIL import Image
 
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
-from mi_refgs.io.images import linear_from_srgb, write_png
+from mi_refgs.io.images import write_png
 from tests.helpers import refused
-from tests.scenes.dots import COLOURS, POINTS, check
+from tests.scenes.dots import check
 from tests.scenes.layouts import (
     SHOTS,
     change_transforms,
-    ply_bytes,
     write_glossy,
     write_llff,
     write_nerfstudio,
@@ -37,21 +36,6 @@ def test_nerfstudio_intrinsics_per_frame(fisheye: bool, tmp_path: Path) -> None:
     data = write_nerfstudio(tmp_path, shots, camera_model=model, k1=0.05, k2=-0.02, p1=0.0, p2=0.0)
     for view, shot in zip(read_dataset(data, "train").views, shots[1:], strict=True):
         check(view, shot, tolerance=0.06)
-
-
-@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-def test_ply_file_path_gives_points(kind: str, tmp_path: Path) -> None:
-    """Poses and points share a frame: `applied_transform` was applied to both."""
-    moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
-    data = write_nerfstudio(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=moved)
-    names = ("x", "y", "z", "red", "green", "blue")
-    columns = dict(zip(names, [*POINTS.T, *COLOURS.T.astype(np.uint8)], strict=True))
-    (data / "sparse_pc.ply").write_bytes(ply_bytes(columns, kind))
-    found = read_dataset(data, "train")
-    assert found.points is not None and found.points.colour is not None
-    np.testing.assert_allclose(found.points.position, POINTS)
-    np.testing.assert_allclose(found.points.colour, linear_from_srgb(COLOURS / 255), atol=1e-6)
-    check(found.views[0], SHOTS[1])
 
 
 def test_filenames_define_splits(tmp_path: Path) -> None:
@@ -159,6 +143,7 @@ class Code:
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_glossy_synthetic_is_read(protocol: int, tmp_path: Path) -> None:
+    """The pose is stored by rows, K by columns."""
     data = write_glossy(tmp_path, protocol)
     train, test = read_dataset(data, "train"), read_dataset(data, "test")
     assert [v.name for v in train.views] == [*"1234567"] and [v.name for v in test.views] == ["0", "8"]
@@ -196,14 +181,6 @@ def test_hostile_pickles_are_refused(tmp_path: Path) -> None:
     assert len(read_dataset(data, "train").views) == 7
     (data / "0-depth.png").unlink()
     refused(lambda: read_dataset(data, "test"), "0-depth.png: file: missing")
-
-
-def test_transposed_pose_is_read_by_columns(tmp_path: Path) -> None:
-    data, file = write_glossy(tmp_path), tmp_path / "1-camera.pkl"
-    pose, matrix = pickle.loads(file.read_bytes())
-    before = read_dataset(data, "train").views[0].to_world
-    file.write_bytes(pickle.dumps([np.asfortranarray(pose), matrix]))
-    np.testing.assert_array_equal(read_dataset(data, "train").views[0].to_world, before)
 
 
 @pytest.mark.parametrize(

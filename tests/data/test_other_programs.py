@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from mi_refgs.data.dataset import read_dataset, reader_of
+from mi_refgs.io.images import linear_from_srgb
 from tests.helpers import refused
-from tests.scenes.dots import POINTS, check
+from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import (
     SHOTS,
     change_transforms,
@@ -36,10 +37,21 @@ def colmap(folder: Path, name: str = "{}", images: str = "images", place: str = 
     return folder
 
 
-def ply_points(folder: Path) -> None:
-    columns = dict(zip("xyz", POINTS.T, strict=True))
-    (colmap(folder) / SPARSE / "points3D.ply").write_bytes(ply_bytes(columns))
-    (folder / SPARSE / "points3D.txt").unlink()
+def ply_points(path: Path, kind: str) -> None:
+    names = ("x", "y", "z", "red", "green", "blue")
+    columns = dict(zip(names, [*POINTS.T, *COLOURS.T.astype(np.uint8)], strict=True))
+    path.write_bytes(ply_bytes(columns, kind))
+
+
+def points_beside_colmap(folder: Path) -> None:
+    (colmap(folder) / SPARSE / "points3D.txt").unlink()
+    ply_points(folder / SPARSE / "points3D.ply", "binary_little_endian")
+
+
+def points_of_nerfstudio(folder: Path) -> None:
+    """Poses and points share a frame: `applied_transform` was applied to both."""
+    moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
+    ply_points(write_nerfstudio(folder, ply_file_path="a.ply", applied_transform=moved) / "a.ply", "ascii")
 
 
 def frames(change: Callable[[dict[str, Any]], Any], **content: Any) -> Callable[[Path], None]:
@@ -100,7 +112,8 @@ FOLDERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "COLMAP, Windows": (lambda f: colmap(f, "C:\\Users\\me\\vase\\images\\{}"), "9 images: the path"),
     "COLMAP, byte-order mark": (marked(colmap, "sparse/0/*.txt"), ""),
     "COLMAP, rigs": (rigs, ""),
-    "COLMAP, points as PLY": (ply_points, ""),
+    "COLMAP, points as PLY": (points_beside_colmap, ""),
+    "nerfstudio, points as PLY": (points_of_nerfstudio, ""),
     "nerfstudio, scaled": (frames(fourfold), "7 images: focal length and principal point"),
     "nerfstudio, small letters": (frames(lambda frame: frame.update(camera_model="opencv", k1=0.0)), ""),
     "nerfstudio, FULL_OPENCV": (frames(lambda frame: frame.update(camera_model="FULL_OPENCV")), ""),
@@ -128,8 +141,10 @@ def test_folder_of_another_program(name: str, tmp_path: Path) -> None:
     for view, shot in zip(found.views, SHOTS[1:], strict=False):
         check(view, shot)
         np.testing.assert_allclose(view.to_world[:3, 3], shot.camera_to_world[:3, 3], atol=1e-3)
-    if "COLMAP" in name:
-        assert found.points is not None and np.allclose(found.points.position, POINTS, atol=1e-6)
+    if "COLMAP" in name or "PLY" in name:
+        assert found.points is not None and found.points.colour is not None
+        np.testing.assert_allclose(found.points.position, POINTS, atol=1e-6)
+        np.testing.assert_allclose(found.points.colour, linear_from_srgb(COLOURS / 255), atol=1e-6)
 
 
 PLAIN = ("masks/{}.png.png", "masks/{}.mask.png", "masks/{}_mask.png", "masks/{}.jpg", "images/{}_mask.png")

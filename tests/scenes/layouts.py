@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import pickle
+import struct
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +14,57 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.scenes.colmap_files import ColmapCamera, ColmapImage, Model, colmap_binary, colmap_text
+from mi_refgs.data.colmap_model import MODELS
 from tests.scenes.dots import COLOURS, POINTS, Shot
 
 SHOTS = [Shot(f"{'abcdefghi'[i]}.png", i) for i in range(9)]
 MODEL, VALUES = "PINHOLE", (110.0, 104.0, 50.3, 34.6)
 
 
-def model_of(shots: list[Shot], camera: str, values: tuple[float, ...]) -> Model:
-    """The dots and these cameras as a COLMAP model."""
-    cameras = {7: ColmapCamera(camera, (shots[0].width, shots[0].height), values)}
-    poses = []
-    for shot in shots:
-        x, y, z, w = Rotation.from_matrix(shot.rotation).as_quat()
-        poses.append(ColmapImage(shot.name, 7, (w, x, y, z), shot.translation.tolist()))
-    return cameras, poses, POINTS, COLOURS
+def _pose(shot: Shot) -> list[float]:
+    """COLMAP's: w, x, y, z of the rotation, and the translation."""
+    x, y, z, w = Rotation.from_matrix(shot.rotation).as_quat().tolist()
+    return [w, x, y, z, *shot.translation.tolist()]
 
 
-def _write(
-    contents: Callable[[Model], dict[str, bytes]],
-    ending: str,
-    model: Path,
-    shots: list[Shot],
-    camera: str = MODEL,
-    values: tuple[float, ...] = VALUES,
+def write_text(
+    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
 ) -> None:
+    """The dots and these cameras as a COLMAP model; every second image has a point and a free keypoint."""
+    size = (shots[0].width, shots[0].height)
+    files: dict[str, list[tuple[object, ...]]] = {
+        "cameras": [("# comment",), (7, camera, *size, *values)],
+        "images": [("# Image list with two lines of data per image:",)],
+        "points3D": [("# points\n",)],
+    }
+    for i, shot in enumerate(shots):
+        files["images"].append((i + 1, *_pose(shot), 7, shot.name))
+        files["images"].append((1.5, 2.5, 3, 10.0, 20.0, -1) if i % 2 else ())
+    for i, (point, colour) in enumerate(zip(POINTS.tolist(), COLOURS.tolist(), strict=True)):
+        files["points3D"].append((i, *point, *colour, 0.5, 1, 0, 2, 0, 3, i))
     model.mkdir(parents=True, exist_ok=True)
-    for name, content in contents(model_of(shots, camera, values)).items():
-        (model / f"{name}.{ending}").write_bytes(content)
+    for name, lines in files.items():
+        text = "".join(" ".join(map(str, line)) + "\n" for line in lines)
+        (model / f"{name}.txt").write_bytes(text.encode())
 
 
-write_text = partial(_write, colmap_text, "txt")
-write_binary = partial(_write, colmap_binary, "bin")
+def write_binary(
+    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
+) -> None:
+    """The same contents in binary records."""
+    kind, size = MODELS[camera][0] if camera in MODELS else 7, (shots[0].width, shots[0].height)
+    cameras = struct.pack(f"<QiiQQ{len(values)}d", 1, 7, kind, *size, *values)
+    images, points = struct.pack("<Q", len(shots)), struct.pack("<Q", len(POINTS))
+    for i, shot in enumerate(shots):
+        images += struct.pack("<i7di", i + 1, *_pose(shot), 7) + shot.name.encode() + b"\0"
+        images += struct.pack("<Qddqddq", 2, 1.5, 2.5, 3, 10, 20, -1) if i % 2 else struct.pack("<Q", 0)
+    for i, (point, colour) in enumerate(zip(POINTS, COLOURS.tolist(), strict=True)):
+        points += struct.pack("<Q3d3BdQ6i", i, *point, *colour, 0.5, 3, 1, 0, 2, 0, 3, i)
+    model.mkdir(parents=True, exist_ok=True)
+    for name, content in {"cameras": cameras, "images": images, "points3D": points}.items():
+        (model / f"{name}.bin").write_bytes(content)
+
+
 WRITERS = {"txt": write_text, "bin": write_binary}
 
 
@@ -91,10 +110,8 @@ def change_transforms(data: Path, change: Callable[[dict[str, Any]], object], sp
 
 def ply_bytes(columns: dict[str, np.ndarray], kind: str = "binary_little_endian") -> bytes:
     """A PLY file by hand, as another program would write it; properties have the types of the columns."""
-    count, names = (
-        len(next(iter(columns.values()))),
-        {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"},
-    )
+    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
+    count = len(next(iter(columns.values())))
     header = f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex {count}\n"
     header += "".join(f"property {names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
     if kind == "ascii":
