@@ -147,15 +147,12 @@ def mirror_visibility(
     return np.where(hit & np.isfinite(mesh_distance(vertices, faces, start, mirror)), 0.0, 1.0)
 
 
-Radiance = Callable[[Array], Array]
-
-
 def ambient(
     vertices: Array,
     faces: Array,
     normals: Array,
     directions: Array,
-    light: Radiance,
+    light: Callable[[Array], Array],
     outgoing: Callable[[Array, Array, bool, Array], Array],
     *,
     offset: float,
