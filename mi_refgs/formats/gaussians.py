@@ -79,7 +79,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     # Geometry: surfels get a thin third axis, and move inwards.
     parts = [_geometry(table) for table in tables]
     raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    flat = np.repeat([_is_flat(table) for table in tables], [table.count for table in tables])
+    flat = np.concatenate([np.full(table.count, table.primitive.widths["scale"] == 2) for table in tables])
     if flat.any():
         raw["position"] = np.where(flat[:, None], _inset(tables, cameras), raw["position"])
     # Colours: those of an imported file are encoded already.
@@ -92,14 +92,10 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     return Surfels.from_numpy(raw | {"radiance_sh": sh})
 
 
-def _is_flat(table: Surfels) -> bool:
-    return table.raw["scale"].shape[1] == 2
-
-
 def _geometry(table: Surfels) -> dict[str, np.ndarray]:
     """Return raw geometry with three standard deviations."""
     raw = {name: table.to_numpy()[name] for name in table.primitive.widths}
-    if _is_flat(table):
+    if raw["scale"].shape[1] == 2:
         thin = raw["scale"].min(axis=1, keepdims=True) + np.float32(np.log(THIN))
         raw["scale"] = np.concatenate([raw["scale"], thin], axis=1)
     return raw

@@ -16,6 +16,7 @@ from tests.helpers import refused
 from tests.scenes.layouts import ply_bytes
 
 GEOMETRY = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+COLOURS = ["nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45))]
 
 
 def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
@@ -55,8 +56,7 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
     write_ply(tmp_path / "a.ply", surfels)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     names = [line.split()[2] for line in header if line.startswith("property")]
-    start = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    start += [*(f"f_rest_{i}" for i in range(45)), *GEOMETRY[3:]]
+    start = [*GEOMETRY[:3], *COLOURS, *GEOMETRY[3:]]
     assert names[: len(start)] == start
     assert names[len(start) :][:5] == ["albedo_0", "albedo_1", "albedo_2", "metallic", "roughness"]
     data = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
@@ -94,9 +94,7 @@ def test_ply_of_others_is_read(kind: str, dtype: str, tmp_path: Path, rng: np.ra
 
 def test_3dgs_file_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     """Its properties, in its order; a third scale is what tells it from surfels."""
-    rest = [f"f_rest_{i}" for i in range(45)]
-    order = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
-    order += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    order = [*GEOMETRY[:3], *COLOURS, *GEOMETRY[3:6], "scale_2", *GEOMETRY[6:]]
     columns = {name: rng.normal(size=4).astype(np.float32) for name in order}
     columns |= {name: np.zeros(4, np.float32) for name in ("nx", "ny", "nz")}
     gaussians = read_ply(write_file(tmp_path / "3dgs.ply", columns))
