@@ -111,11 +111,7 @@ def test_object_that_cameras_approach_is_whole(rng: np.random.Generator) -> None
     thing = box((0.1, -0.4, -0.4), (2.2, 0.4, 0.4), 3000, rng)
     origins = np.array([[2.3, 0.5 * np.sin(t), 0.5 * np.cos(t)] for t in np.linspace(0, 6, 20)])
     region = Region((1.0, 0, 0), 1.2, ((1.0, 0.0, 0.0, 0.05),))
-
-    def seen(points: np.ndarray) -> np.ndarray:
-        return np.ones(len(points))
-
-    found = fitted_region(region, origins, np.concatenate([wall, thing]), seen)
+    found = fitted_region(region, origins, np.concatenate([wall, thing]), lambda points: np.ones(len(points)))
     assert found is not None
     assert found.radius <= 0.8 * np.linalg.norm(origins - np.array(found.centre), axis=1).min() + 1e-9
     middle = np.array([1.15, 0, 0])

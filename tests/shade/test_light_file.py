@@ -1,8 +1,7 @@
-"""Lat-long images of lights: every format, averaged to fewer rows."""
+"""Lat-long images of lights, averaged to fewer rows."""
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,42 +9,25 @@ import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
-from mi_refgs.io.images import image_size, linear_from_srgb, read_png, write_png
-from mi_refgs.reconstruction.new_light import NewLight
+from mi_refgs.io.images import linear_from_srgb, read_png, write_png
 from mi_refgs.shade.light import envmap, lobe_matrices
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light_file import read_radiance
 
 
-def write_hdr(path: Path, mantissa: np.ndarray) -> None:
-    """A Radiance image without run lengths of bytes (H, W, 3), all with the exponent of 1/256 per step."""
-    height, width = mantissa.shape[:2]
-    pixels = np.concatenate([mantissa, np.full((height, width, 1), 128, np.uint8)], axis=-1)
-    path.write_bytes(f"#?RADIANCE\n\n-Y {height} +X {width}\n".encode() + pixels.tobytes())
-
-
-def write_map(path: Path, kind: str, rng: np.random.Generator, height: int = 37) -> np.ndarray:
-    """A random map of `kind`, and its linear radiance."""
-    bytes_ = rng.integers(0, 256, (height, 74, 3), dtype=np.uint8)
-    values = (bytes_ / 256).astype(np.float32)
-    if kind == "hdr":
-        write_hdr(path, bytes_)
-    elif kind == "png":
+@pytest.mark.parametrize("kind", ["float.exr", "half.exr", "8_bits.png"])
+def test_a_map_that_is_finer_than_wanted_is_averaged(
+    kind: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """As `resample` does."""
+    path, values = tmp_path / kind, rng.integers(0, 256, (37, 74, 3)).astype(np.float32) / 256
+    if path.suffix == ".png":
         write_png(path, values)
-        return np.asarray(linear_from_srgb(read_png(path)))
+        values = linear_from_srgb(read_png(path))
     else:
-        write_exr(path, values, half=kind == "half")
-    return values
-
-
-@pytest.mark.parametrize("kind", ["exr", "half", "hdr", "png"])
-@pytest.mark.parametrize("rows", [64, 12])
-def test_every_format_is_read(kind: str, rows: int, tmp_path: Path, rng: np.random.Generator) -> None:
-    """A map that is finer than wanted is averaged as `resample` does."""
-    path = tmp_path / f"map.{kind if kind in ('hdr', 'png') else 'exr'}"
-    values = write_map(path, kind, rng)
-    expected = values if rows > len(values) else lobe_matrices.resample(values, rows)
-    np.testing.assert_allclose(read_radiance(path, rows), expected, rtol=1e-5, atol=1e-6)
+        write_exr(path, values, half=path.stem == "half")
+    for rows, expected in ((64, values), (12, lobe_matrices.resample(values, 12))):
+        np.testing.assert_allclose(read_radiance(path, rows), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(("count", "wanted"), [(9, 8), (37, 12), (1000, 7), (5, 2), (8, 24)])
@@ -63,16 +45,6 @@ def test_matrices_of_grids_are_hats(count: int, wanted: int) -> None:
     np.testing.assert_allclose(columns, hat / hat.sum(1, keepdims=True), atol=1e-12)
 
 
-def test_more_pixels_than_the_bound_are_refused_by_the_header(tmp_path: Path) -> None:
-    write_exr(tmp_path / "a.exr", np.ones((4, 6, 3)))
-    good = (tmp_path / "a.exr").read_bytes()
-    window, large = struct.pack("<4i", 0, 0, 5, 3), struct.pack("<4i", 0, 0, 2**15 - 1, 2**13)
-    (tmp_path / "a.exr").write_bytes(good.replace(window, large) + bytes(2**22))
-    for read in (image_size, read_radiance, EnvironmentLight.from_file, lambda path: NewLight(path).read()):
-        with pytest.raises(InputError, match=r"a\.exr: size: 32768 × 8193 pixels are more than 268 million"):
-            read(tmp_path / "a.exr")
-
-
 def test_a_light_without_a_height_has_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(envmap, "FINEST", 16)
     for rows, expected in ((22, 16), (14, 12)):
@@ -84,15 +56,12 @@ def test_what_is_no_light(tmp_path: Path) -> None:
     hole = np.ones((9, 8, 3))
     hole[7, 5, 1] = np.nan
     write_exr(tmp_path / "hole.exr", hole)
-    write_exr(tmp_path / "xyz.exr", np.ones((4, 8, 3)), names="XYZ")
     write_exr(tmp_path / "row.exr", np.ones((1, 8, 3)))
-    write_hdr(tmp_path / "cut.hdr", np.full((9, 16, 3), 200, np.uint8))
-    (tmp_path / "cut.hdr").write_bytes((tmp_path / "cut.hdr").read_bytes()[:-60])
+    (tmp_path / "cut.hdr").write_bytes(b"#?RADIANCE\n\n-Y 9 +X 16\n" + bytes(9 * 16 * 4 - 60))
     write_exr(tmp_path / "cut.exr", np.random.default_rng(0).random((64, 64, 3)))
     (tmp_path / "cut.exr").write_bytes((tmp_path / "cut.exr").read_bytes()[:-9000])
     for name, words in {
         "hole.exr": "NaN or infinite values, the first at row 7, column 5",
-        "xyz.exr": "channels: found X, Y, Z; export R, G, B",
         "row.exr": "8 × 1 pixels are no lat-long image",
         "cut.hdr": "truncated",
         "cut.exr": "pixels: not a readable EXR file",
