@@ -60,13 +60,9 @@ def test_cameras_in_one_place_are_refused(
     same = {"transform_matrix": np.eye(4).tolist()}
     change_transforms(data, lambda made: [frame.update(same) for frame in made["frames"]], "train")
     assert words in said(capsys, str(data))
-    assert main(train_command(data, tmp_path / "run", write_method(tmp_path))) == 2
-    error = capsys.readouterr().err
-    assert (
-        f"{data}/transforms_train.json: cameras: " in error
-        and words in error
-        and not (tmp_path / "run").exists()
-    )
+    command = train_command(data, tmp_path / "run", write_method(tmp_path))
+    refused(command, f"{data}/transforms_train.json: cameras: ", words)
+    assert not (tmp_path / "run").exists()
 
 
 def test_images_of_two_sizes_are_fitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
