@@ -22,7 +22,9 @@ def page() -> str:
     """A section for the top level and for each table of a method file."""
     text = [
         "# Settings of a method",
-        "Keys of a method file, which `--set` changes for one run: `--set loss.ssim=0.1 light.height=64`. "
+        'Keys of a method file. `extends = "NAME or FILE"` begins with another method, of which '
+        '`drop = ["loss.alpha"]` removes keys. `--set` changes keys for one '
+        "run: `--set loss.ssim=0.1 light.height=64`. "
         "Defaults are those of a file that says nothing; [methods](methods.md) shows what each says, and "
         "`config.toml` in a run folder what the run was fitted with. Numbers of iterations are written for "
         "the file's own `iterations`, and a preset scales them. A *window* is a table of `start`, `until` "
