@@ -151,11 +151,15 @@ def plugin_files() -> list[str]:
     return list(dict.fromkeys(_files.values()))
 
 
+def plugin_options(files: Sequence[str] | None = None) -> str:
+    """Options of a command that load the files, by default those of this process; a space before each."""
+    return "".join(f" --plugin {shlex.quote(file)}" for file in (plugin_files() if files is None else files))
+
+
 def load_again(error: UnknownNameError, files: Sequence[str]) -> UnknownNameError:
     """The error about a name that a run needs; its remedy names the plugins that the fit had loaded."""
     if not files:
         return error
-    options = " ".join(f"--plugin {shlex.quote(str(file))}" for file in files)
     gone = "".join(f"; {file} is gone" for file in files if not os.path.isfile(file))
-    remedy = f"add {options}, or import it in Python{gone}"
+    remedy = f"add{plugin_options(files)}, or import it in Python{gone}"
     return UnknownNameError(error.what, error.file, error.field, remedy)

@@ -9,6 +9,7 @@ from mi_refgs.cli.command import Output, Preset, Rendering, Result, Settings, jo
 from mi_refgs.cli.evaluate import table
 from mi_refgs.io.files import resource_dir
 from mi_refgs.io.progress import say
+from mi_refgs.registry import plugin_options
 
 SCENE = "glossy_demo.xml"
 VIEWS, TEST_VIEWS, SIZE, SAMPLES = 60, 8, 112, 64  # chosen for less than 8 minutes on two cores
@@ -52,6 +53,6 @@ class Demo:
         result, sheet = read_metrics(folder), output / SHEET
         if result is None or result.get("iterations") != found.trained.iteration or not sheet.is_file():
             result = found.evaluate(progress=True)
-        text = f"{table(result)}\ncontact sheet: {sheet}; next: refgs view {output}"
+        text = f"{table(result)}\ncontact sheet: {sheet}; next: refgs view {output}{plugin_options()}"
         paths = {"contact_sheet": str(sheet), "run": str(output), "data": str(data)}
         return Result({**paths, "metrics": result}, text)

@@ -20,6 +20,7 @@ from mi_refgs.cli.command import (
     joined,
     optional,
 )
+from mi_refgs.registry import plugin_options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +68,8 @@ class Train:
         beside = "" if around is None else f" and {around.surfels.count} of the background"
         text = (
             f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s "
-            f"({taken:.0f} s in all), {trainer.surfels.count} surfels{beside}; next: refgs eval {self.output}"
+            f"({taken:.0f} s in all), {trainer.surfels.count} surfels{beside}; "
+            f"next: refgs eval {self.output}{plugin_options()}"
         )
         if trainer.fit.decisions:
             data["decisions"] = trainer.fit.decisions

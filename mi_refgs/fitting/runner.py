@@ -23,6 +23,7 @@ from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import resource_dir
 from mi_refgs.methods.method import POSE, Method
+from mi_refgs.registry import plugin_options
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import MODEL
@@ -150,7 +151,7 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress, force: bo
         kept = "" if run.checkpoints() else " (before the first iteration was done)"
         raise type(error)(
             f"interrupted at iteration {trainer.iteration}{kept}; "
-            f"resume with: refgs train {views.folder or 'DATA'} -o {output} --resume"
+            f"resume with: refgs train {views.folder or 'DATA'} -o {output} --resume{plugin_options()}"
         ) from None
     except InputError as error:  # a full disk, no surfel left
         saved = run.checkpoints()

@@ -5,6 +5,8 @@ The model of a plugin is fitted. Its run is then used without the loss, event an
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -65,7 +67,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         shading = mi_refgs.Shading(model.shaded_at[0], name, diffuse="irradiance")
         one = TrainedScene(surfels, light, two_balls(), shading, 1, 0.0)
         save(one, folder / name, made, camera, data=data)
-    assert main(train_command(data, folder / "coated", folder / "coated.toml", "--plugin", str(COAT))) == 0
+    with contextlib.redirect_stdout(said := io.StringIO()):
+        options = "--plugin", str(COAT)
+        assert main(train_command(data, folder / "coated", folder / "coated.toml", *options)) == 0
+    assert f"next: refgs eval {folder / 'coated'} --plugin {COAT}\n" in said.getvalue()
     yield folder
     forget(*NEEDED, *FIT_ONLY)
 
