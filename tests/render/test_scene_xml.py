@@ -27,13 +27,6 @@ from tests.scenes import integrator as scenes
 from tests.scenes.integrator import HEIGHT, WIDTH
 
 
-def shading_with(option: str) -> Shading:
-    """A shading whose model honours the option, with OTHER_OPTIONS's value."""
-    model = next(model for model in MODELS.values() if option in model.honoured)
-    chosen = {option: scenes.OTHER_OPTIONS[option]}
-    return Shading(model.shaded_at[0], model.name, "irradiance", True, **chosen)
-
-
 def fitted(folder: Path, shading: Shading) -> TrainedScene:
     made = scenes.hollow_mesh if shading.ambient_rays else scenes.plane_mesh
     mesh = read_mesh(made(folder)) if shading.occlusion else None
@@ -59,7 +52,8 @@ def shown(folder: Path, made: TrainedScene, camera: Camera) -> tuple[mi.Scene, n
 @pytest.mark.parametrize("option", QUALITY)
 def test_quality_options_round_trip(option: str, tmp_path: Path) -> None:
     """Through scene.xml and through model.json; and the images are the same."""
-    shading = shading_with(option)
+    model, chosen = next(x for x in MODELS.values() if option in x.honoured), scenes.OTHER_OPTIONS[option]
+    shading = Shading(model.shaded_at[0], model.name, "irradiance", True, **{option: chosen})
     made = fitted(tmp_path, shading)
     scene, seen, expected = shown(tmp_path / "run", made, view())
     assert scene.integrator().shading == shading and TrainedScene.read(tmp_path / "run").shading == shading

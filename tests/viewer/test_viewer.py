@@ -153,9 +153,6 @@ class Clock:
         return self.now
 
 
-Delivered = tuple[np.ndarray, int, float]  # an image, its progress and seconds
-
-
 class Loop(RenderLoop):
     """A loop over a grey scene with client 7, which has no pose yet."""
 
@@ -165,9 +162,9 @@ class Loop(RenderLoop):
         self.seen, self.reported = self.add(7), list[str]()
         self.report = self.reported.append
 
-    def add(self, number: int) -> list[Delivered]:
-        """Add a client; return the list of its images."""
-        seen: list[Delivered] = []
+    def add(self, number: int) -> list[Any]:
+        """Add a client; return the list of its images, each with progress and seconds."""
+        seen: list[Any] = []
         self.clients[number] = Client(lambda *image: seen.append(image))
         return seen
 
@@ -185,7 +182,7 @@ def loop() -> Loop:
     return Loop()
 
 
-def progress(seen: list[Delivered]) -> list[int]:
+def progress(seen: list[Any]) -> list[int]:
     return [each for _, each, _ in seen]
 
 
