@@ -42,7 +42,4 @@ def progress_bar(total: int, what: str, **options: Any) -> Any:
 
 def with_bar(items: Sequence[Item], what: str, **options: Any) -> Iterator[Item]:
     """Yield the items under a bar that counts them."""
-    with progress_bar(len(items), what, **options) as bar:
-        for item in items:
-            yield item
-            bar.update()
+    yield from progress_bar(len(items), what, iterable=items, **options)
