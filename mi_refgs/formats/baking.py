@@ -8,6 +8,7 @@ import importlib.util
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +19,7 @@ from scipy import ndimage
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError, SceneError, require_between
 from mi_refgs.formats.format import Shot
+from mi_refgs.io.progress import warn
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
 from mi_refgs.occlusion.mesh import Mesh, clean
@@ -79,6 +81,9 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
         remedy = "export `scene.xml`, or another model"
         raise SceneError(f"{model.name} has no textures", "reflectance", remedy=remedy)
+    owner: Any = next(kind for kind in type(model).__mro__ if "textures" in vars(kind))
+    if lost := {*scene.shading.required_attributes} - {*owner.required_attributes(model, scene.shading)}:
+        warn(f"{', '.join(lost)}: not exported; `{model.name}` needs a method `textures` that uses it")
     # Views that show the object's materials.
     plain = replace(scene, shading=scene.shading.untraced())
     views = [shots[i].camera.resized(VIEW_SIZE) for i in evenly_spread(len(shots), VIEWS)]

@@ -137,7 +137,9 @@ def meshed(run: Path, out: Path) -> None:
     if MODELS[run.name].textures(dict.fromkeys(ATTRIBUTES, 0.5)) is None:
         refused(command, run.name)
     else:
-        assert main(command) == 0
+        with contextlib.redirect_stderr(said := io.StringIO()):
+            assert main(command) == 0
+        assert ("coat: not exported; `coated` needs" in said.getvalue()) == (run.name == "coated")
 
 
 COMMANDS: dict[str, Callable[[Path, Path], np.ndarray | None]] = {

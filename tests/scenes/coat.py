@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -33,9 +32,6 @@ class Coated(SplitSum):
         mirrored = reflect(safe_normalize(points.view), safe_normalize(points.normal))
         coat = points.coat * light.specular(mirrored, dr.minimum(points.roughness, 0.1))
         return mi_refgs.RadianceTerms(terms.diffuse, terms.specular + coat, terms.indirect)
-
-    def textures(self, values: Mapping[str, Any]) -> dict[str, Any] | None:
-        return None
 
 
 mi_refgs.register_reflectance(Coated())
