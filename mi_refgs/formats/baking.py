@@ -113,6 +113,7 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
         raise SceneError(what, "mesh", remedy="train it for longer")
     low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0).max()
     made = trimesh.Trimesh((mesh.vertices - low) / size, mesh.faces, process=False)
+    made.merge_vertices()  # a seam of texture coordinates would tear
     trimesh.smoothing.filter_taubin(made, iterations=SMOOTHING)
     if len(made.faces) > faces:
         made = made.simplify_quadric_decimation(face_count=faces)

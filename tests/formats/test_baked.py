@@ -99,6 +99,10 @@ def test_charts_do_not_overlap(exported: Exported) -> None:
     """Areas of triangles sum to that of the covered texels, so none is counted twice."""
     mesh = simplified(exported.trained.mesh or Mesh.empty(), FACES)
     assert FACES / 2 < len(mesh.faces) <= FACES
+    whole = known_mesh()
+    cut = Mesh(whole.vertices[whole.faces].reshape(-1, 3), np.arange(whole.faces.size).reshape(-1, 3), 0.01)
+    welded, expected = simplified(cut, FACES), simplified(whole, FACES)
+    assert len(welded.vertices) == len(expected.vertices) and len(welded.faces) == len(expected.faces)
     _, faces, uv = unwrap(mesh, TEXTURE)
     assert uv.min() >= 0 and uv.max() <= 1
     corner = uv[faces]
