@@ -75,7 +75,7 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
             raise InputError(f"{package} is not installed", "--to", remedy=remedy)
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
-        remedy = "fit one with occlusion, as `--for relighting` does"
+        remedy = "fit one with occlusion, as `--for relighting` does; if it was, longer: no mesh was extracted"
         raise SceneError("the run has none", "mesh", remedy=remedy)
     model = scene.shading.model
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
