@@ -112,12 +112,12 @@ class Registry(Mapping[str, T], Generic[T]):
         return len(self._items)
 
 
-def load_plugins(files: Sequence[str | Path] = ()) -> None:
-    """Run the modules of the entry points GROUP, then Python files, each once in a process: they register
-    what they add. Raises InputError for one that is missing or fails."""
+def load_plugins(files: str | Path | Sequence[str | Path] = ()) -> None:
+    """Run the modules of the entry points GROUP, then one or more Python files, each once in a process: they
+    register what they add. Raises InputError for one that is missing or fails."""
     for point in importlib.metadata.entry_points(group=GROUP):
         _load(point.value, point.load, f"entry point {point.value}", "update or remove its package")
-    for file in files:
+    for file in [files] if isinstance(files, str | Path) else files:
         path = os.path.abspath(file)
         if not (path.endswith(".py") and os.path.isfile(path)):
             raise InputError("no such file", path, "--plugin", "give a Python file, NAME.py")

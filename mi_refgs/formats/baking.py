@@ -75,7 +75,9 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
             raise InputError(f"{package} is not installed", "--to", remedy=remedy)
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
-        remedy = "fit one with occlusion, as `--for relighting` does; if it was, longer: no mesh was extracted"
+        remedy = (
+            "fit one with occlusion, as `--for relighting` does; if it was, longer: no mesh was extracted"
+        )
         raise SceneError("the run has none", "mesh", remedy=remedy)
     model = scene.shading.model
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
@@ -119,7 +121,7 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
         made = made.simplify_quadric_decimation(face_count=faces)
     # A part that the box of an object has cut open could count as the wall of a cavity.
     whole = clean(np.asarray(made.vertices), np.asarray(made.faces), mesh.voxel, open_=True)
-    return Mesh((whole.vertices * size + low).astype(np.float32), whole.faces, mesh.voxel)
+    return Mesh(whole.vertices * size + low, whole.faces, mesh.voxel)
 
 
 def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,7 +143,7 @@ def texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, UI
     """Find the texels of a size² texture whose centre lies in a triangle. Returns which they are (size, size)
     bool, the first row at v = 1, and for the T of them, row by row, the triangle (T,) and the barycentric
     coordinates (T,) of its second and third corner."""
-    plane = Occluder(Mesh(np.pad(uv, ((0, 0), (0, 1))).astype(np.float32), faces, FLAT))
+    plane = Occluder(Mesh(np.pad(uv, ((0, 0), (0, 1))), faces, FLAT))
     row, column = np.divmod(np.arange(size * size), size)
     above = mi.Point3f(upload((column + 0.5) / size), upload(1 - (row + 0.5) / size), mi.Float(1))
     hit = plane.closest(above, mi.Vector3f(0, 0, -1), None)

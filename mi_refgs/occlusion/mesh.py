@@ -31,15 +31,19 @@ class Mesh:
     faces: np.ndarray  # (F, 3) uint32
     voxel: float  # resolution of the surface, scene units; offsets of visibility rays scale with it
 
+    def __post_init__(self) -> None:
+        for name, kind in (("vertices", np.float32), ("faces", np.uint32)):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), kind))
+
     @staticmethod
     def empty(voxel: float = 1.0) -> Mesh:
         """The mesh of an empty volume."""
-        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), voxel)
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), voxel)
 
     def part(self, kept: np.ndarray) -> Mesh:
         """The kept triangles (F,) bool, with the vertices that they have."""
         used, faces = np.unique(self.faces[kept], return_inverse=True)
-        return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.uint32), self.voxel)
+        return Mesh(self.vertices[used], faces.reshape(-1, 3), self.voxel)
 
     def normals(self) -> np.ndarray:
         """Outward unit normals (V, 3) of the triangles around each vertex."""
@@ -80,7 +84,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = F
     keep = (area >= COMPONENT_KEEP * area[solid].max(initial=0)) & solid
     mesh.update_faces(keep[label])
     mesh.remove_unreferenced_vertices()
-    return Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), voxel)
+    return Mesh(mesh.vertices, mesh.faces, voxel)
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
@@ -125,4 +129,4 @@ def read_mesh(path: Path | str) -> Mesh:
     if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(vertices).all()):
         wrong = f"vertices not finite, or {VOXEL_COMMENT} not above 0"
         raise InputError(wrong, path, "mesh", "extract the mesh again")
-    return Mesh(vertices, faces.astype(np.uint32), voxel)
+    return Mesh(vertices, faces, voxel)

@@ -24,12 +24,13 @@ from mi_refgs.synthesis.settings import RELIGHT, recorded_lights
 class NewLight:
     """A lat-long map file as the light of a scene."""
 
-    path: Path
+    path: Path  # or str
     world: bool = False  # whether the map is in world directions; otherwise its first row is +z
     rotate: float = 0.0  # degrees about +z, counter-clockwise seen from above
     exposure: float = 0.0  # stops: radiance times 2^exposure
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
         require_file(self.path)
         require_range(self.rotate, self.exposure)
 

@@ -71,7 +71,7 @@ def make_dataset(
         write_region(out, region)
     if not (out / SURFACE).exists():
         voxel = 2 * cameras.radius / SURFACE_VOXELS
-        write_mesh(out / SURFACE, Mesh(vertices.astype(np.float32), faces.astype(np.uint32), voxel))
+        write_mesh(out / SURFACE, Mesh(vertices, faces, voxel))
     write_views(out, ("train", "test"), Tracer(loaded, cameras), MAPS, progress)
     for other, scene_there in zip(others, relit, strict=True):
         alone = Tracer(scene_there, replace(cameras, objects=()))

@@ -78,7 +78,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture
 def coat(place: Path) -> Iterator[None]:
     """What rendering needs of the plugin is registered, and nothing else of it."""
-    mi_refgs.load_plugins([COAT])
+    mi_refgs.load_plugins(str(COAT))
     forget(*FIT_ONLY)
     yield
     forget(*NEEDED)

@@ -195,7 +195,8 @@ def test_a_part_of_a_mesh_has_whole_triangles_and_their_vertices_alone() -> None
 def test_mesh_file_round_trip(tmp_path: Path) -> None:
     """Vertices, faces, voxel, and the empty mesh; foreign files get a voxel from their edges."""
     solid = trimesh.creation.icosphere(2)
-    mesh = meshes.Mesh(np.asarray(solid.vertices, np.float32), np.asarray(solid.faces, np.uint32), 0.0123)
+    mesh = meshes.Mesh(solid.vertices, solid.faces, 0.0123)  # of trimesh's types
+    assert (type(mesh.vertices), mesh.vertices.dtype, mesh.faces.dtype) == (np.ndarray, np.float32, np.uint32)
     for case in (mesh, meshes.Mesh.empty(0.5)):
         meshes.write_mesh(tmp_path / "mesh.ply", case)
         back = meshes.read_mesh(tmp_path / "mesh.ply")

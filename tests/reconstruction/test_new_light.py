@@ -30,7 +30,7 @@ def test_panorama_zenith_is_z_and_rotates_about_it(tmp_path: Path) -> None:
     image[:4] = (3, 0, 0)
     image[12:20, 30:34] = (0, 5, 0)
     write_exr(file, image)
-    upright = NewLight(file).read()
+    upright = NewLight(str(file)).read()  # type: ignore[arg-type]
     np.testing.assert_allclose(radiance_along(upright, [0, 0, 1]), (3, 0, 0), atol=0.05)
     np.testing.assert_allclose(radiance_along(upright, [0, 0, -1]), 0.1, atol=0.01)
     as_it_lies = NewLight(file, world=True).read()
