@@ -33,9 +33,9 @@ from mi_refgs.reconstruction.new_light import NewLight, truth_under
 from mi_refgs.reconstruction.reconstruction import load
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import export
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import RELIT, Run
 
-SHEET, RESULT = "sheet.png", "relight.json"
+SHEET = "sheet.png"
 SHEET_VIEWS, SHEET_COLUMNS = 4, 6  # test views of a sheet, spread evenly; most frames of a turntable per row
 NO_TRUTH = "the data set has no test views under this light; make them with `refgs dataset --relight`"
 NO_DATA = "there is no data set, so cameras are around the object; name its folder with --data"
@@ -122,7 +122,7 @@ def relight(
     environment = light_image(relit.trained.light.radiance().numpy())
     rows = _rows(ours, truth, np.array(result.get("scale", 1.0)), background)
     write_png(folder / place / SHEET, contact_sheet(rows, {"environment map": environment}))
-    write_json(folder / place / RESULT, result)
+    write_json(folder / place / RELIT, result)
     return result
 
 

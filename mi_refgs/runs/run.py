@@ -33,6 +33,7 @@ EXPOSURE = "exposure.json"  # gains of the training views
 LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
 LOG = "metrics.jsonl"  # the training log; other logs of a run are other .jsonl files
 CONFIG = "config.toml"
+RELIT = "relight.json"  # of a folder that `refgs relight` wrote, which is no run
 
 
 class Run:
@@ -82,7 +83,12 @@ class Run:
     def method(self) -> Method:
         """The resolved method; raises InputError if this is no run folder."""
         if not self.exists():
-            raise InputError("missing", self.path, CONFIG, "give the folder that `refgs train -o` wrote")
+            remedy = "give the folder that `refgs train -o` wrote"
+            if (self.path / RELIT).is_file():
+                remedy = (
+                    "it is a relit scene: give its run; in Python, load(RUN).relight(…).export(…) exports one"
+                )
+            raise InputError("missing", self.path, CONFIG, remedy)
         return load_resolved(self.path / CONFIG)
 
     def _record(self, name: str) -> dict[str, Any]:

@@ -158,6 +158,7 @@ def test_relight_command(known: Path, tmp_path: Path, capfd: pytest.CaptureFixtu
     assert plain["psnr_scaled"] > 20
     assert json.loads((out / "relight.json").read_text()) == plain
     refused([*command, "--azimuth", "30"], "output: has other files")
+    refused(["export", str(out)], "config.toml: missing; it is a relit scene: give its run")
     assert main([*command[:-1], str(tmp_path / "turned"), "--azimuth", "30"]) == 0
     shown = capfd.readouterr()
     assert "score: none" in shown.out and "warning" not in shown.err
