@@ -289,16 +289,18 @@ def load_method(method: str | None, preset: str | None, settings: Settings = ())
 
 def _require_same(run: Run, made: Method, choice: Choice, views: Dataset) -> None:
     """Raise InputError if what is given for a resumed run would have made another method of it."""
-    now = choice.method
+    now, first = choice.method, ["name", "preset"]
     if not isinstance(now, Method):
         name = choice.named()
         if not (name or choice.preset or choice.settings):
             return
         if choice.purpose is not None:
             name = _for_images(name, load_method(name, None), views)
-        settings = methods.assignments(choice.settings) or made.assignments
-        now = methods.load(name or made.file, choice.preset or made.preset or DEFAULT_PRESET, settings)
+        given = methods.assignments(choice.settings)  # other keys are the run's
+        first += [text.partition("=")[0] for text in given]
+        preset = choice.preset or made.preset or DEFAULT_PRESET
+        now = methods.load(name or made.file, preset, [*made.assignments, *given])
     if found := differences(run, now):
-        key = min(found, key=lambda key: key not in ("name", "preset"))
+        key = min(found, key=lambda key: [not key.startswith(one) for one in first])
         what = "the run was started with {}, and would now have {}".format(*found[key])
         raise InputError(what, run.path / "config.toml", key, "drop what says so, or choose another -o")

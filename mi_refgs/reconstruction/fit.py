@@ -96,7 +96,7 @@ def _light_settings(file: str | Path | None, fixed: bool, data: Path) -> list[st
         return []
     path, own = Path(file).resolve(), data / "environment.exr"
     world = path.is_file() and own.is_file() and path.read_bytes() == own.read_bytes()
-    chosen = {"kind": "file", "file": str(path), "fixed": fixed, "world": world}
+    chosen = {"file": str(path), "kind": "file", "fixed": fixed, "world": world}
     return methods.assignments({f"light.{key}": value for key, value in chosen.items()})
 
 

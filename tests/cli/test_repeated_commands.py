@@ -35,6 +35,7 @@ def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path,
     state, config = contents(run / "checkpoints"), Run(run).method()
     for more in ([], ["--method", str(config.file)], ["--preset", "quick"]):
         assert main([*argv, *more]) == 0
+    assert main([*argv[:4], "--resume", "--set", "data.downscale=1"]) == 0  # other keys are the run's
     assert main([*argv[:4], "--resume"]) == 0 and contents(run / "checkpoints") == state
     other = tmp_path / "twin" / method.name  # of the same name
     other.parent.mkdir()
@@ -46,6 +47,10 @@ def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path,
     }
     for option, (value, key) in changes.items():
         refused([*argv, option, value], f"config.toml: {key}: the run was started with")
+    refused(
+        [*argv[:4], "--resume", "--light", str(data / "environment.exr")],
+        "config.toml: light.file: the run was started with None",
+    )
     longer = dataclasses.replace(config, iterations=500)
     again = lambda: reconstruct.fit(data, longer, output=run, resume=True, progress=Progress())  # noqa: E731
     refused(again, "iterations: the run was started with 6", " 500")
