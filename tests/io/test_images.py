@@ -83,5 +83,3 @@ def test_files_are_written_atomically(tmp_path: Path) -> None:
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.txt"]
     write_bytes(path, b"new")
     assert path.read_bytes() == b"new" and os.listdir(tmp_path) == ["a.txt"]
-    words = "a.txt: output: cannot be created (", "; choose a writable"
-    refused(partial(write_bytes, path / "b.txt", b""), *words)

@@ -58,14 +58,10 @@ def test_exported_map_round_trip(rng: np.random.Generator, tmp_path: Path) -> No
     np.testing.assert_allclose(again.radiance().numpy(), light.radiance().numpy(), rtol=1e-6)
 
 
-def test_bad_input(tmp_path: Path) -> None:
-    (tmp_path / "text.exr").write_text("not an image")
-    refused(lambda: EnvironmentLight.from_file(tmp_path / "text.exr"), "text.exr: pixels")
+def test_bad_input() -> None:
     refused(lambda: EnvironmentLight.from_radiance(np.full((8, 16, 3), np.nan)), "NaN")
     for shape in ((8, 8, 3), (10, 20, 3), (4, 8, 3), (8, 16, 1)):
         refused(partial(EnvironmentLight, dr.zeros(mi.TensorXf, shape)), "shape")
-    (tmp_path / "file").write_text("")
-    refused(lambda: EnvironmentLight.constant(1, 8).write(tmp_path / "file" / "a.exr"), "cannot be created")
 
 
 def test_softplus_is_exact_positive_and_finite() -> None:
@@ -143,7 +139,7 @@ def test_maps_finer_than_the_levels_are_averaged(
 @pytest.mark.parametrize("height", [8, 12, 64])
 def test_prefilter_of_a_gpu_is_that_of_the_host(height: int, rng: np.random.Generator) -> None:
     op = prefilter.operator(height)
-    kernels = Kernels.of(height, op.shapes, op.matrix, op.texels)
+    kernels = Kernels(height, op.shapes, op.matrix, op.texels)
     radiance = rng.uniform(size=(height, 2 * height, 3)).astype(np.float32)
     δ = rng.normal(size=(op.texels, 4)).astype(np.float32)
     levels = kernels.apply(upload(radiance)).numpy().reshape(δ.shape)

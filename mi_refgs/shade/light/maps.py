@@ -108,11 +108,7 @@ def require_range(rotate: float, exposure: float) -> None:
 
 
 def world_light(
-    radiance: np.ndarray,
-    world: bool = False,
-    rotate: float = 0.0,
-    exposure: float = 0.0,
-    height: int | None = None,
+    radiance: np.ndarray, world: bool, rotate: float, exposure: float, height: int | None = None
 ) -> EnvironmentLight:
     """Convert lat-long radiance (h, w, 3) to a light of `height` rows, by default h, at most FIXED_HEIGHT;
     options as in `Known`."""

@@ -38,8 +38,8 @@ class NearField:
     def __post_init__(self) -> None:
         centre, nearness = np.shape(self.centre), np.shape(self.nearness)
         if centre != (3,) or len(nearness) != 2 or nearness[1] != 2 * nearness[0] or nearness[0] < 2:
-            found = f"shapes {centre} and {nearness}"
-            raise InputError(found, "near field", remedy="need (3,) and (h, 2h), h ≥ 2")
+            what, remedy = f"shapes {centre} and {nearness}", "need (3,) and (h, 2h), h ≥ 2"
+            raise InputError(what, "near field", remedy=remedy)
         if not (np.isfinite(self.centre).all() and np.all((0 <= self.nearness) & (self.nearness < np.inf))):
             raise InputError("a value is negative or not finite", "near field", remedy="replace it")
 
@@ -68,21 +68,17 @@ class NearField:
         dr.make_opaque(centre)
         return upload(np.asarray(self.nearness, np.float32)), centre
 
-    def at(self, direction: Vector3f) -> Float:
-        h = dr.opaque(mi.UInt32, len(self.nearness))
-        texels = self.on_device[0]
-        u, v = azimuth_polar(direction)
-        return interpolated(lambda i: dr.gather(mi.Float, texels, i), u, v, h, 2 * h)
-
     def seen_from(self, position: Point3f, direction: Vector3f) -> Vector3f:
         """Unit directions from the centre to what rays x + t r from `position` in unit directions meet, under
         AD. The distance 1 / n is looked up in the direction of the last point that was found; on the sphere
         of that radius t = τ / n, τ = √((x·r n)² + 1 - |x|² n²) - x·r n, and the direction is r + x n / τ,
         also where n is 0. Where x is outside, t is SHORTEST radii or more."""
         offset = mi.Vector3f(position) - mi.Vector3f(self.on_device[1])
+        texels, h = self.on_device[0], dr.opaque(mi.UInt32, len(self.nearness))
         towards, nearness = mi.Vector3f(direction), mi.Float(0)
         for index in range(LOOKUPS):
-            found = self.at(towards)
+            at = azimuth_polar(towards)
+            found = interpolated(lambda i: dr.gather(mi.Float, texels, i), *at, h, 2 * h)
             nearness = dr.lerp(found, nearness, DAMPING) if index else found
             along = dr.dot(offset, direction) * nearness
             inside = dr.square(along) + 1 - dr.squared_norm(offset) * dr.square(nearness)

@@ -94,7 +94,7 @@ def _operator(variant: str, height: int) -> Operator:
     *firsts, texels = np.cumsum([0, *(2 * h * h for h in heights)]).tolist()
     shapes = tuple(zip(firsts, heights, strict=True))
     info = upload(np.array([(first, h, 2 * h, 0) for first, h in shapes]), mi.UInt32)
-    kernels = Kernels.of(height, shapes, matrix, texels) if variant.startswith("cuda") else None
+    kernels = Kernels(height, shapes, matrix, texels) if variant.startswith("cuda") else None
     return Operator(height, matrix, info, shapes, texels, kernels)
 
 

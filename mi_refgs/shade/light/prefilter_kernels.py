@@ -49,19 +49,11 @@ def _circle(variant: str, turns: int) -> tuple[Float, Float]:
     return upload(np.cos(angle)), upload(np.sin(angle))
 
 
-@dataclass(frozen=True)
 class Part:
     """Texels and coefficients of some maps, and the matrix that makes the coefficients of other maps."""
 
-    to_coefficients: Terms
-    to_texels: Terms
-    row_ends: UInt32
-    columns: UInt32
-    weights: Float
-    turns: int
-
-    @staticmethod
-    def of(shapes: Shapes, matrix: csc_matrix, turns: int) -> Part:
+    def __init__(self, shapes: Shapes, matrix: csc_matrix, turns: int) -> None:
+        self.turns = turns
         rows, analysed, synthesised, first = matrix.tocsr(), [], [], 0
         for texel, h in shapes:
             unit = turns // (4 * h)
@@ -71,11 +63,11 @@ class Part:
             angle = unit * (2 * j + 1)
             synthesised.append([first + i, h + 0 * i, h + 1 + 0 * i, 0 * i, angle])
             first += h * (h + 1)
-        to, back = (
+        self.to_coefficients, self.to_texels = (
             Terms(*(upload(x, mi.UInt32) for x in np.hstack(part))) for part in (analysed, synthesised)
         )
-        ends, columns = (upload(x, mi.UInt32) for x in (rows.indptr, rows.indices))
-        return Part(to, back, ends, columns, upload(rows.data), turns)
+        self.row_ends, self.columns = (upload(x, mi.UInt32) for x in (rows.indptr, rows.indices))
+        self.weights = upload(rows.data)
 
     def analyse(self, texels: Float) -> Float:
         """Coefficients of texels."""
@@ -125,19 +117,13 @@ def _stored(sums: list[Float]) -> Float:
     return stored
 
 
-@dataclass(frozen=True)
 class Kernels:
     """Those of an operator: the map, and its levels."""
 
-    map: Part  # its product is with the transposed matrix
-    levels: Part
-    texels: int
-
-    @staticmethod
-    def of(height: int, shapes: Shapes, matrix: csc_matrix, texels: int) -> Kernels:
-        turns = 4 * height
-        parts = Part.of([(0, height)], matrix.T, turns), Part.of(shapes[1:], matrix, turns)
-        return Kernels(*parts, texels)
+    def __init__(self, height: int, shapes: Shapes, matrix: csc_matrix, texels: int) -> None:
+        self.texels = texels
+        self.map = Part([(0, height)], matrix.T, 4 * height)  # its product is with the transposed matrix
+        self.levels = Part(shapes[1:], matrix, 4 * height)
 
     def apply(self, radiance: Float) -> Float:
         """As `Operator.apply`, of flat arrays."""
