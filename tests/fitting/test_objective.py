@@ -21,7 +21,7 @@ from mi_refgs.methods.method import LossWeight
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, shown, view_of
+from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, planes, shown, view_of
 
 
 def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset, Target]:
@@ -33,10 +33,8 @@ def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset
 def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
     flat = np.full(alpha.shape, 2.0, np.float32)
     normal = mi.Vector3f(0, 0, upload(-alpha.astype(np.float32)))
-    planes = [upload(radiance[..., c].astype(np.float32)) for c in range(3)]
-    opacity = upload(alpha.astype(np.float32))
-    frame = Frame(alpha=opacity, depth=upload(flat), normal=normal, radiance=mi.Color3f(*planes))
-    return replace(frame, object_alpha=opacity)
+    opacity, colour = upload(alpha.astype(np.float32)), mi.Color3f(*planes(radiance.astype(np.float32)))
+    return Frame(opacity, upload(flat), normal, colour, object_alpha=opacity)
 
 
 Picture = tuple[np.ndarray, np.ndarray]

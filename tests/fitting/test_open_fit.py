@@ -84,8 +84,7 @@ def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None
     distance = np.linalg.norm(outer, axis=1)
     assert np.all(size <= 1.001 * method.surroundings.size * distance)
     assert np.exp(params["scale"].numpy()).max() < REGION.radius
-    views = [view.project(outer)[2] for view in data.views]
-    assert np.mean(np.any(views, axis=0)) > 0.99
+    assert np.mean(np.any([view.project(outer)[2] for view in data.views], axis=0)) > 0.99
     # The sky is 0.5 + 0.3 d in the direction d, encoded; what no view sees is grey.
     trainer = Trainer(method, data)
     assert [table.max_count for table in trainer.fit.tables] == [48, 142]  # a quarter of 190
@@ -426,11 +425,8 @@ def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None
     towards /= np.linalg.norm(towards)
 
     def wall(distance: float) -> Surfels:
-        made = from_points(
-            (centre + distance * towards)[None], -towards[None], rng=np.random.default_rng(0),
-            attributes=["radiance_sh"], opacity=0.99,
-        )  # fmt: skip
-        raw = made.to_numpy()
+        options: Any = {"attributes": ["radiance_sh"], "opacity": 0.99, "rng": np.random.default_rng(0)}
+        raw = from_points((centre + distance * towards)[None], -towards[None], **options).to_numpy()
         raw["scale"][:] = np.log(3.0)
         return Surfels.from_numpy(raw)
 

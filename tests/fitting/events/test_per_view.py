@@ -29,7 +29,7 @@ from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import GAIN, LOSS_WEIGHTS, POSE, DataOptions, Method
 from mi_refgs.reference import losses as reference
-from mi_refgs.render.display import displayed
+from mi_refgs.render.display import displayed, image_array
 from mi_refgs.render.pipeline import Frame, SurfelScene, render
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.views import with_poses
@@ -320,8 +320,7 @@ def disturbed_discs(rng: np.random.Generator) -> tuple[Dataset, Surfels, np.ndar
     raw["radiance_sh"][:, :3] = rng.normal(size=(300, 3))
     surfels, distance = Surfels.from_numpy(raw), 4.0
     scene = SurfelScene(surfels, Shading(at="surfel", reflectance="radiance"))
-    outward = unit(rng.normal(size=(views, 3)) * [1, 1, 0.6])
-    true = poses_around(outward, np.zeros(3), distance)
+    true = poses_around(unit(rng.normal(size=(views, 3)) * [1, 1, 0.6]), np.zeros(3), distance)
     # Disturbances without the motion that all cameras have in common: it would be the scene's.
     eye, turn = true[:, :3, 3], np.radians(0.5) * unit(rng.normal(size=(views, 3)))
     shift = 0.005 * distance * unit(rng.normal(size=(views, 3))) - np.cross(turn, eye)
@@ -334,9 +333,8 @@ def disturbed_discs(rng: np.random.Generator) -> tuple[Dataset, Surfels, np.ndar
         intrinsics = (size, size, 1.4 * size, 1.4 * size, size / 2, size / 2)
         view = View(f"{i}", *intrinsics, pose, Pixels(np.zeros((size, size, 3), np.float32)))
         frame = render(scene, view.camera())
-        image = np.stack([np.array(x) for x in displayed(frame, background, False)], -1)
-        alpha = np.array(frame.alpha).reshape(size, size)
-        pixels = Pixels(image.reshape(size, size, 3).clip(0, 1).astype(np.float32), alpha)
+        image = image_array([*displayed(frame, background, False), frame.alpha], size, size)
+        pixels = Pixels(image[..., :3].clip(0, 1), image[..., 3])
         made.append(replace(view, to_world=wrong[i], pixels=pixels))
     return Dataset(Path("discs"), "train", tuple(made), background, False, None), surfels, true
 
