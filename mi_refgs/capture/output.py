@@ -79,9 +79,8 @@ def prepare(folder: Path, sources: Sequence[Path]) -> None:
     real = folder.resolve()
     for source in sources:
         if real in (source.resolve(), *source.resolve().parents):
-            raise InputError(
-                f"it contains {source}, which is read", folder, "output", "choose another folder"
-            )
+            what = f"it contains {source}, which is read"
+            raise InputError(what, folder, "output", "choose another folder")
     own = (folder / WORK / "key").is_file()
     own = own or ((folder / REPORT).is_file() and "key" in read_json(folder / REPORT))
     if not own and folder.is_dir() and any(folder.iterdir()):

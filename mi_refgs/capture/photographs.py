@@ -165,15 +165,13 @@ def _positive(value: object) -> float | None:
     return number if 0 < number < np.inf else None
 
 
-def find_masks(folder: Path | None, photographs: Sequence[Photograph]) -> dict[str, Path]:
-    """The mask of each photograph by its name, as in `data.images.mask_in`; empty without a folder."""
+def find_masks(folder: Path, photographs: Sequence[Photograph]) -> dict[str, Path]:
+    """The mask of each photograph by its name, as in `data.images.mask_in`."""
     masks: dict[str, Path] = {}
-    if folder is None:
-        return masks
     if not folder.is_dir():
         raise InputError("no such folder", folder, "--masks", "give one with a PNG file per photograph")
     for photograph in photographs:
-        path, wanted = mask_in(folder, photograph.name).path, photograph.size
+        path, wanted = mask_in(folder, photograph.name), photograph.size
         size = image_size(path)
         if not is_copy(size, wanted) and not is_copy(size, photograph.stored_size):
             what = f"{size[0]} × {size[1]} pixels, but {photograph.name} has {wanted[0]} × {wanted[1]}"

@@ -58,7 +58,7 @@ def capture(
         remedy = f"give one of {', '.join(MODELS)}"
         raise InputError(f"{camera}: unknown lens model", "--camera-model", remedy=remedy)
     photographs = find_photographs(source)
-    mask_files = find_masks(masks, photographs)
+    mask_files = {} if masks is None else find_masks(masks, photographs)
     if masks is None and (ignored := [path for path in source.glob("*/") if MASK.search(path.name)]):
         tell(f"not used: {ignored[0]}; --masks {ignored[0]} would read masks there")
     output.prepare(folder, [source] if masks is None else [source, masks])

@@ -10,7 +10,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -203,16 +203,15 @@ def is_copy(size: tuple[float, ...], of: tuple[float, ...]) -> bool:
     return abs(size[0] * of[1] - size[1] * of[0]) < max(sum(size), sum(of))
 
 
-def image_folder(root: Path, model: Path | None = None) -> tuple[Path, Path]:
-    """The first of FOLDERS in `root`, and `root`; of a `model`, that of its nearest parent which has one, and
-    that parent, or else twice the nearest that contains images. Raises InputError without any."""
-    parents = [root] if model is None else [p for p in (model, *model.parents) if p.is_relative_to(root)]
-    found = [(p / name, p) for p in parents for name in FOLDERS if (p / name).is_dir()]
-    if not found and model is not None:
-        found = [(parent, parent) for parent in parents if image_files(parent, deep=False)]
-    if not found:
-        raise InputError("no such folder", root, FOLDERS[0], "put the images there, or give its parent")
-    return found[0]
+def image_folder(root: Path, model: Path) -> tuple[Path, Path]:
+    """The first of FOLDERS in `model`, or in its nearest parent in `root` that has one, and that parent; else
+    twice the nearest that contains images. Raises InputError without any."""
+    parents = [path for path in (model, *model.parents) if path.is_relative_to(root)]
+    folders = ((path / name, path) for path in parents for name in FOLDERS if (path / name).is_dir())
+    flat = ((path, path) for path in parents if image_files(path, deep=False))
+    if found := next(chain(folders, flat), None):
+        return found
+    raise InputError("no such folder", root, FOLDERS[0], "put the images there, or give its parent")
 
 
 def image_files(folder: Path, deep: bool) -> list[Path]:
@@ -255,13 +254,13 @@ def mask_of(image: Path, root: Path, beside: bool = True) -> Mask | None:
     if not folders:
         return None
     best = min(folders, key=lambda path: (images[path] != own, images[path] != "", path.name != MASKS))
-    return mask_in(best, str(name.relative_to(own) if own in (*FOLDERS, images[best]) else name))
+    return Mask(mask_in(best, str(name.relative_to(own) if own in (*FOLDERS, images[best]) else name)))
 
 
-def mask_in(folder: Path, name: str) -> Mask:
+def mask_in(folder: Path, name: str) -> Path:
     """The mask of an image in a folder of masks: of `a.jpg` `a.jpg.png`, `a.png`, `a_mask.png` and so on."""
     if found := _mask_file(folder, name, MARKS):
-        return Mask(found)
+        return found
     raise InputError("missing", folder / f"{name}.png", "mask", "add it, or remove the folder of masks")
 
 

@@ -30,13 +30,13 @@ class LlffReader:
         return (folder / POSES).is_file()
 
     def read(self, folder: Path, split: str, options: ReadOptions) -> Recording:
-        source, images = folder / POSES, image_folder(folder)[0]
-        rows, files = read_poses(source), image_files(images, deep=True)
+        source, images = folder / POSES, image_folder(folder, folder)[0]
+        rows, files = read_poses(source), image_files(images, deep=images != folder)
         if len(files) != len(rows):
             what = f"{len(rows)} cameras, but {images.name} has {len(files)} images"
             raise InputError(what, source, remedy="restore the images")
         chosen = held_out(list(zip(files, rows, strict=True)), split, source)
-        return Recording(tuple(_view(source, options, *one) for one in chosen), source=source)
+        return Recording(tuple(_view(source, images, options, *one) for one in chosen), source=source)
 
 
 def read_poses(path: Path) -> np.ndarray:
@@ -56,9 +56,9 @@ def read_poses(path: Path) -> np.ndarray:
     return rows
 
 
-def _view(source: Path, options: ReadOptions, path: Path, row: np.ndarray) -> View:
+def _view(source: Path, images: Path, options: ReadOptions, path: Path, row: np.ndarray) -> View:
     image = ImageFile.of(path, options.downscale, mask_of(path, source.parent))
-    name = path.relative_to(source.parent).as_posix().partition("/")[2]
+    name = path.relative_to(images).as_posix()
     down, right, backwards, position, (height, width, focal) = row[:15].reshape(3, 5).T
     if min(height, width, focal) <= 0:
         remedy = "export the poses again"

@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.data.lens import Lens
 from mi_refgs.io.images import write_png
 from tests.helpers import refused
 from tests.scenes.dots import check
@@ -25,17 +24,6 @@ from tests.scenes.layouts import (
     write_nerfstudio,
     write_transforms,
 )
-
-
-@pytest.mark.parametrize("fisheye", [False, True])
-def test_nerfstudio_intrinsics_per_frame(fisheye: bool, tmp_path: Path) -> None:
-    lens = Lens(fisheye, (0.05, -0.02, 0.0, 0.0)[: 4 if fisheye else 3])
-    frames = [((110.0 + i, 104.0), (49.0 + 0.3 * i, 35.0)) for i in range(4)]
-    shots = [replace(SHOTS[i], lens=lens, focal=f, centre=c) for i, (f, c) in enumerate(frames)]
-    model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
-    data = write_nerfstudio(tmp_path, shots, camera_model=model, k1=0.05, k2=-0.02, p1=0.0, p2=0.0)
-    for view, shot in zip(read_dataset(data, "train").views, shots[1:], strict=True):
-        check(view, shot, tolerance=0.06)
 
 
 def test_filenames_define_splits(tmp_path: Path) -> None:
