@@ -111,7 +111,8 @@ def read_light(props: Any) -> tuple[Any, Any, NearField | None]:
 
 def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
     """Read the shading, whose defaults fit the attributes, and the occluder if it traces visibility."""
-    reflectance = _choice(props, "reflectance", Shading.default(surfels.raw)[0], tuple(MODELS))
+    reflectance = str(get(props, "reflectance", Shading.default(surfels.raw)[0]))
+    MODELS.find(reflectance, "refgs: reflectance")
     diffuse = _choice(props, "diffuse", Shading.default(surfels.raw, [reflectance])[1], DIFFUSE)
     at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")

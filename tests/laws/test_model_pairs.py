@@ -195,7 +195,10 @@ def test_what_is_missing_is_named_wherever_it_is_read(place: Path, coat: None, t
     forget(MODELS)
     export = ["export", place / "coated", "-o", tmp_path / "out"]
     refused(["render", place / "coated", "-o", "x.exr"], "model.json: ", "'coated' is unknown", COAT)
+    xml, hint = place / "coated" / "scene.xml", "or load its file with --plugin"
+    refused(["render", xml, "-o", "x.exr"], "reflectance: 'coated' is unknown", hint)
     forget(ATTRIBUTES)
+    refused(lambda: mi_refgs.load_method(str(place / "coated.toml")), "attributes: 'coat' is unknown", hint)
     refused(export, ".npz: surfels: 'coat' is unknown", f"add --plugin {COAT}")
 
 
