@@ -139,6 +139,9 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
     loss = None
     for name, registered in LOSSES.items():
         if name in factors and (value := registered.value(inputs)) is not None:
+            if not dr.is_diff_v(value):
+                remedy = "compute it with Dr.Jit"
+                raise InputError("a Python number, from which nothing learns", f"loss.{name}", remedy=remedy)
             if (width := dr.width(value)) != 1:
                 raise InputError(f"has {width} values", f"loss.{name}", remedy="reduce it, as with dr.mean")
             value = factors[name] * value

@@ -92,7 +92,7 @@ def _light_settings(file: str | Path | None, fixed: bool, data: Path) -> list[st
     """The assignments of a method whose light is a file."""
     if file is None:
         if fixed:
-            raise InputError("no map is given", "light_fixed", remedy="name its file as `light`")
+            raise InputError("no map is given", "--light-fixed", remedy="give its file as --light")
         return []
     path, own = Path(file).resolve(), data / "environment.exr"
     world = path.is_file() and own.is_file() and path.read_bytes() == own.read_bytes()

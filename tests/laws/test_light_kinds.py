@@ -155,7 +155,7 @@ def test_what_no_light_can_be(tmp_path: Path) -> None:
     refused(lambda: methods.load("ref_gaussian", "quick", learns[:1]), "light: file: none is named")
     command = ["train", str(data), "-o", str(tmp_path / "run"), "--method", "base_2dgs"]
     refused([*command, "--light", str(data / "environment.exr")], "light: no stage uses it")
-    refused([*command, "--light-fixed"], "light_fixed: no map is given")
+    refused([*command, "--light-fixed"], "--light-fixed: no map is given; give its file as --light")
 
 
 AT = np.array([[0.3, -0.2, 0.5], [0.1, 0.2, -0.3]], np.float32)  # rotation vector, log scale
