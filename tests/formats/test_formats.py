@@ -22,7 +22,7 @@ from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import refused, run_python
+from tests.helpers import refused
 
 
 @pytest.fixture
@@ -38,13 +38,6 @@ def plain() -> Iterator[list[Any]]:
     FORMATS.register(Format("plain", "a number", ".txt", put, (Option("level", 3, "the number"),)))
     yield calls
     FORMATS.unregister("plain")
-
-
-def test_format_declarations_import_no_numpy_or_mitsuba(tmp_path: Path) -> None:
-    code = "import sys, {}; print([name for name in ('numpy', 'mitsuba') if name in sys.modules])"
-    modules = "mi_refgs.formats", "mi_refgs"
-    found, base = (run_python(code.format(module), folder=tmp_path) for module in modules)
-    assert found == base
 
 
 def test_registered_format_is_a_choice_of_the_command(
