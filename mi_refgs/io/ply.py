@@ -17,12 +17,9 @@ from mi_refgs.kernels.memory import PER_PLY_BYTE, require
 
 MAX_HEADER_LINES = 1000  # a header of surfels has 124 lines at most
 MAX_LINE = 4096  # bytes per line of the header
-TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
-    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
-}
-"""NumPy's names of the types, without the byte order."""
+TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+TYPES |= {"float": "f4", "double": "f8"}
+TYPES |= {np.dtype(code).name: code for code in TYPES.values()}  # int8, …; without the byte order
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "a"}
 OTHERS = {b"PK": "PyTorch's or a zip file", b"glTF": "a glTF file", b"<": "a web page"}  # by first bytes
 

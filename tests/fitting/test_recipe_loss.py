@@ -19,7 +19,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import LOSSES
 from mi_refgs.types import Float
 from tests.helpers import refused
-from tests.scenes.highlight import without
+from tests.scenes.highlight import step_to, without
 
 SETTINGS = ["iterations=30", "surfels.count=80", "surfels.max_count=100", "stage.initial.until=1"]
 
@@ -41,12 +41,14 @@ def registered(name: str, *value: Any, **reads: Any) -> Iterator[None]:
         LOSSES.unregister(name)
 
 
+def trainer_of(data: Path, method: Path, *settings: str) -> Trainer:
+    chosen = methods.load(str(method), "quick", [*SETTINGS, *settings])
+    return Trainer(without(chosen), read_dataset(data, "train", truth=False))
+
+
 def roughness_after(data: Path, method: Path, *settings: str) -> float:
     """Mean raw roughness after some steps of the deferred stage."""
-    chosen = methods.load(str(method), "quick", [*SETTINGS, *settings])
-    trainer = Trainer(without(chosen), read_dataset(data, "train", truth=False))
-    for _ in range(12):
-        trainer.step()
+    trainer = step_to(trainer_of(data, method, *settings), 12)
     return float(np.mean(trainer.surfels.to_numpy()["roughness"]))
 
 
@@ -67,15 +69,10 @@ def test_photometric_loss_is_replaced_or_required(data: Path, method: Path) -> N
         return sum((dr.mean(dr.square(a - b)) for a, b in pairs), mi.Float(0)) / 3
 
     with registered("squared", squared):
-        settings = [*SETTINGS, "loss.l1=0", "loss.ssim=0", "loss.normal=0"]
-        for more in (["loss.squared=1"], []):
-            chosen = methods.load(str(method), "quick", [*settings, *more])
-            trainer = Trainer(without(chosen), read_dataset(data, "train", truth=False))
-            if more:
-                trainer.step()
-                assert float(trainer.loss[0]) == pytest.approx(float(trainer.error[0]), rel=1e-5)
-            else:
-                refused(trainer.step, "loss: none in iteration 1; give one a weight")
+        none = ["loss.l1=0", "loss.ssim=0", "loss.normal=0"]
+        trainer = step_to(trainer_of(data, method, *none, "loss.squared=1"), 1)
+        assert float(trainer.loss[0]) == pytest.approx(float(trainer.error[0]), rel=1e-5)
+        refused(trainer_of(data, method, *none).step, "loss: none in iteration 1; give one a weight")
 
 
 def test_loss_per_pixel_or_of_no_name_is_refused(data: Path, method: Path) -> None:

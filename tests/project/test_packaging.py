@@ -130,9 +130,8 @@ def test_plugins_and_packages_are_listed() -> None:
     assert packages == set(PROJECT["tool"]["setuptools"]["packages"])
 
 
-IMPORT_NAMES = dict(
-    scikit_image="skimage", pillow="pil", mitsuba="drjit", dask="distributed", openexr="imath"
-)
+IMPORT_NAMES = {"scikit_image": "skimage", "pillow": "pil", "mitsuba": "drjit"}
+IMPORT_NAMES |= {"dask": "distributed", "openexr": "imath"}
 """Modules that a distribution installs under another name than its own, in lower case."""
 
 
