@@ -21,17 +21,11 @@ from mi_refgs.io.progress import progress_bar
 
 SEED = 0  # seed of all random numbers; a second run gives the same result
 WORKING_SIZE = 1600  # longest side of the images, pixels; twice takes four times as long for few matches more
-MOST_FEATURES = 3000  # per image; matching time grows with its square: two cores match 30 pairs a second
-POLL = 0.25  # seconds between two looks for Ctrl-C
 IMAGES_AT_ONCE, PAIRS_AT_ONCE = 8, 200  # per call of COLMAP; the progress bar moves after each
-SMALLEST_MODEL = 3  # smallest number of images in a model; COLMAP's default of 10 would refuse small sets
-MOST_MODELS = 5  # largest number of separate groups of images that are reconstructed; a message counts them
 EXHAUSTIVE = 150  # largest number of images for which every pair is matched: 11,175 pairs take some minutes
 IN_ORDER = 8  # images before and after each, by name, with which it is matched in larger sets: a walk
 ALIKE = 20  # most similar images with which each is also matched in larger sets: they close loops
 WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12  # words, features per image to find them, k-means rounds
-LENS_MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV")  # that are tried, from few to many parameters
-LENS_GAIN = 0.01  # by which more parameters must reduce the mean reprojection error; noise gives 1e-4
 
 Reconstruction = Any  # pycolmap.Reconstruction
 Token = Any  # pycolmap.CancellationToken
@@ -69,7 +63,7 @@ def _run(call: Callable[[Any], Result]) -> Result:
         pycolmap.set_random_seed(SEED)
         future = pool.submit(call, token)
         try:
-            while not wait([future], timeout=POLL).done:
+            while not wait([future], timeout=0.25).done:  # seconds between two looks for Ctrl-C
                 pass
         except BaseException:
             token.cancel()
@@ -109,7 +103,7 @@ def extract(database: Path, folder: Path, names: Sequence[str]) -> None:
     pycolmap = load()
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
-    options.sift.max_num_features = MOST_FEATURES
+    options.sift.max_num_features = 3000  # two cores match 30 pairs a second; time grows with its square
     settings = (pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions(), options, pycolmap.Device.cpu)
 
     def work(part: Sequence[str], token: Token) -> None:
@@ -154,8 +148,8 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
-    options.min_model_size = SMALLEST_MODEL
-    options.max_num_models = MOST_MODELS
+    options.min_model_size = 3  # the default of 10 would refuse small sets
+    options.max_num_models = 5  # separate groups of images, which a message counts
     placed = counter(1)
     with progress_bar(count, "cameras") as shown:
 
@@ -255,7 +249,7 @@ def best_lens(model: Reconstruction) -> Reconstruction:
     """The reconstruction with the simplest lens model that fits the observations, bundle-adjusted."""
     pycolmap = load()
     best, error = model, np.inf
-    for kind in LENS_MODELS:
+    for kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV"):  # from few to many parameters
         copy = pycolmap.Reconstruction(model)
         for camera in copy.cameras.values():
             focal = camera.focal_length_x, camera.focal_length_y
@@ -266,6 +260,6 @@ def best_lens(model: Reconstruction) -> Reconstruction:
             camera.params = [known.get(name, 0.0) for name in MODELS[kind][1].split()]
         adjust(copy)
         lower = float(copy.compute_mean_reprojection_error())
-        if lower < (1 - LENS_GAIN) * error:
+        if lower < 0.99 * error:  # more parameters gain 1e-4 from noise
             best, error = copy, lower
     return best

@@ -14,11 +14,7 @@ from mi_refgs.data.region import Region, region_radius, weighted_quantile
 from mi_refgs.errors import InputError
 
 ROUNDS = 50  # iterations of reweighted least squares, which converge to the least sum of absolute values
-LEVEL_SPREAD = 0.02  # relative variance of right-hand directions off their main line without a plane: ± 8°
 SEEN_SHARE = 0.5  # fraction of the cameras whose images must show a point; other points are background
-REGION_POINTS = 50  # number of points that determine the region's radius; with fewer, the cameras alone do
-REGION_QUANTILE = 0.9  # fraction of the points around the focus that the region contains
-LEAST_SHARE = 0.5  # least radius over that from the cameras: points are only where the object has texture
 
 
 def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
@@ -33,7 +29,7 @@ def up_direction(solved: Solved, up: np.ndarray) -> np.ndarray:
     for _ in range(ROUNDS):
         values, vectors = np.linalg.eigh(np.einsum("v,vi,vj->ij", weight, rights, rights) / weight.sum())
         weight = 1 / np.maximum(abs(rights @ vectors[:, 0]), 1e-3)
-    if values[1] < LEVEL_SPREAD * values.sum():
+    if values[1] < 0.02 * values.sum():  # within ± 8° of one line, which spans no plane
         line = vectors[:, 2]
         direction = mean - (mean @ line) * line
     else:
@@ -75,9 +71,9 @@ def region_of_interest(solved: Solved) -> Region:
     offset = np.linalg.norm(solved.points - focus, axis=1)
     near = offset < radius
     near[near] = seen_share(solved, solved.points[near]) >= SEEN_SHARE
-    if np.count_nonzero(near) >= REGION_POINTS:
-        reach = weighted_quantile(offset[near], solved.length[near], REGION_QUANTILE)
-        radius = max(reach, LEAST_SHARE * radius)
+    if np.count_nonzero(near) >= 50:  # with fewer, the cameras alone determine the radius
+        reach = weighted_quantile(offset[near], solved.length[near], 0.9)
+        radius = max(reach, 0.5 * radius)  # points are only where the object has texture
     x, y, z = (float(c) for c in focus)
     return object_region(Region((x, y, z), radius), solved.origin, solved.points, partial(seen_share, solved))
 

@@ -32,9 +32,6 @@ from mi_refgs.io.progress import with_bar
 PLOT = "capture.png"
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
 FIRST_MODEL = "SIMPLE_RADIAL"  # lens with which images are registered: few matches determine its parameter
-SHOWN_RADII = 6.0  # half the width of the plot in radii of the region, unless the cameras need more
-LEAST_TILT = 0.3  # sine of the angle to a plot from which a plane is drawn in it
-GOOD_ERROR = 1.0  # reprojection error, pixels, above which lens, rolling shutter or scene are wrong
 FEW_FEATURES = 60  # of the median image: a pair needs 15 consistent matches, a good quarter of the features
 LEAST_PLACED = 0.5  # fraction of the photographs that must be registered in one group
 NAMED = 5  # largest number of photographs that a message names
@@ -182,7 +179,7 @@ def report_text(c: dict[str, Any], folder: Path) -> str:
     if missing := c["not_placed"]:
         more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
         lines.append(f"not placed: {', '.join(missing[:NAMED])}{more}; take more between them and the others")
-    if c["mean_reprojection_error"] > GOOD_ERROR:
+    if c["mean_reprojection_error"] > 1:  # pixel: lens, rolling shutter or scene are wrong
         lines.append("the error is high: something moved, or the lens needs another --camera-model")
     lines.append(f"look at {folder / PLOT}; next: refgs train {folder} -o runs/{folder.name}")
     return "\n".join(lines)
@@ -195,7 +192,7 @@ def draw(path: Path, world: Solved, region: Region) -> None:
 
     centre = np.array(region.centre)
     reach = float(np.abs(world.origin - centre).max())
-    half = 1.1 * max(reach, min(SHOWN_RADII * region.radius, 2 * reach))
+    half = 1.1 * max(reach, min(6 * region.radius, 2 * reach))
     near = world.points[(np.abs(world.points - centre) < half).all(axis=1)]
     directions = np.stack([world.origin, world.origin + half / 12 * world.axis])
     figure = Figure(figsize=(12, 6), layout="constrained")
@@ -206,7 +203,7 @@ def draw(path: Path, world: Solved, region: Region) -> None:
         axes.add_patch(Circle((centre[0], centre[up]), region.radius, fill=False, color="C3", lw=1.5))
         for *normal, offset in region.planes:  # where they cut the plane of the plot through the centre
             across = np.array([normal[0], normal[up]])
-            if (length := np.linalg.norm(across)) > LEAST_TILT:
+            if (length := np.linalg.norm(across)) > 0.3:  # sine of its angle to the plot
                 foot = centre[[0, up]] + (offset - centre @ normal) / length**2 * across
                 axes.axline(foot, foot + np.array([-across[1], across[0]]), color="C3", lw=1.5)
         axes.set(title=title, xlabel="x", ylabel="xyz"[up], aspect="equal")

@@ -26,7 +26,6 @@ PLACES += ["distorted/sparse/*", "colmap", "."]
 """Folders of reconstructions, in the order in which they are tried."""
 ENDINGS = ("bin", "txt")
 MIN_VIEWS, MAX_ERROR = 3, 2.0  # track length and error, pixels, of used points: wrong matches have others
-MIN_POINTS = 100  # number of reliable points below which others are used, too
 
 
 class ColmapReader:
@@ -104,7 +103,7 @@ class Reconstruction:
             file = self.source.with_name("points3D.ply")
             return read_ply_points(file) if file.is_file() else None
         good = (points.views >= MIN_VIEWS) & (points.error <= MAX_ERROR)
-        if np.count_nonzero(good) < MIN_POINTS:
+        if np.count_nonzero(good) < 100:  # too few to start from: the others are better than none
             good[:] = True
         if not good.any():
             return None

@@ -34,8 +34,6 @@ MODELS: dict[str, tuple[int, str]] = {
 }
 """Camera models whose distortion can be undone: number in binary files, parameters in their order."""
 TEST_LIST = "test.txt"  # beside the model: names of the test views, one per line, as 3DGS reads it
-MAX_NAME = 4096  # bytes of an image's name; no path is longer
-OBSERVED = 500  # keypoints of an image that are read, evenly spread: enough for a median, and read at once
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ class _Cursor:
         return int(number)
 
     def name(self) -> str:
-        start, self.at = self.at, self.data.find(b"\0", self.at, self.at + MAX_NAME) + 1
+        start, self.at = self.at, self.data.find(b"\0", self.at, self.at + 4096) + 1  # no path is longer
         if not self.at:
             raise ValueError("a name has no end")
         return self.data[start : self.at - 1].decode()  # UnicodeDecodeError is a ValueError
@@ -137,7 +135,7 @@ def read_images(path: Path) -> list[Image]:
             raise InputError("the image occurs twice", path, abbreviated(name), "remove one of the two")
         rotation = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()  # COLMAP's w is first
         observed = observed[(observed[:, 2] >= 0) & np.isfinite(observed).all(axis=1)]
-        observed = observed[evenly_spread(len(observed), OBSERVED)]
+        observed = observed[evenly_spread(len(observed), 500)]  # enough for a median, and read at once
         images[name] = Image(name, camera, rotation, values[4:], observed)
     return [images[name] for name in sorted(images)]
 

@@ -25,7 +25,6 @@ from mi_refgs.io.images import image_size
 from mi_refgs.registry import Registry
 
 HOLDOUT = 8  # every eighth image is a test view where a data set names none (LLFF, 3DGS, 2DGS)
-EXTENT_MARGIN = 1.1  # scene extent over the largest distance of a training camera to their mean (3DGS)
 NEAR_EXTENTS = 2e-3  # depth of the near plane in scene extents, about 0.01 units of Blender's data sets
 FAR = 1e3  # distance of the cameras' mean from the origin, in extents, from which positions are shifted
 DISTINCT = 1e-11  # extent over that distance below which all cameras are at one place; nothing is shifted
@@ -348,7 +347,7 @@ def _opaque(views: tuple[View, ...]) -> bool:
 def _extent(views: tuple[View, ...]) -> float:
     origins = np.array([view.to_world[:3, 3] for view in views])
     middle = origins.mean(axis=0) if len(np.unique(origins, axis=0)) > 1 else 0
-    return EXTENT_MARGIN * float(np.linalg.norm(origins - middle, axis=1).max()) or 1.0
+    return 1.1 * float(np.linalg.norm(origins - middle, axis=1).max()) or 1.0
 
 
 def _offset(views: tuple[View, ...]) -> np.ndarray:

@@ -21,7 +21,6 @@ from mi_refgs.io.images import read_grey
 
 CAMERA = re.compile(r"(\d{1,6})-camera\.pkl")
 SHAPES = ((3, 4), (3, 3))  # of pose and K
-MAX_BYTES = 4096  # of a camera's file that are read; it has a few hundred
 MAX_DEPTH, MAX_CODE = 15.0, 65535  # scene units of the largest number in a depth file, and that number
 BACKGROUND = int(14.5 / MAX_DEPTH * MAX_CODE) + 1  # smallest number of the background: 14.5 units
 
@@ -67,7 +66,7 @@ def _arrays(path: Path) -> list[np.ndarray]:
     arrays, code, by_columns, sides = list[np.ndarray](), "", False, list[int]()
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES)
+            data = file.read(4096)  # it has a few hundred bytes
         for instruction, value, _ in pickletools.genops(data):
             if isinstance(value, bool) or instruction.name in ("NEWTRUE", "NEWFALSE"):
                 by_columns = value or instruction.name == "NEWTRUE"

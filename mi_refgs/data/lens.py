@@ -22,7 +22,6 @@ from mi_refgs.errors import InputError
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 MAX_ZOOM = 2.0  # factor of the focal length beyond which less than a quarter of the image would be left
-ZOOM_STEPS = 30  # bisections: 1e-9 of the focal length, 1e-6 pixels
 GRID = 65  # points a side at which a zoom is checked; between them edges bend by less than 0.01 pixels
 ROWS = 64  # rows of an image whose source pixels are computed together
 _lock = Lock()
@@ -139,7 +138,7 @@ def undistortion(
             what = "the distortion moves the image's edges more than half-way in, or folds it"
             raise InputError(what, remedy="correct the coefficients")
         high = low if valid(low) else high
-        for _ in range(ZOOM_STEPS if high > low else 0):
+        for _ in range(30 if high > low else 0):  # to 1e-9 of the focal length, 1e-6 pixels
             middle = (low + high) / 2
             low, high = (low, middle) if valid(middle) else (middle, high)
     return Undistortion(lens, camera, high)
