@@ -82,10 +82,8 @@ class Hull:
 
     def inner_points(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Uniform points (≤ count, 3) in the hull; fewer if it is small beside the cells that it touches."""
-        steps = np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        shape = np.array(self.field.shape) - 1
-        parts = [self.field[tuple(slice(a, a + n) for a, n in zip(s, shape, strict=True))] for s in steps]
-        cells = np.argwhere(np.max(parts, axis=0) > HULL_LEVEL)
+        corners = np.lib.stride_tricks.sliding_window_view(self.field, (2, 2, 2))
+        cells = np.argwhere(corners.max(axis=(3, 4, 5)) > HULL_LEVEL)
         points = np.empty((0, 3))
         for _ in range(HULL_DRAWS):
             if not (missing := count - len(points)):

@@ -16,6 +16,7 @@ from functools import lru_cache
 from threading import Lock
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from scipy import ndimage
 
 from mi_refgs.errors import InputError
@@ -56,23 +57,17 @@ class Lens:
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distort image points (x, y) at unit distance."""
-        square = x * x + y * y
+        square, series = x * x + y * y, (1, *self.radial)
         if self.fisheye:
             r = np.sqrt(square)
             angle = np.arctan(r)
-            factor = np.where(r > 0, angle / np.where(r > 0, r, 1), 1) * self._series(angle * angle)
+            factor = np.where(r > 0, angle / np.where(r > 0, r, 1), 1) * polyval(angle * angle, series)
             return x * factor, y * factor
-        factor, (p1, p2) = self._series(square), self.tangential
+        factor, (p1, p2) = polyval(square, series), self.tangential
         return (
             x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x),
             y * factor + 2 * p2 * x * y + p1 * (square + 2 * y * y),
         )
-
-    def _series(self, square: np.ndarray) -> np.ndarray:
-        total = np.zeros_like(square)
-        for k in reversed(self.radial):
-            total = (total + k) * square
-        return 1 + total
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,7 @@ from mi_refgs.io.files import check_size, replace_file, require_file
 from mi_refgs.io.progress import note
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"  # first bytes of every EXR file
-SAMPLE_BYTES = 2  # bytes per sample at least: those of half floats; integers and floats have 4
 SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of R, G, B, white (BT.709)
-CHROMATICITY_TOLERANCE = 1e-3  # half the last digit in standards
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of R, G, B (BT.709)
 _lock = threading.Lock()
 _processes: dict[int, subprocess.Popen[bytes]] = {}
@@ -111,13 +109,13 @@ def _read(path: Path, vectors: bool = False, pixels: bool = True) -> tuple[Part,
     left, top, right, bottom = part.data
     if (np.minimum(part.data[2:], part.display[2:]) < np.maximum(part.data[:2], part.display[:2])).any():
         raise InputError("no pixel is in the display window", path, "dataWindow", "export it again")
-    check_size(path, right - left + 1, bottom - top + 1, SAMPLE_BYTES * len(part.channels))
+    check_size(path, right - left + 1, bottom - top + 1, 2 * len(part.channels))  # bytes of half floats
     check_size(path, *part.size, 1)
     if not names:
         remedy = f"export R, G, B (and A), {'X, Y, Z, ' if vectors else ''}or one channel (and A)"
         raise InputError(f"found {', '.join(sorted(part.channels))}", path, "channels", remedy)
     coloured = len(names) > 2 and not names[0].endswith("X")
-    if coloured and not np.allclose(part.chromaticities or SRGB, SRGB, atol=CHROMATICITY_TOLERANCE):
+    if coloured and not np.allclose(part.chromaticities or SRGB, SRGB, atol=1e-3):
         raise InputError("not those of sRGB", path, "chromaticities", "convert the image to linear sRGB")
     if len(parts) > 1:
         note(path, f"{len(parts)} parts, of which '{part.name}' is read")

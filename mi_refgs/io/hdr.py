@@ -11,7 +11,6 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import check_size, require_file
 from mi_refgs.io.progress import note
 
-MAX_HDR_HEADER = 2**16  # bytes within which the size of a Radiance image must be given
 SIZE = re.compile(rb"\n\r?\n([-+])([XY]) (\d{1,9}) ([-+])([XY]) (\d{1,9})\r?\n")
 MAX_VALUE = 1e28  # to which values are clipped before arithmetic
 SRGB_FROM_XYZ = np.linalg.inv(((0.4124, 0.2126, 0.0193), (0.3576, 0.7152, 0.1192), (0.1805, 0.0722, 0.9505)))
@@ -26,7 +25,7 @@ def read_hdr(path: Path) -> np.ndarray:
     where a run is longer than its row."""
     require_file(path)
     data = path.read_bytes()
-    size = SIZE.search(data[:MAX_HDR_HEADER])
+    size = SIZE.search(data[: 2**16])
     if not data.startswith(b"#?") or size is None or size[2] == size[5]:
         raise InputError("no Radiance image with a line as -Y 512 +X 1024", path, "header", "save it as EXR")
     signs, height, width = {size[2]: size[1], size[5]: size[4]}, int(size[3]), int(size[6])

@@ -98,7 +98,7 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
         factor = math.gcd(shrink, JPEG_SHRINK) if image.format == "JPEG" else 1
         if factor > 1:
             image.draft(None, tuple(max(side // factor, 1) for side in image.size))
-        return np.asarray(image.convert("RGBA" if _transparent(image) else "RGB")), factor
+        return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB")), factor
 
 
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
@@ -137,11 +137,7 @@ def has_alpha(path: str | Path) -> bool:
     if path.suffix.lower() == ".exr":
         return exr_header(path)[2]
     with open_image(path) as image:
-        return _transparent(image)
-
-
-def _transparent(image: Any) -> bool:
-    return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+        return bool(image.has_transparency_data)
 
 
 @contextlib.contextmanager

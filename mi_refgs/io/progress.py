@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 
-TERMINAL_INTERVAL, LOG_INTERVAL = 0.5, 30.0  # seconds between refreshes of a bar: in a terminal, in a file
 _NOTED: set[tuple[Path, str]] = set()
 
 
@@ -36,7 +35,7 @@ def progress_bar(total: int, what: str, **options: Any) -> Any:
     """Return a bar of `total` steps, to be updated and closed; `options` are tqdm's."""
     from tqdm import tqdm
 
-    interval = TERMINAL_INTERVAL if sys.stderr.isatty() else LOG_INTERVAL
+    interval = 0.5 if sys.stderr.isatty() else 30.0  # seconds between refreshes: in a terminal, in a file
     return tqdm(total=total, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=interval, **options)
 
 
