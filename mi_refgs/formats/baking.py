@@ -98,12 +98,14 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
         # Materials and normals at vertices and texels.
         points, start = _points(mesh, scene, triangle, barycentric)
         frames = map(renderer, views)
-        pairs = (
-            (view, frame, _columns(model, frame.maps)) for view, frame in zip(views, frames, strict=True)
-        )
+        pairs = ((v, f, _columns(model, f.maps)) for v, f in zip(views, frames, strict=True))
         found = _mean_of_views(pairs, points, start, OFFSET_VOXELS * mesh.voxel)
     count = len(mesh.vertices)
-    maps = _padded(covered, found[count:, :5])
+    image = np.zeros((texture, texture, 5), np.float32)
+    image[covered] = found[count:, :5]
+    # Texels beside the charts get the nearest value.
+    rows, columns = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    maps = np.clip(image[rows, columns], 0, 1)
     shape = (mesh.vertices[vertex], found[:count, 5:][vertex], uv.astype(np.float32), cut_faces)
     return TexturedMesh(*shape, maps[..., :3], maps[..., 3], maps[..., 4], scene.light)
 
@@ -260,11 +262,3 @@ def _sample_view(
         weight += own
         total = [dr.fma(own, v, sum_) for v, sum_ in zip(values[:COLUMNS], total, strict=True)]
     return weight, total
-
-
-def _padded(covered: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return textures (N, N, C) of values (T, C) of `covered` (N, N) texels; others get the nearest value."""
-    image = np.zeros((*covered.shape, values.shape[1]), np.float32)
-    image[covered] = values
-    rows, columns = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
-    return np.clip(image[rows, columns], 0, 1)

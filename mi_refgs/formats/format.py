@@ -100,25 +100,21 @@ def write(
     from mi_refgs.data.dataset import require_no_data
 
     found, shots, owner = {}, tuple(shots), f"export of {source and source.resolve()}"
-    if len(chosen) > 1:
-        own_folder(Path(output), owner)
+    output, several = Path(output), len(chosen) > 1
+    if several:
+        own_folder(output, owner)
     for made in chosen:
-        target = _target(made, Path(output), len(chosen) > 1)
+        target = output
+        if several or output.is_dir() or (made.suffix and not output.suffix):
+            target = output / f"{made.name}{made.suffix}"
+        elif made.suffix and output.suffix.lower() != made.suffix:
+            raise InputError(f"{made.name} writes {made.suffix}", output, "suffix", "name the file so")
+        make_folder(target.parent)
         own = {option.name: given.get(option.name, option.default) for option in made.options}
-        if made.suffix and target == Path(output):
+        if made.suffix and target == output:
             require_no_run(target)
             require_no_data(target)
         else:
             own_folder(target.parent if made.suffix else target, owner)
         found[made.name] = made.writer(trained, target, shots, **own)
     return found
-
-
-def _target(made: Format, output: Path, several: bool) -> Path:
-    """Return the path of a format: `output`, or a path in it for a folder or several formats."""
-    if several or output.is_dir() or (made.suffix and not output.suffix):
-        output = output / f"{made.name}{made.suffix}"
-    elif made.suffix and output.suffix.lower() != made.suffix:
-        raise InputError(f"{made.name} writes {made.suffix}", output, "suffix", "name the file so")
-    make_folder(output.parent)
-    return output
