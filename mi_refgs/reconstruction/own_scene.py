@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,7 +20,7 @@ from mi_refgs.shade.light.latlong import lat_long
 from mi_refgs.shade.light.light import RotatedLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
-from mi_refgs.shade.shading import Shading
+from mi_refgs.shade.shading import Shading, spare
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
 
@@ -73,6 +74,9 @@ def _of_arrays(params: Mapping[str, Any], mesh: Mesh | None, shading: ShadingOpt
     if shading is None:
         reflectance, diffuse = Shading.default(surfels.raw)
         shading = ShadingOptions(MODELS[reflectance].shaded_at[0], reflectance, diffuse)
+        if lost := spare(surfels.raw, MODELS[reflectance].required_attributes(shading)):
+            what = f"{', '.join(lost)}: `{reflectance}` does not use it; name a model by `shading`"
+            warnings.warn(what, RuntimeWarning, stacklevel=4)
     resolved = Shading.resolve(shading, mesh is not None)
     resolved.require_inputs(surfels.raw, light is not None)
     return TrainedScene(surfels, light, mesh, resolved, iteration=0, seconds=0.0)

@@ -72,9 +72,10 @@ class Reconstruction:
         params: an `mi.Scene` with the `refgs` integrator or its `mi.traverse`, with its light, mesh, shading
         and surroundings; or a mapping of raw attributes (N, D) by name and "light", the raw map (h, 2h, 3),
         arrays or tensors, whose names may begin with "refgs.". mesh: for relighting and exports, as
-        `extract_mesh` makes it. shading: of a mapping only, by default the first model whose attributes are
-        there. data: folder of its data set; without one, cameras are around the object. name: of its method.
-        Raises InputError for another object, unknown names, wrong shapes, NaN, or a missing light."""
+        `extract_mesh` makes it. shading: of a mapping only, by default the first model that uses all
+        attributes, or else some. data: folder of its data set; without one, cameras are around the object.
+        name: of its method. Raises InputError for another object, unknown names, wrong shapes, NaN, or a
+        missing light."""
         trained = scene_of(params, mesh, shading)
         provenance = Provenance(method_of(trained, name)).with_data(None if data is None else Path(data))
         return Reconstruction(trained, provenance)

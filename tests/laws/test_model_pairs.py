@@ -164,6 +164,15 @@ def test_a_command_shows_the_model(name: str, command: str, place: Path, coat: N
         assert name != "coated" or np.abs(radiance(expected.edit(set=["coat=0"])) - found).max() > 0.1
 
 
+def test_raw_values_choose_the_model_that_uses_them(place: Path, coat: None) -> None:
+    raw, light = raw_channels(), mi_refgs.EnvironmentLight.from_radiance(sky()).raw
+    state = raw | {"coat": raw["metallic"], "light": light}
+    assert mi_refgs.Reconstruction.from_params(state).trained.shading.reflectance == "coated"
+    forget(MODELS)
+    with pytest.warns(RuntimeWarning, match="coat: `split_sum` does not use it"):
+        mi_refgs.Reconstruction.from_params(state)
+
+
 def test_a_comparison_takes_it_along(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def work(jobs: list[Any], *_: object) -> None:
         forget(*NEEDED, *FIT_ONLY)  # a worker is another process

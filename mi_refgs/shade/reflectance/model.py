@@ -123,4 +123,4 @@ def require_complete(model: Reflectance) -> None:
 
 
 MODELS: Registry[Reflectance] = Registry("reflectance model", require_complete, of=Reflectance)
-"""Every model by name. The first one whose attributes the surfels have is the plugin's default."""
+"""Every model by name. The first one that uses all attributes, or else some, is the plugin's default."""
