@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -202,6 +203,10 @@ def begin(
         checks.heed(found, warn, force)
         for note in views.notes:
             tell(f"{views.path}: {note}")
+        for (_, before), (name, _) in itertools.pairwise(method.stages()):
+            if before.until >= method.iterations:
+                remedy = "add iterations, or lower `until` of the stages before"
+                warn(f"stage {name}: does not begin in {method.iterations} iterations; {remedy}")
         views, surfaces = _with_stereo(views, tell)
         if not resumed:
             views = _around_object(views, surfaces, tell, warn)
