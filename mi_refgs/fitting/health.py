@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import drjit as dr
 import numpy as np
 
 from mi_refgs.errors import InputError
@@ -17,6 +18,7 @@ from mi_refgs.fitting.state import FitState
 from mi_refgs.methods.method import BACKGROUND, LIGHT
 from mi_refgs.runs.checkpoint import channels_of
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.types import Float
 
 CULL_SHARE = 0.1  # fraction of the surfels from which on they are not the cause: a pixel has tens
 PATIENCE = 3  # log intervals in which every step fails before the fit ends: removing surfels may help first
@@ -30,9 +32,10 @@ class Health:
     checked: int = 0  # iteration of the last check
     failed: int = 0  # steps that failed in a row
 
-    def check(self, setup: FitSetup, state: FitState) -> str | None:
+    def check(self, setup: FitSetup, state: FitState, terms: Mapping[str, Float]) -> str | None:
         """Remove the surfels that made steps fail since the last check; returns a sentence about it, if any.
-        Raises InputError if the light is not finite, if no surfel is left, or if nothing helps."""
+        `terms` are the losses of the last step. Raises InputError if the light is not finite, if no surfel is
+        left, or if nothing helps."""
         skipped, steps = state.optimiser.report(), state.iteration - self.checked
         self.checked, self.skipped = state.iteration, self.skipped + skipped.count
         self.failed = self.failed + steps if skipped.count >= steps else 0
@@ -46,11 +49,12 @@ class Health:
         if not rows and not skipped.count:
             return None
         view = setup.data.views[setup.view(skipped.iteration + 1)].name if skipped.count else ""
-        said = sentence(rows, skipped, view)
-        if self.failed >= PATIENCE * setup.method.log_every:
+        wrong = [f"loss '{name}'" for name, value in terms.items() if not dr.all(dr.isfinite(value))[0]]
+        said = sentence(rows, skipped, view, wrong)
+        if self.failed >= min(PATIENCE * setup.method.log_every, setup.method.iterations):
             raise InputError(
                 f"{said}; nothing was learnt in {self.failed} iterations: look at that image and its camera, "
-                "or lower the rates (--set rates.…)"
+                "or that loss, or lower the rates (--set rates.…)"
             )
         for table, names in found:
             if names:
@@ -71,9 +75,9 @@ def together(rows: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.unique(np.concatenate([*rows.values(), np.zeros(0, np.int64)])).astype(np.int64)
 
 
-def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str) -> str:
-    """The notice: iteration, view, attributes and surfels."""
-    channels = ", ".join(rows or skipped.rows) or "the loss"
+def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str, losses: list[str]) -> str:
+    """The notice: iteration, view, attributes and surfels, or losses."""
+    channels = ", ".join(rows or losses or skipped.rows) or "the loss"
     where = f"iteration {skipped.iteration + 1}, view {view}: " if skipped.count else ""
     indices = together(rows)
     if not len(indices):

@@ -127,8 +127,14 @@ def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss[LossInputs]]:
     return [loss for loss in LOSSES.values() if loss.name in weights and weights[loss.name].weight]
 
 
-def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: int) -> tuple[Float, Float]:
-    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached."""
+def objective(
+    inputs: LossInputs,
+    weights: Mapping[str, LossWeight],
+    iteration: int,
+    terms: dict[str, Float] | None = None,
+) -> tuple[Float, Float]:
+    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached. `terms`
+    gets the losses by name, detached."""
     image, target = inputs.image, inputs.target
     # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
     factors = {
@@ -144,6 +150,8 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
                 raise InputError("a Python number, from which nothing learns", f"loss.{name}", remedy=remedy)
             if (width := dr.width(value)) != 1:
                 raise InputError(f"has {width} values", f"loss.{name}", remedy="reduce it, as with dr.mean")
+            if terms is not None:
+                terms[name] = dr.detach(value)
             value = factors[name] * value
             loss = value if loss is None else loss + value
     if loss is None:

@@ -61,6 +61,7 @@ class Trainer:
         self.release: Callable[[], None] = lambda: None  # raises a pending interrupt, while `train` runs
         self.health = Health()
         self.loss: Float = None  # of the last step, width 1
+        self.terms: dict[str, Float] = {}  # losses of the last step by name, width 1
         self.error: Float = None  # mean squared error of the last step, width 1
         if method.light is not None:
             light = method.light.sized(max(view.width * view.height for view in data.views))
@@ -199,7 +200,7 @@ class Trainer:
 
     def check(self) -> None:
         """Remove the surfels that made steps fail since the last check, and warn; see `Health.check`."""
-        if (warning := self.health.check(self.setup, self.fit)) is not None:
+        if (warning := self.health.check(self.setup, self.fit, self.terms)) is not None:
             self.warn(warning)
 
     def step(self) -> None:
@@ -242,7 +243,8 @@ class Trainer:
         frame = render(scene, camera, request)
         gain = per_view.log_gain(fit.params, index)
         inputs = LossInputs.of(frame, target, self.data, light, gain, fit.photographed)
-        loss, error = objective(inputs, weights, iteration)
+        self.terms.clear()
+        loss, error = objective(inputs, weights, iteration, self.terms)
         self.loss, self.error = dr.detach(loss), dr.mean(error)
         if frame.attribution is not None:
             loss += dr.sum(error * frame.attribution)

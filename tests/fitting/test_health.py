@@ -13,9 +13,11 @@ import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.method import Method
+from mi_refgs.methods.extensions import LOSSES, Loss, register_loss
+from mi_refgs.methods.method import LossWeight, Method
 from mi_refgs.surfels.primitives.surfel import Surfel
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.scenes.highlight import ball, run_folder, small_method, without
 
 
@@ -93,6 +95,16 @@ def test_fit_in_which_every_step_fails_ends_with_one_sentence(method: Method, tm
     after = trainer.surfels.to_numpy()
     for name in Surfel.widths:  # materials begin anew in iteration 9, with the deferred stage
         np.testing.assert_array_equal(after[name], before[name])
+
+
+def test_short_fit_in_which_every_step_fails_names_the_loss(method: Method) -> None:
+    register_loss(Loss("nan", lambda inputs: dr.mean(inputs.frame.alpha) * np.nan))
+    weights = method.loss | {"nan": LossWeight(0.1)}
+    try:
+        trainer = Trainer(replace(without(method), iterations=2, loss=weights), ball())
+        refused(trainer.train, "loss 'nan' not finite; 2 steps were left out; nothing was learnt in 2")
+    finally:
+        LOSSES.unregister("nan")
 
 
 def test_light_that_is_not_finite_ends_fit_with_one_sentence(method: Method, tmp_path: Path) -> None:
