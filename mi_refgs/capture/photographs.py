@@ -24,7 +24,6 @@ VIDEOS = ".mp4 .mov .m4v .avi .mkv .webm .mts".split()
 FRAMES = 120  # of a video that are used, at most: with every pair matched, some minutes
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .avif".split()  # for a message
 FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point
-DIAGONAL_35MM = 43.2666  # mm, of a frame of 36 mm × 24 mm, to which EXIF's 35 mm equivalent relates
 ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405  # EXIF tags
 SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation that swap width and height
 
@@ -151,7 +150,7 @@ def _photograph(path: Path) -> Photograph:
     size = size[::-1] if orientation in SIDEWAYS else size
     equivalent, own = _positive(detail.get(FOCAL_35MM)), _positive(detail.get(FOCAL))
     device = f"{exif.get(MAKE, '')} {exif.get(MODEL, '')} {own or equivalent or ''}"
-    focal = None if equivalent is None else equivalent / DIAGONAL_35MM
+    focal = None if equivalent is None else equivalent / 43.2666  # mm, diagonal of 36 mm × 24 mm
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     return Photograph(path, path.name, digest, size, focal, device, plain, orientation)
 

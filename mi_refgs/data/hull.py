@@ -14,9 +14,6 @@ from mi_refgs.errors import InputError
 
 HULL_RESOLUTION, HULL_LEAST = 96, 32  # voxels per edge, most and fewest: as pixels along the longer edge
 HULL_LEVEL = 0.5  # mask level that bounds the hull
-HULL_CARVED = 0.05  # level of the blurred masks below which a voxel is carved and not looked at again
-HULL_SEEN = 0.25  # of the views must see a point of the hull: what hardly any camera sees was never carved
-HULL_DRAWS = 64  # rounds of rejection sampling; one keeps about a quarter for a voxel-thin sheet
 COLOUR_VIEWS = 32  # from which a point's median colour is computed; memory grows with points times views
 FOCUS_CONDITION = 1e-3  # least singular value of the mean of (I - d dᵀ) over axes that meet; 0: parallel
 
@@ -85,7 +82,7 @@ class Hull:
         corners = np.lib.stride_tricks.sliding_window_view(self.field, (2, 2, 2))
         cells = np.argwhere(corners.max(axis=(3, 4, 5)) > HULL_LEVEL)
         points = np.empty((0, 3))
-        for _ in range(HULL_DRAWS):
+        for _ in range(64):  # one keeps about a quarter for a voxel-thin sheet
             if not (missing := count - len(points)):
                 break
             grid = cells[rng.integers(len(cells), size=2 * missing)] + rng.random((2 * missing, 3))
@@ -115,10 +112,10 @@ def visual_hull(views: Sequence[View], bounds: np.ndarray, resolution: int | Non
         value = map_coordinates(mask, np.stack([row[seen], column[seen]]), order=1, mode="nearest")
         inside[alive[seen]] = np.minimum(inside[alive[seen]], value)
         witnesses[alive[seen]] += 1
-        dead = inside[alive] < HULL_CARVED
+        dead = inside[alive] < 0.05  # carved, and not looked at again
         inside[alive[dead]] = 0
         alive = alive[~dead]
-    inside[witnesses < HULL_SEEN * len(views)] = 0
+    inside[witnesses < 0.25 * len(views)] = 0  # what hardly any camera sees was never carved
     # One voxel closes a hull that touches the bounds; centres of voxels are half a voxel inside the box.
     field = np.pad(inside.reshape((resolution,) * 3), 1)
     if not np.any(field > HULL_LEVEL):

@@ -19,13 +19,11 @@ from mi_refgs.data.view import View, evenly_spread
 # Support planes; lengths are in radii of the region.
 PLANE_REACH = 2.0  # distance from the centre up to which points determine them
 PLANE_MARGIN = 0.04  # height above at which the region begins; half leaves 4 % of the outline to the table
-PLANE_DRAWS = 2_000  # planes through three points: 30 good ones if a quarter of the points is on one
 PLANE_COUNT = 3  # at most: a table, and a corner of two walls
 PLANE_POINTS, PLANE_SHARE = 50, 0.05  # fewest points on one, and their share of those within PLANE_REACH
 BELOW_SHARE = 0.5  # most points below over those on it: a table mirrors some, the face of an object has more
 ABOVE_SHARE = 0.9  # fraction of the cameras that are above
 PARALLEL = 0.9  # cosine of two normals from which the second is what the first has left
-REFITS = 5  # rounds of least squares that follow the best draw
 # The group of points of the object.
 MOST_POINTS = 5_000  # of the points on a plane, and twice as many of a group: time and memory grow with them
 SEEN_SHARE = 0.4  # fraction of the views that show a point; close views leave some parts out
@@ -38,10 +36,6 @@ FREE_SHARE = 0.15  # of the centre's depth, empty before a camera; a table seen 
 # Balls around the group.
 SPHERE_SAMPLES = 2_000  # points of a sphere by which it is enclosed together with a group
 ENCLOSED, FITTED_BALL = 1.05, 1.1  # radius over that of the smallest ball: of sparse points, of fitted ones
-BOX_MARGIN = 0.2  # distance of fitted points, in radii, from planes beside them: thin parts may be missing
-BALL_CENTRES = 100  # points of a group towards which centres are tried
-BALL_SHARES = (0.0, 0.25, 0.5, 0.75)  # fractions of the way from its middle to them
-BALL_ROUNDS = 500  # of the smallest enclosing ball: its radius is right to 0.2 %
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,7 @@ def support_planes(
     least, found = max(PLANE_POINTS, PLANE_SHARE * len(points)), list[Plane]()
     while len(points) >= least and len(found) < most:
         # Planes through three points, with the cameras above.
-        corner = points[rng.integers(len(points), size=(PLANE_DRAWS, 3))]
+        corner = points[rng.integers(len(points), size=(2_000, 3))]  # 30 good ones if a quarter is on one
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         normal /= np.where(length > 0, length, 1)
@@ -93,7 +87,7 @@ def support_planes(
         if not usable[best] or on[best] < least:
             break
         up, level = normal[best], float(offset[best])
-        for _ in range(REFITS):
+        for _ in range(5):
             near = points[abs(points @ up - level) < width]
             middle = near.mean(axis=0)
             across = np.linalg.svd(near - middle, full_matrices=False)[2][2]
@@ -142,7 +136,7 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
     region = _with_ball(region, centre, FITTED_BALL * radius, origins)
     axes = np.linalg.svd(group - group.mean(axis=0), full_matrices=False)[2]
     normals = np.concatenate([axes, -axes])
-    offsets = np.min(group @ normals.T, axis=0) - BOX_MARGIN * region.radius
+    offsets = np.min(group @ normals.T, axis=0) - 0.2 * region.radius  # thin parts may be missing
     box = [(a, b, c, d) for a, b, c, d in np.column_stack([normals, offsets]).tolist()]
     return replace(region, planes=(*region.planes, *box))
 
@@ -150,8 +144,8 @@ def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen:
 def _ball_beside_cameras(group: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre (3,) in a group (N, 3) around which a ball free of cameras has most; radius for all of it."""
     middle = group.mean(axis=0)
-    outwards = group[evenly_spread(len(group), BALL_CENTRES)] - middle
-    centres = np.concatenate([middle + share * outwards for share in BALL_SHARES])
+    outwards = group[evenly_spread(len(group), 100)] - middle
+    centres = np.concatenate([middle + share * outwards for share in (0.0, 0.25, 0.5, 0.75)])
     away = cdist(centres, group)
     best = int(np.argmax(np.mean(away <= _room(centres, origins)[:, None], axis=1)))
     return centres[best], float(away[best].max())
@@ -187,7 +181,7 @@ def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatt
 def enclosing_ball(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre (3,) and radius of nearly the smallest ball around points (N, 3). [Bădoiu and Clarkson 2003]"""
     centre = points.mean(axis=0)
-    for step in range(1, BALL_ROUNDS + 1):
+    for step in range(1, 501):  # the radius is right to 0.2 %
         farthest = points[np.argmax(np.sum((points - centre) ** 2, axis=1))]
         centre = centre + (farthest - centre) / (step + 1)
     return centre, float(np.linalg.norm(points - centre, axis=1).max())

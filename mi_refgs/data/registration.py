@@ -15,9 +15,6 @@ from mi_refgs.io.images import box_downscale
 
 STEP = 0.1  # pixels of the averaged image that the image moves by for a difference
 COARSEST = 48  # pixels along the shorter side of the image that is averaged most, at least
-ROUNDS = 5  # Gauss-Newton steps per image size
-DAMPING = 1e-3  # of the diagonal [Levenberg 1944]: flat scenes hardly distinguish rotation from translation
-ENOUGH = 1e-3  # relative decrease of the squared error below which a size is finished
 
 Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a view's camera
 
@@ -48,8 +45,8 @@ def _fitted(view: View, render: Render, distance: float, block: int) -> View:
     shifts = [_difference(_moved(view, STEP * unit * axis), render, block) - now for axis in np.eye(6)]
     slope = np.stack(shifts, axis=1) / STEP
     normal = slope.T @ slope
-    normal += DAMPING * np.diag(np.diag(normal))
-    for _ in range(ROUNDS):
+    normal += 1e-3 * np.diag(np.diag(normal))  # [Levenberg 1944]: flat scenes hardly tell turn from shift
+    for _ in range(5):
         change, *_ = np.linalg.lstsq(normal, -slope.T @ now, rcond=None)
         candidate = _moved(view, unit * change)
         after = _difference(candidate, render, block)
@@ -57,7 +54,7 @@ def _fitted(view: View, render: Render, distance: float, block: int) -> View:
         if not now_squared < before:
             break
         view, now = candidate, after
-        if now_squared > (1 - ENOUGH) * before:
+        if now_squared > (1 - 1e-3) * before:
             break
     return view
 

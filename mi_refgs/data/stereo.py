@@ -17,11 +17,9 @@ from mi_refgs.data.region import Region
 from mi_refgs.data.view import View, evenly_spread
 
 FEWEST = 3  # views that are compared: AGREED ones confirm a depth
-VIEWS = 64  # most views that are compared, about half a second each
 PIXELS = 16_000  # of the images that are compared, at most about
 NEIGHBOURS = 4  # views with which each is compared
 ALIKE = 2  # of these, the most similar count: others may not see a surface
-BASELINE = 12.0  # preferred angle between two views from the region's centre, degrees
 DEPTHS = 64  # depths that are compared, evenly spaced in 1/z
 NEAREST = 0.35  # the first of them, in distances of the cameras from the region's centre
 FARTHEST = 20.0  # the last one, in radii of the region beyond its centre; random points end there, too
@@ -29,11 +27,9 @@ PATCH = 5  # side of a compared patch, pixels
 CONTRAST = 0.0045  # standard deviation of a patch, 0 … 1, below which it has no texture: one level of 256
 SIMILAR, SIMILAR_CONFIRMING = 0.75, 0.5  # correlation from which a depth counts, and confirms another
 VOXEL = 0.03  # side of the voxels that are left with one point, in contracted space
-VOXEL_POINTS = 3  # fewest points in a voxel on a surface; stray ones are alone
 LEAST = 50  # points that are left: fewer are chance
 MOST = 50_000  # pixels with and without a point that are returned: more than a fit starts with
 AGREED = 2  # views that confirm a depth
-AGREEMENT = 0.75  # difference in 1/z, in steps of the sweep, up to which two depths agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +54,7 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     if len(views) < FEWEST:
         return None
     centre = np.array(region.centre)
-    small = [views[i] for i in evenly_spread(len(views), VIEWS)]
+    small = [views[i] for i in evenly_spread(len(views), 64)]  # half a second each
     small = [v.averaged(max(1, round(math.sqrt(v.width * v.height / PIXELS)))) for v in small]
     grey = [view.displayed.mean(axis=-1, dtype=np.float32) for view in small]
     distance = float(np.median([np.linalg.norm(view.to_world[:3, 3] - centre) for view in small]))
@@ -66,14 +62,14 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     nearness = np.linspace(1 / (NEAREST * distance), 1 / farthest, DEPTHS, dtype=np.float32)
     outward = np.array([view.to_world[:3, 3] for view in small]) - centre
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), NORM_FLOOR)
-    away = abs(np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1))) - BASELINE)
+    away = abs(np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1))) - 12)  # off the preferred angle
     np.fill_diagonal(away, np.inf)
     nearest = np.argsort(away, kind="stable")[:, : min(NEIGHBOURS, len(small) - 1)].tolist()
     swept = []
     for i, near in enumerate(nearest):
         others = [(small[j], grey[j]) for j in near]
         swept.append(_Swept(small[i], near, *_sweep(small[i], grey[i], others, nearness)))
-    tolerance = AGREEMENT * float(nearness[0] - nearness[1])
+    tolerance = 0.75 * float(nearness[0] - nearness[1])  # within which two depths agree
     # The pixels whose depth others confirm, and the rest.
     position, on, off = [], [], []
     for one in swept:
@@ -88,7 +84,7 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     points, colours = np.concatenate(position), np.concatenate(on)
     voxel = np.floor(region.contract(points) / VOXEL)
     _, first, count = np.unique(voxel, axis=0, return_index=True, return_counts=True)
-    spaced = points[first[count >= VOXEL_POINTS]]  # one in each voxel
+    spaced = points[first[count >= 3]]  # one in each voxel on a surface; stray ones are alone
     if len(spaced) < LEAST:
         return None
     rays, rng = [np.concatenate(parts) for parts in zip(*off, strict=True)], np.random.default_rng(0)

@@ -35,7 +35,6 @@ SUFFIXES = (*ENDINGS, ".exr")  # that `file_path` may have or omit, in the order
 OTHER_LENSES = ("k5", "k6", "ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys of unsupported lenses, refused unless they are 0 or false."""
 MAPS = {"normal": 3, "depth": 1, "albedo": 4, "roughness": 2, "metallic": 2}  # channels of ground truth
-NORMAL_LENGTH = 0.5  # smallest length of an 8-bit normal: no normal is stored as (½, ½, ½)
 
 
 class TransformsReader:
@@ -287,7 +286,7 @@ def _shiny_blender_maps(
     normal = depth = None
     if (pixels := _beside(image, "_normal.png", read_png, shape)) is not None:
         pixels = 2 * pixels[..., :3] - 1
-        stored = np.linalg.norm(pixels, axis=-1, keepdims=True) > NORMAL_LENGTH
+        stored = np.linalg.norm(pixels, axis=-1, keepdims=True) > 0.5  # none is stored as (½, ½, ½)
         normal = block_mean(pixels, stored, downscale, straight)[0]
     if (pixels := _beside(image, "_disp.tiff", read_tiff, shape)) is not None:
         disparity = pixels[..., None]
