@@ -34,8 +34,6 @@ from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.light.prefilter import Operator, prefilter
 from mi_refgs.types import TensorXf
 
-ATANH_TERMS = 7  # terms of the series of log(1 + e) in softplus: relative error below 1e-7 for e ≤ 1
-
 
 def softplus(x: Any) -> Any:
     """log(1 + exp x) to full relative precision for every finite x, with a finite derivative."""
@@ -43,7 +41,7 @@ def softplus(x: Any) -> Any:
     # log(1 + e) = 2 atanh(e / (2 + e)): 1 + e alone would round away all of a dark texel.
     s = e / (2 + e)
     series = dr.zeros(type(x), dr.width(x))
-    for n in reversed(range(ATANH_TERMS)):
+    for n in reversed(range(7)):  # relative error below 1e-7
         series = dr.fma(series, s * s, 1 / (2 * n + 1))
     return 0.5 * x + 0.5 * dr.abs(x) + 2 * s * series  # not max(0, x), whose slope at 0 is not ½
 
@@ -67,7 +65,6 @@ DEFAULT_HEIGHT = 64  # rows: 2.8° a texel, about what an image of a few hundred
 MIN_HEIGHT = 8  # fewest rows of a light
 FINEST = 1024  # default for most rows of a light that is read from a file: 0.2° per texel
 RADIANCE_FLOOR = 1e-4  # least radiance after an import: softplus has no finite raw value for 0
-POLE_SINE = 1e-4  # within 0.006° of a pole the azimuth is fixed, so that its derivative stays below 1e4
 
 
 def is_height(rows: int) -> bool:
@@ -144,7 +141,7 @@ def azimuth_polar(direction: Any) -> tuple[Any, Any]:
     """Fractions u of a turn and v of a meridian of unit directions, with finite derivatives."""
     x, y, z = direction.x, direction.y, direction.z
     sin2 = x * x + z * z
-    off_pole = sin2 > POLE_SINE**2
+    off_pole = sin2 > 1e-4**2  # nearer than 0.006° the azimuth is fixed: its derivative stays below 1e4
     φ = dr.atan2(dr.select(off_pole, x, 0), -dr.select(off_pole, z, 1))
     u = φ * (0.5 / dr.pi)
     u = dr.select(u < 0, u + 1, u)

@@ -16,9 +16,6 @@ from scipy.sparse import csr_matrix
 LEVEL_ROUGHNESS = (0.1, 0.15, 0.22, 0.32, 0.45, 0.65, 1.0)
 """Of the filtered levels (level 0 is the map): mixtures of two are within 6 % (L1) of the lobe between."""
 LEVEL_MAX_HEIGHT = (128, 128, 128, 64, 32, 32, 32)  # rows at most: 1.4 % (L1)
-DROP_BELOW = 1e-5  # of a level's largest entry; smaller ones are dropped: 0.05 % of a lobe (L1)
-HORIZON_CUTS = 0.5  # roughness from which a lobe ends at the horizon rather than before it
-MIN_SUBSAMPLES = 2  # quadrature points per texel side where the lobe is wider than a texel
 
 
 def row_angles(h: int) -> np.ndarray:
@@ -90,7 +87,7 @@ def fourier_rows(roughness: float, h: int, h_out: int) -> np.ndarray:
     k, is (a_m, b_m) of Σ_m (a_m cos mφ + b_m sin mφ), the filtered radiance of row i; m = 0 … h, w = 2h."""
     w, texel = 2 * h, np.pi / (h - 1)
     core = 2 * roughness**2  # the lobe falls to a quarter at this angle, radians
-    s = max(MIN_SUBSAMPLES, int(np.ceil(2.5 * texel / core)) + 1)
+    s = max(2, int(np.ceil(2.5 * texel / core)) + 1)  # samples along a texel
     t = (np.arange(s) + 0.5) / s
     θ = (np.arange((h - 1) * s) + 0.5) * (texel / s)
     # A sample lies between the texels d and d + 1: its bilinear weights, then the transform of the texels.
@@ -136,10 +133,10 @@ def build_levels(h: int) -> list[np.ndarray]:
             weights = np.einsum("ikm,kn,m->inm", weights, rows, transfer, optimize=True)
         rows = weights.shape[0]
         weights = weights[:, :, : rows + 1]  # a level of w columns has frequencies up to w/2
-        if rows < h_in and roughness > HORIZON_CUTS:
+        if rows < h_in and roughness > 0.5:  # the lobe ends at the horizon rather than before it
             # The edge at the horizon rings, and light would turn negative: Lanczos' factors fade it out.
             weights = weights * np.sinc(np.arange(rows + 1) / (rows + 1))
-        kept = np.abs(weights) > DROP_BELOW * np.abs(weights).max()
+        kept = np.abs(weights) > 1e-5 * np.abs(weights).max()  # the rest is 0.05 % of a lobe (L1)
         kept[:, :, 0] = True  # the mean is never thinned: constants stay constant
         built.append(np.where(kept, weights, 0))
     return built
