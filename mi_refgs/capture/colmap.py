@@ -24,7 +24,6 @@ WORKING_SIZE = 1600  # longest side of the images, pixels; twice takes four time
 IMAGES_AT_ONCE, PAIRS_AT_ONCE = 8, 200  # per call of COLMAP; the progress bar moves after each
 EXHAUSTIVE = 150  # largest number of images for which every pair is matched: 11,175 pairs take some minutes
 IN_ORDER = 8  # images before and after each, by name, with which it is matched in larger sets: a walk
-ALIKE = 20  # most similar images with which each is also matched in larger sets: they close loops
 WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12  # words, features per image to find them, k-means rounds
 
 Reconstruction = Any  # pycolmap.Reconstruction
@@ -172,7 +171,7 @@ def pairs_to_match(features: dict[str, np.ndarray]) -> list[tuple[str, str]]:
     near = {(i, j) for i in range(len(names)) for j in range(i + 1, min(i + 1 + IN_ORDER, len(names)))}
     likeness = image_similarity([features[name] for name in names])
     np.fill_diagonal(likeness, -np.inf)
-    for i, best in enumerate(np.argsort(-likeness, axis=1, kind="stable")[:, :ALIKE]):
+    for i, best in enumerate(np.argsort(-likeness, axis=1, kind="stable")[:, :20]):  # they close loops
         near |= {(min(i, int(j)), max(i, int(j))) for j in best}
     return [(names[i], names[j]) for i, j in sorted(near)]
 

@@ -32,7 +32,6 @@ from mi_refgs.io.progress import with_bar
 PLOT = "capture.png"
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
 FIRST_MODEL = "SIMPLE_RADIAL"  # lens with which images are registered: few matches determine its parameter
-FEW_FEATURES = 60  # of the median image: a pair needs 15 consistent matches, a good quarter of the features
 LEAST_PLACED = 0.5  # fraction of the photographs that must be registered in one group
 NAMED = 5  # largest number of photographs that a message names
 
@@ -128,7 +127,7 @@ def _solve(
     colmap.extract(database, images, names)
     found = colmap.features(database)
     counts = [len(found[name]) for name in names]
-    if (median := int(np.median(counts))) < FEW_FEATURES:
+    if (median := int(np.median(counts))) < 60:  # a pair needs 15 consistent matches, a good quarter
         what = f"half of them have no more than {median} features: they are blurred, or without texture"
         remedy = "hold still, use more light, put a patterned ground below the object"
         raise InputError(what, source, "photographs", remedy)

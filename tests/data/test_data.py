@@ -184,7 +184,6 @@ def only_exr(folder: Path) -> None:
         (edit(lambda c: c.update(frames=[])), {}, ["zero train views"]),
         (edit(lambda c: c.pop("camera_angle_x")), {}, ["camera_angle_x", "fl_x"]),
         (edit(lambda c: c.update(camera_angle_x="wide")), {}, ["camera_angle_x", "'wide'"]),
-        (edit(lambda c: c.update(w=800, h=800)), {}, ["r_0.png", "no copy of 800 × 800"]),
         (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),
         (named("file_path", "train/none"), {}, ["none.png", "missing"]),
         (only_exr, {}, ["r_0.exr: images: an EXR file", "data.images=exr"]),

@@ -99,16 +99,6 @@ def test_alpha_and_maps_are_undistorted_like_the_image(tmp_path: Path) -> None:
     assert set(np.unique(view.depth.round(5))) == {0, 3}
 
 
-def test_zero_distortion_changes_no_pixel(tmp_path: Path) -> None:
-    folder = dataset(tmp_path, {})
-    plain = read_dataset(folder, "train").views[0].load()
-    zeros = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | {"is_fisheye": False}
-    change_transforms(folder, lambda content: content.update(zeros))
-    view = read_dataset(folder, "train").views[0].load()
-    np.testing.assert_array_equal(view.image, plain.image)
-    assert (view.fx, view.fy) == (plain.fx, plain.fy)
-
-
 @pytest.mark.parametrize(
     ("lens", "words"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,8 @@ FOLDERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "COLMAP, points as PLY": (points_beside_colmap, ""),
     "nerfstudio, points as PLY": (points_of_nerfstudio, ""),
     "nerfstudio, scaled": (frames(fourfold), "7 images: focal length and principal point"),
-    "nerfstudio, small letters": (frames(lambda frame: frame.update(camera_model="opencv", k1=0.0)), ""),
+    "nerfstudio, small letters": (frames(lambda frame: frame.update(camera_model="opencv")), ""),
+    "nerfstudio, no distortion": (partial(write_nerfstudio, k1=0.0, k4=0.0, p1=0.0, is_fisheye=False), ""),
     "nerfstudio, FULL_OPENCV": (frames(lambda frame: frame.update(camera_model="FULL_OPENCV")), ""),
     "nerfstudio, 3 × 4": (turned(lambda m: m[:3]), ""),
     "nerfstudio, rounded": (turned(lambda m: np.round(m, 3)), "7 images: the rotation is rounded or"),
@@ -140,6 +142,7 @@ def test_folder_of_another_program(name: str, tmp_path: Path) -> None:
     assert len(found.views) == 7 and said in " ".join(found.notes) and bool(said) == bool(found.notes)
     for view, shot in zip(found.views, SHOTS[1:], strict=False):
         check(view, shot)
+        assert view.file is not None and view.file.lens is None
         np.testing.assert_allclose(view.to_world[:3, 3], shot.camera_to_world[:3, 3], atol=1e-3)
     if "COLMAP" in name or "PLY" in name:
         assert found.points is not None and found.points.colour is not None
