@@ -27,7 +27,6 @@ IN_ORDER = 8  # images before and after each, by name, with which it is matched 
 WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12  # words, features per image to find them, k-means rounds
 
 Reconstruction = Any  # pycolmap.Reconstruction
-Token = Any  # pycolmap.CancellationToken
 Result = TypeVar("Result")
 Item = TypeVar("Item")
 
@@ -105,7 +104,7 @@ def extract(database: Path, folder: Path, names: Sequence[str]) -> None:
     options.sift.max_num_features = 3000  # two cores match 30 pairs a second; time grows with its square
     settings = (pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions(), options, pycolmap.Device.cpu)
 
-    def work(part: Sequence[str], token: Token) -> None:
+    def work(part: Sequence[str], token: Any) -> None:
         pycolmap.extract_features(database, folder, list(part), *settings, cancellation_token=token)
 
     _in_parts(names, IMAGES_AT_ONCE, "features", work)
@@ -122,7 +121,7 @@ def match(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
     verification.ransac.random_seed = SEED
     settings = (matching, pairing, verification, pycolmap.Device.cpu)
 
-    def work(part: Sequence[tuple[str, str]], token: Token) -> None:
+    def work(part: Sequence[tuple[str, str]], token: Any) -> None:
         listed.write_text("".join(f"{first} {second}\n" for first, second in part))
         pycolmap.match_image_pairs(database, *settings, cancellation_token=token)
 

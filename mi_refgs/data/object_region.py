@@ -19,7 +19,6 @@ from mi_refgs.data.view import View, evenly_spread
 # Support planes; lengths are in radii of the region.
 PLANE_REACH = 2.0  # distance from the centre up to which points determine them
 PLANE_MARGIN = 0.04  # height above at which the region begins; half leaves 4 % of the outline to the table
-PLANE_COUNT = 3  # at most: a table, and a corner of two walls
 PLANE_POINTS, PLANE_SHARE = 50, 0.05  # fewest points on one, and their share of those within PLANE_REACH
 BELOW_SHARE = 0.5  # most points below over those on it: a table mirrors some, the face of an object has more
 ABOVE_SHARE = 0.9  # fraction of the cameras that are above
@@ -34,7 +33,6 @@ LEAST_WITHIN = 0.5  # the same of points on fitted surfaces, below which somethi
 WHOLE = 0.95  # fraction in an image that shows the whole object
 FREE_SHARE = 0.15  # of the centre's depth, empty before a camera; a table seen from 5° above begins at 0.18
 # Balls around the group.
-SPHERE_SAMPLES = 2_000  # points of a sphere by which it is enclosed together with a group
 ENCLOSED, FITTED_BALL = 1.05, 1.1  # radius over that of the smallest ball: of sparse points, of fitted ones
 
 
@@ -59,7 +57,7 @@ def support_planes(
     origins: np.ndarray,  # (V, 3) of the cameras
     region: Region,
     width: float = SPARSE.width,  # half the thickness of a plane, radii
-    most: int = PLANE_COUNT,
+    most: int = 3,  # a table, and a corner of two walls
 ) -> tuple[Plane, ...]:
     """Planes PLANE_MARGIN above surfaces that support an object, with nearly all cameras above them."""
     rng = np.random.default_rng(0)
@@ -109,7 +107,7 @@ def object_region(
     if len(group) < GROUP_POINTS or np.mean(region.contains(group)) >= WITHIN_SHARE:
         return region
     # The ball around the group and the part of the sphere above the planes, with the cameras outside.
-    offset = np.random.default_rng(0).normal(size=(SPHERE_SAMPLES, 3))
+    offset = np.random.default_rng(0).normal(size=(2_000, 3))
     offset *= region.radius / np.linalg.norm(offset, axis=1, keepdims=True)
     sphere = np.array(region.centre) + offset
     centre, radius = enclosing_ball(np.concatenate([group, sphere[region.above(sphere)]]))
