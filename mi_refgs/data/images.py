@@ -23,7 +23,7 @@ from mi_refgs.io.files import is_file
 from mi_refgs.io.images import (
     ENDINGS,
     box_downscale,
-    has_alpha,
+    image_header,
     image_size,
     read_bytes,
     read_grey,
@@ -85,7 +85,7 @@ class ImageFile:
 
     def has_alpha(self) -> bool:
         """Whether there is alpha, by the file's header."""
-        return self.mask is not None or has_alpha(self.path)
+        return self.mask is not None or image_header(self.path)[2]
 
     def decode(self) -> np.ndarray:
         """(H, W, 3 or 4): uint8 as in the file, else float32, averaged and premultiplied."""

@@ -19,9 +19,7 @@ SRGB_LINEAR_LIMIT = 0.0031308  # linear value below which the sRGB curve is a st
 SRGB_ENCODED_LIMIT = 0.04045  # the same point after encoding
 ALPHA_FLOOR = 1e-8  # alpha by which radiance is divided at least
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp")  # of 8-bit images, in the order in which they are tried
-EXIF_IFD = 0x8769  # tag of the table of camera settings (EXIF 2.3)
 PSNR_MAX = 100.0  # dB, of identical images: JSON has no infinity
-JPEG_SHRINK = 8  # JPEG blocks have 8 × 8 pixels; the decoder can return 8 × 8, 4 × 4, 2 × 2 or 1 for each
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -73,14 +71,17 @@ def with_ending(stem: Path, endings: tuple[str, ...] = ENDINGS) -> Path | None:
     return next((by_ending[ending] for ending in endings if ending in by_ending), None)
 
 
+def image_header(path: Path) -> tuple[int, int, bool]:
+    """Width and height of a PNG, JPEG or EXR file, and whether it has alpha; raises as its reader does."""
+    if path.suffix.lower() == ".exr":
+        return exr_header(path)
+    with open_image(path) as image:
+        return *image.size, bool(image.has_transparency_data)
+
+
 def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of a PNG, JPEG or EXR file, from its header; raises InputError as its reader does."""
-    path = Path(path)
-    if path.suffix.lower() == ".exr":
-        return exr_header(path)[:2]
-    with open_image(path) as image:
-        width, height = image.size
-        return int(width), int(height)
+    return image_header(Path(path))[:2]
 
 
 def read_png(path: str | Path) -> np.ndarray:
@@ -95,7 +96,8 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
     with open_image(path) as image:
         if image.mode.startswith(("I", "F")):
             raise InputError("more than 8 bits per channel", path, "pixels", "save it as 8-bit PNG or EXR")
-        factor = math.gcd(shrink, JPEG_SHRINK) if image.format == "JPEG" else 1
+        # The decoder can return 8 × 8, 4 × 4, 2 × 2 or 1 pixels for each block of 8 × 8.
+        factor = math.gcd(shrink, 8) if image.format == "JPEG" else 1
         if factor > 1:
             image.draft(None, tuple(max(side // factor, 1) for side in image.size))
         return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB")), factor
@@ -131,15 +133,6 @@ def read_tiff(path: str | Path) -> np.ndarray:
         return np.nan_to_num(np.asarray(image, dtype=np.float32) / np.float32(scale))
 
 
-def has_alpha(path: str | Path) -> bool:
-    """Whether a PNG, JPEG or EXR file has alpha, from its header."""
-    path = Path(path)
-    if path.suffix.lower() == ".exr":
-        return exr_header(path)[2]
-    with open_image(path) as image:
-        return bool(image.has_transparency_data)
-
-
 @contextlib.contextmanager
 def open_image(path: Path, *formats: str) -> Iterator[Any]:
     """Open a PNG or JPEG file, or one of `formats`, and check its size."""
@@ -171,7 +164,7 @@ def exif_tags(image: Any) -> tuple[dict[int, Any], dict[int, Any]]:
         for tag in exif:
             with contextlib.suppress(Exception):
                 tags[tag] = exif[tag]
-        settings.update(exif.get_ifd(EXIF_IFD))
+        settings.update(exif.get_ifd(0x8769))  # of the camera (EXIF 2.3)
     return tags, settings
 
 

@@ -17,7 +17,6 @@ from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.types import TensorXf
 
 LARGEST_HEIGHT = 128  # most rows of a learnt map by default: the finest filtered level has no more
-ROWS_PER_PIXEL = math.pi / 4  # of an image's side: one texel per pixel at the centre of a mirror ball
 FIXED_HEIGHT = 256  # most rows of a known map: a texel is 0.7°, an eighth of the lobe of roughness 0.1
 READ_ROWS = OVERSAMPLING * FIXED_HEIGHT  # to which a larger map is averaged first
 EXPOSURE_MAX = 10.0  # stops; a light stores no radiance below 1e-4
@@ -43,7 +42,7 @@ class Map(LightKind):
         many pixels shows: 128 rows from 161² pixels on, 76 for 96²."""
         if self.height is not None:
             return self
-        wanted = 4 * math.ceil(ROWS_PER_PIXEL * math.sqrt(pixels) / 4)
+        wanted = 4 * math.ceil(math.pi / 4 * math.sqrt(pixels) / 4)  # a texel per pixel at the ball's centre
         return replace(self, height=min(max(wanted, MIN_HEIGHT), LARGEST_HEIGHT))
 
 
