@@ -21,7 +21,9 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 CULL_SHARE = 0.1  # fraction of the surfels from which on they are not the cause: a pixel has tens
-PATIENCE = 3  # log intervals in which every step fails before the fit ends: removing surfels may help first
+PATIENCE = (
+    3  # log intervals in which every step fails before a fit ends, at its end 1: removal may help first
+)
 
 
 @dataclass
@@ -51,7 +53,8 @@ class Health:
         view = setup.data.views[setup.view(skipped.iteration + 1)].name if skipped.count else ""
         wrong = [f"loss '{name}'" for name, value in terms.items() if not dr.all(dr.isfinite(value))[0]]
         said = sentence(rows, skipped, view, wrong)
-        if self.failed >= min(PATIENCE * setup.method.log_every, setup.method.iterations):
+        wait = PATIENCE if rows or state.iteration < setup.method.iterations else 1
+        if self.failed >= min(wait * setup.method.log_every, setup.method.iterations):
             raise InputError(
                 f"{said}; nothing was learnt in {self.failed} iterations: look at that image and its camera, "
                 "or that loss, or lower the rates (--set rates.…)"

@@ -97,12 +97,16 @@ def test_fit_in_which_every_step_fails_ends_with_one_sentence(method: Method, tm
         np.testing.assert_array_equal(after[name], before[name])
 
 
-def test_short_fit_in_which_every_step_fails_names_the_loss(method: Method) -> None:
+@pytest.mark.parametrize(("iterations", "start"), [(2, 0), (6, 3)])
+def test_fit_whose_last_steps_fail_names_the_loss(iterations: int, start: int, method: Method) -> None:
     register_loss(Loss("nan", lambda inputs: dr.mean(inputs.frame.alpha) * np.nan))
-    weights = method.loss | {"nan": LossWeight(0.1)}
+    weights = method.loss | {"nan": LossWeight(0.1, start=start)}
     try:
-        trainer = Trainer(replace(without(method), iterations=2, loss=weights), ball())
-        refused(trainer.train, "loss 'nan' not finite; 2 steps were left out; nothing was learnt in 2")
+        trainer = Trainer(replace(without(method), iterations=iterations, loss=weights), ball())
+        lost = iterations - start
+        refused(
+            trainer.train, f"loss 'nan' not finite; {lost} steps were left out; nothing was learnt in {lost}"
+        )
     finally:
         LOSSES.unregister("nan")
 
