@@ -27,6 +27,7 @@ from mi_refgs.surfels.table import Surfels
 
 DIELECTRIC, METAL = 0.1, 0.9  # metallic during the trials: 0 and 1 have no slope to leave them by
 METAL_GAIN = 1.5  # dB from which surfels start as metal: plastic gains 0.7, gold and mixed scenes 2.3 or more
+MANY_VIEWS = 32  # below which more is needed: of plastic too, metal explains few images better (16: 1.9 dB)
 JUDGED_VIEWS = 24  # training views whose errors decide
 NEIGHBOURHOOD = 0.05  # fraction of the surfels that a surfel shares its choice with: single errors are noise
 CENTRES = 5_000  # surfels that the fraction is counted in: so many sums are computed
@@ -35,7 +36,7 @@ CENTRES = 5_000  # surfels that the fraction is counted in: so many sums are com
 @register_event
 @dataclass(frozen=True)
 class Metal(Event[Trainer]):
-    """Begins a fit as dielectric and as metal, and continues one of them: as metal if it gains METAL_GAIN."""
+    """Begins a fit as dielectric and as metal, and continues one of them: as metal if it gains enough."""
 
     name: ClassVar[str] = "metal"
     outside: ClassVar[bool] = True
@@ -52,22 +53,28 @@ class Metal(Event[Trainer]):
         views = [trainer.data.views[i] for i in evenly_spread(len(trainer.data.views), JUDGED_VIEWS)]
         errors = [[_squared_error(fit, view) for view in views] for fit in fits]
         dielectric, metal = (psnr_of(float(np.mean([error.mean() for error in one]))) for one in errors)
-        is_metal = metal >= dielectric + METAL_GAIN
+        gain = required_gain(len(trainer.data.views))
+        is_metal = metal >= dielectric + gain
         trainer.take(fits[is_metal], trainer.method)
         trainer.fit.optimiser.factors["metallic"] = 1.0
 
         # Each surfel starts as what has the smaller error around it.
-        excess = [one - 10 ** (METAL_GAIN / 10) * other for one, other in zip(*errors, strict=True)]
+        excess = [one - 10 ** (gain / 10) * other for one, other in zip(*errors, strict=True)]
         raw = trainer.surfels.to_numpy()
         metals = _sum_around(raw["position"], _attributed(trainer.surfels, views, excess)) > 0
         raw["metallic"] = np.where(metals[:, None], logit(METAL), logit(DIELECTRIC)).astype(np.float32)
         trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("metallic",))
         reason = (
-            f"{metal:.2f} dB as metal, {dielectric:.2f} dB as dielectric, metal needs {METAL_GAIN:g} dB "
+            f"{metal:.2f} dB as metal, {dielectric:.2f} dB as dielectric, metal needs {gain:.1f} dB "
             f"more; {metals.mean():.0%} of the surfels start as metal"
         )
         row = Row(self.name, 0, bool(is_metal), reason, dielectric, metal)
         conclude(trainer, row, began, f"continues as {'metal' if is_metal else 'dielectric'}")
+
+
+def required_gain(views: int) -> float:
+    """dB by which so many training views have to be explained better as metal."""
+    return METAL_GAIN * max(MANY_VIEWS / views, 1) ** 0.5
 
 
 def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:

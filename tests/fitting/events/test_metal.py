@@ -20,11 +20,13 @@ from mi_refgs.surfels.attributes import sigmoid
 from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
 TRIAL = "event.metal.trial=4"
+VIEWS = 6
+GAIN = event.required_gain(VIEWS)  # few: more than METAL_GAIN
 
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = write_data(tmp_path_factory.mktemp("metal_trial") / "ball", views=6, truth=False)
+    folder = write_data(tmp_path_factory.mktemp("metal_trial") / "ball", views=VIEWS, truth=False)
     return read_dataset(folder, "train", truth=False)
 
 
@@ -62,7 +64,7 @@ def judged(
 def test_gain_decides(better: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Metal has to gain enough; metallic is held during the trial and learns afterwards."""
     held = event.METAL if better == "metal" else event.DIELECTRIC
-    gain = event.METAL_GAIN * (1.01 if better == "metal" else 0.99)
+    gain = GAIN * (1.01 if better == "metal" else 0.99)
     trials = judged(monkeypatch, 0.01, 0.01 * 10 ** (-gain / 10))
     trainer, said = fitted(views, tmp_path, TRIAL)
     for (iteration, during), value in zip(trials, (event.DIELECTRIC, event.METAL), strict=True):
@@ -75,7 +77,7 @@ def test_gain_decides(better: str, views: Dataset, tmp_path: Path, monkeypatch: 
     assert trainer.iteration == 6 and np.abs(found - held).max() > 1e-4 and np.abs(found - held).mean() < 0.1
 
 
-@pytest.mark.parametrize("gains", [(3.0, -3.0), (1.8 * event.METAL_GAIN, 0.5 * event.METAL_GAIN)])
+@pytest.mark.parametrize("gains", [(2 * GAIN, -0.5 * GAIN), (1.8 * GAIN, 0.5 * GAIN)])
 def test_each_region_has_its_start(
     gains: tuple[float, float], views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,7 +124,7 @@ def test_images_of_a_fit_decide(
     trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4")
     sentence = next(one for one in said if "continues as" in one)
     metal, dielectric = (float(part.split(" dB")[0].split()[-1]) for part in sentence.split(",")[:2])
-    value = event.METAL if metal >= dielectric + event.METAL_GAIN else event.DIELECTRIC
+    value = event.METAL if metal >= dielectric + GAIN else event.DIELECTRIC
     held = f"surfels.initial={{metallic={value}}}", "rates.attribute={metallic=0}"
     again, _ = fitted(views, tmp_path / "again", "iterations=4", *held)
     assert trainer.iteration == again.iteration == 4
