@@ -36,7 +36,6 @@ POINTS, NEIGHBOURS = 2_000, 4  # points of a scene that are projected; views wit
 IMAGES, PIXELS = 200, 150  # images that are looked at, and samples along their shorter side, at most
 NOISE, ROUGH = 4.0, 3 * ALIKE  # tolerance in median deviations from a plain backdrop, and at most
 STILL, TURNED = 0.75, 0.87  # share of the border that stays before a turntable; cosine of its least turn, 30°
-UNMASKED = 8  # views whose background is looked at without their masks
 
 
 @dataclass(frozen=True)
@@ -246,7 +245,7 @@ class Sight:
         masked = [p for p in (v.pixels for v in self.views) if isinstance(p, ImageSource) and p.file.mask]
         borders = [look.border for look in self.looks]
         if masked:  # as photographed
-            some = (masked[i] for i in evenly_spread(len(masked), UNMASKED))
+            some = (masked[i] for i in evenly_spread(len(masked), 8))
             whole = (replace(x, file=replace(x.file, mask=None), has_alpha=False) for x in some)
             borders = [border_of(replace(self.views[0], pixels=x).load().displayed) for x in whole]
         middle = np.median(borders, axis=0)

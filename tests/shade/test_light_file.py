@@ -19,7 +19,6 @@ from mi_refgs.shade.light.light_file import read_radiance
 def test_a_map_that_is_finer_than_wanted_is_averaged(
     kind: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    """As `resample` does."""
     path, values = tmp_path / kind, rng.integers(0, 256, (37, 74, 3)).astype(np.float32) / 256
     if path.suffix == ".png":
         write_png(path, values)

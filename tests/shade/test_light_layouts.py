@@ -75,9 +75,8 @@ def test_layouts_agree_with_the_lat_long_map_of_the_same_place(
 ) -> None:
     """Also where Mitsuba looks the map up, and at no more rows than wanted."""
     path, picture = tmp_path / "a.exr", layout(name)
-    header = {"envmap": OpenEXR.ENVMAP_CUBE} if name == "OpenEXR" else {}
-    planes = {channel: np.ascontiguousarray(picture[..., i]) for i, channel in enumerate("RGB")}
-    OpenEXR.File({"type": OpenEXR.scanlineimage} | header, planes).write(str(path))
+    header = {"type": OpenEXR.scanlineimage} | ({"envmap": OpenEXR.ENVMAP_CUBE} if name == "OpenEXR" else {})
+    OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)}).write(str(path))
     found = read_radiance(path)
     assert found.shape == (2 * SIZE, 4 * SIZE, 3)
     np.testing.assert_allclose(found, marked(np.moveaxis(map_directions(2 * SIZE), -1, 0)), atol=0.01)
