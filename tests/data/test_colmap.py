@@ -21,10 +21,8 @@ from tests.helpers import refused
 from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import SHOTS, VALUES, WRITERS, write_binary, write_colmap
 
-KINDS = ("txt", "bin")
 
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WRITERS)
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
 def test_colmap_cameras_project_points_onto_images(kind: str, place: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, kind, place=place)
@@ -58,7 +56,7 @@ LENSES: dict[str, tuple[tuple[float, ...], Lens]] = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WRITERS)
 def test_every_lens_model_is_undistorted(model: str, kind: str, tmp_path: Path) -> None:
     values, lens = LENSES[model]
     focal = (107.0, 107.0) if values[0] == 107.0 else (110.0, 104.0)
@@ -68,7 +66,7 @@ def test_every_lens_model_is_undistorted(model: str, kind: str, tmp_path: Path) 
         check(view, shot, tolerance=0.06)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", WRITERS)
 def test_unsupported_lens_models_are_refused(kind: str, tmp_path: Path) -> None:
     data = write_colmap(tmp_path, kind, SHOTS[:2], camera="FOV", values=(*VALUES, 0.01))
     refused(lambda: read_dataset(data, "train"), f"cameras.{kind}: camera 7: the lens model", "undistort")
