@@ -21,9 +21,7 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 CULL_SHARE = 0.1  # fraction of the surfels from which on they are not the cause: a pixel has tens
-PATIENCE = (
-    3  # log intervals in which every step fails before a fit ends, at its end 1: removal may help first
-)
+PATIENCE = 3  # log intervals of failed steps before a fit ends, at its end 1: removing surfels may help first
 
 
 @dataclass
