@@ -67,7 +67,16 @@ class Registry(Mapping[str, T], Generic[T]):
     def register(self, item: T) -> T:
         """Add an item, which is returned. Raises InputError for an item of another kind, without a name, with
         the name of another one, or that `check` refuses."""
-        self._require_kind(item)
+        of = self._of
+        if self._classes:
+            made: Any = (
+                isinstance(item, type) and issubclass(item, of) and vars(item).get("__dataclass_params__")
+            )
+            fits, wanted = made and made.frozen, f"a class below {of.__name__}, a @dataclass(frozen=True)"
+        else:
+            fits, wanted = isinstance(item, of) and not isinstance(item, type), f"an object of {of.__name__}"
+        if not fits:
+            raise InputError(f"{abbreviated(item)} cannot be registered", self.kind, remedy=f"give {wanted}")
         name = getattr(item, "name", "")
         if not name or name in self._registered:
             what = f"'{name}': the name is empty or in use"
@@ -78,16 +87,6 @@ class Registry(Mapping[str, T], Generic[T]):
             _files[self.kind, name] = os.path.abspath(caller["__file__"])
         self._registered = added | self._registered if self._newest_first else self._registered | added
         return item
-
-    def _require_kind(self, item: object) -> None:
-        of = self._of
-        if self._classes:
-            made = isinstance(item, type) and issubclass(item, of) and vars(item).get("__dataclass_params__")
-            fits, wanted = made and made.frozen, f"a class below {of.__name__}, a @dataclass(frozen=True)"
-        else:
-            fits, wanted = isinstance(item, of) and not isinstance(item, type), f"an object of {of.__name__}"
-        if not fits:
-            raise InputError(f"{abbreviated(item)} cannot be registered", self.kind, remedy=f"give {wanted}")
 
     def unregister(self, name: str) -> None:
         del self._items[name]

@@ -53,11 +53,9 @@ class Train:
 
         progress = ProgressBar()
         begin = time.monotonic()
-        given: dict[str, Any] = {"preset": self.preset, "output": self.output, "resume": self.resume}
-        given |= {"settings": joined(self.set), "purpose": self.purpose}
-        given |= {"light": self.light, "light_fixed": self.light_fixed, "force": self.force}
-        given["turntable"] = self.turntable
-        fit(self.data, self.method, progress=progress, **given)
+        names = "preset", "output", "resume", "purpose", "light", "light_fixed", "force", "turntable"
+        given: dict[str, Any] = {name: getattr(self, name) for name in names}
+        fit(self.data, self.method, settings=joined(self.set), progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None
         data: dict[str, Any] = {"run": str(self.output), "method": trainer.method.name}

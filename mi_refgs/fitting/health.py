@@ -34,8 +34,7 @@ class Health:
 
     def check(self, setup: FitSetup, state: FitState, terms: Mapping[str, Float]) -> str | None:
         """Remove the surfels that made steps fail since the last check; returns a sentence about it, if any.
-        `terms` are the losses of the last step. Raises InputError if the light is not finite, if no surfel is
-        left, or if nothing helps."""
+        Raises InputError if the light is not finite, if no surfel is left, or if nothing helps."""
         skipped, steps = state.optimiser.report(), state.iteration - self.checked
         self.checked, self.skipped = state.iteration, self.skipped + skipped.count
         self.failed = self.failed + steps if skipped.count >= steps else 0
@@ -48,15 +47,18 @@ class Health:
         rows = {table.prefix + name: at for table, names in found for name, at in names.items()}
         if not rows and not skipped.count:
             return None
-        view = setup.data.views[setup.view(skipped.iteration + 1)].name if skipped.count else ""
         wrong = [f"loss '{name}'" for name, value in terms.items() if not dr.all(dr.isfinite(value))[0]]
-        said = sentence(rows, skipped, view, wrong)
+        channels = ", ".join(rows or wrong or skipped.rows) or "the loss"
+        views, iteration = setup.data.views, skipped.iteration + 1
+        where = f"iteration {iteration}, view {views[setup.view(iteration)].name}: " if skipped.count else ""
+        said = f"{where}{channels} not finite; {skipped.count} steps were left out"
+        if len(indices := together(rows)):
+            named = ", ".join(map(str, indices[:5])) + (" …" if len(indices) > 5 else "")
+            said = f"{where}{channels} not finite at surfels {named}: {len(indices)} were removed"
         wait = PATIENCE if rows or state.iteration < setup.method.iterations else 1
         if self.failed >= min(wait * setup.method.log_every, setup.method.iterations):
-            raise InputError(
-                f"{said}; nothing was learnt in {self.failed} iterations: look at that image and its camera, "
-                "or that loss, or lower the rates (--set rates.…)"
-            )
+            remedy = "look at that image, its camera and that loss, or lower the rates (--set rates.…)"
+            raise InputError(f"{said}; nothing was learnt in {self.failed} iterations: {remedy}")
         for table, names in found:
             if names:
                 table.remove(together(names))
@@ -74,14 +76,3 @@ def culprits(surfels: Surfels, skipped: Skipped, prefix: str = "") -> dict[str, 
 def together(rows: Mapping[str, np.ndarray]) -> np.ndarray:
     """The rows of all attributes, each once, sorted."""
     return np.unique(np.concatenate([*rows.values(), np.zeros(0, np.int64)])).astype(np.int64)
-
-
-def sentence(rows: Mapping[str, np.ndarray], skipped: Skipped, view: str, losses: list[str]) -> str:
-    """The notice: iteration, view, attributes and surfels, or losses."""
-    channels = ", ".join(rows or losses or skipped.rows) or "the loss"
-    where = f"iteration {skipped.iteration + 1}, view {view}: " if skipped.count else ""
-    indices = together(rows)
-    if not len(indices):
-        return f"{where}{channels} not finite; {skipped.count} steps were left out"
-    named = ", ".join(map(str, indices[:5])) + (" …" if len(indices) > 5 else "")
-    return f"{where}{channels} not finite at surfels {named}: {len(indices)} were removed"

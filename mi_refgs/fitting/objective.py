@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -42,6 +42,7 @@ class LossInputs:
     mean. None without a light, where a loss on it returns None."""
     log_gain: list[Float] | None = None  # natural log of the exposure of R, G, B, width 1 each; None: 0
     photographed: PhotographedLight | None = None  # what photographs show of the light, if there is any
+    terms: dict[str, Float] = field(default_factory=dict)  # losses of this step until now, detached, width 1
 
     @staticmethod
     def of(
@@ -127,14 +128,8 @@ def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss[LossInputs]]:
     return [loss for loss in LOSSES.values() if loss.name in weights and weights[loss.name].weight]
 
 
-def objective(
-    inputs: LossInputs,
-    weights: Mapping[str, LossWeight],
-    iteration: int,
-    terms: dict[str, Float] | None = None,
-) -> tuple[Float, Float]:
-    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached. `terms`
-    gets the losses by name, detached."""
+def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: int) -> tuple[Float, Float]:
+    """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached."""
     image, target = inputs.image, inputs.target
     # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
     factors = {
@@ -145,13 +140,10 @@ def objective(
     loss = None
     for name, registered in LOSSES.items():
         if name in factors and (value := registered.value(inputs)) is not None:
-            if not dr.is_diff_v(value):
-                remedy = "compute it with Dr.Jit"
-                raise InputError("a Python number, from which nothing learns", f"loss.{name}", remedy=remedy)
-            if (width := dr.width(value)) != 1:
-                raise InputError(f"has {width} values", f"loss.{name}", remedy="reduce it, as with dr.mean")
-            if terms is not None:
-                terms[name] = dr.detach(value)
+            if not dr.is_diff_v(value) or dr.width(value) != 1:
+                found = f"{dr.width(value)} of type {type(value).__name__}, from which nothing learns"
+                raise InputError(found, f"loss.{name}", remedy="return one mi.Float, as dr.mean does")
+            inputs.terms[name] = dr.detach(value)
             value = factors[name] * value
             loss = value if loss is None else loss + value
     if loss is None:

@@ -139,8 +139,7 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress, force: bo
     trainer = begin(method, views, run, progress.say, progress.warn, force)
     if resumed:
         # Commands that follow read the data set of the last fit.
-        before = run.dataset()
-        if before is not None and str(before.resolve()) != views.folder:
+        if (before := run.dataset()) is not None and str(before.resolve()) != views.folder:
             progress.warn(f"{output}: was fitted to {before.resolve()} before, now to {views.path}")
             run.write_dataset(views.folder, run.region())
         progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
@@ -205,8 +204,7 @@ def begin(
             tell(f"{views.path}: {note}")
         for (_, before), (name, _) in itertools.pairwise(method.stages()):
             if before.until >= method.iterations:
-                remedy = "add iterations, or lower `until` of the stages before"
-                warn(f"stage {name}: does not begin in {method.iterations} iterations; {remedy}")
+                warn(f"stage {name}: does not begin in {method.iterations} iterations; add more")
         views, surfaces = _with_stereo(views, tell)
         if not resumed:
             views = _around_object(views, surfaces, tell, warn)

@@ -243,9 +243,8 @@ class Trainer:
         frame = render(scene, camera, request)
         gain = per_view.log_gain(fit.params, index)
         inputs = LossInputs.of(frame, target, self.data, light, gain, fit.photographed)
-        self.terms.clear()
-        loss, error = objective(inputs, weights, iteration, self.terms)
-        self.loss, self.error = dr.detach(loss), dr.mean(error)
+        loss, error = objective(inputs, weights, iteration)
+        self.loss, self.error, self.terms = dr.detach(loss), dr.mean(error), inputs.terms
         if frame.attribution is not None:
             loss += dr.sum(error * frame.attribution)
         phase("loss backward")(dr.backward)(loss)

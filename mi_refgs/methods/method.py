@@ -326,6 +326,4 @@ def _require_known(key: str, names: Iterable[str], known: set[str]) -> None:
     if unknown := [name for name in names if name not in known]:
         some = ", ".join(name for name in (*ATTRIBUTES, *{*known} - {*ATTRIBUTES}) if name in known)
         hint = "" if unknown[0] in ATTRIBUTES else "; or load its file with --plugin"
-        raise InputError(
-            f"'{unknown[0]}' is unknown", field=key, remedy=f"use some of {some or 'none'}{hint}"
-        )
+        raise InputError(f"'{unknown[0]}' is unknown", None, key, f"use some of {some or 'none'}{hint}")

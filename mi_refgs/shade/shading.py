@@ -86,8 +86,7 @@ class Shading(ShadingOptions):
 
     @staticmethod
     def default(attributes: Collection[str], models: Collection[str] = MODELS) -> tuple[str, Diffuse]:
-        """The first of some models, with its first diffuse, whose attributes exist, and are all if there is
-        such a one; else that of fewest."""
+        """The first of some models and diffuse that uses all attributes, else some; else that of fewest."""
         needs: dict[tuple[str, Diffuse], set[str]] = {
             (name, diffuse): {*MODELS[name].required_attributes(ShadingOptions(diffuse=diffuse))}
             for name in models

@@ -76,7 +76,7 @@ def test_photometric_loss_is_replaced_or_required(data: Path, method: Path) -> N
 
 
 def test_loss_per_pixel_or_of_no_name_is_refused(data: Path, method: Path) -> None:
-    wrong: Any = (lambda of: of.frame.alpha, "values; reduce it"), (lambda of: 0.5, "a Python number")
+    wrong: Any = (lambda of: of.frame.alpha, "type Float, from"), (lambda of: 0.5, "1 of type float")
     for value, words in wrong:
         with registered("wrong", value):
             refused(lambda: roughness_after(data, method, "loss.wrong=1.0"), "loss.wrong: ", words)
