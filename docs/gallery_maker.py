@@ -40,7 +40,7 @@ from mi_refgs.reconstruction import relight as relighting
 from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.new_light import NewLight
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import RELIT as RELIT_RECORD, Run
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.synthesis.make_dataset import make_dataset
 from mi_refgs.synthesis.options import DatasetOptions
@@ -224,7 +224,7 @@ def _fitted(
     data = make_dataset(scenes / f"{name}.xml", work / "data", relight=[light], progress=True, **traced)
     run, metrics = _evaluated(data, methods.for_purpose(PURPOSE), work / "run", settings)
     folder = Run(work / "run")
-    record = folder.path / "relight" / Path(LIGHT).stem / relighting.RESULT
+    record = folder.path / "relight" / Path(LIGHT).stem / RELIT_RECORD
     if not is_file(record):
         relighting.relight(folder, NewLight(light), samples=SAMPLES, progress=True)
     keys = (

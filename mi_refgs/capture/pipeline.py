@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -180,7 +181,8 @@ def report_text(c: dict[str, Any], folder: Path) -> str:
         lines.append(f"not placed: {', '.join(missing[:NAMED])}{more}; take more between them and the others")
     if c["mean_reprojection_error"] > 1:  # pixel: lens, rolling shutter or scene are wrong
         lines.append("the error is high: something moved, or the lens needs another --camera-model")
-    lines.append(f"look at {folder / PLOT}; next: refgs train {folder} -o runs/{folder.name}")
+    train = shlex.join(["refgs", "train", str(folder), "-o", f"runs/{folder.name}"])
+    lines.append(f"look at {folder / PLOT}; next: {train}")
     return "\n".join(lines)
 
 

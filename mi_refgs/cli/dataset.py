@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -49,6 +50,6 @@ class Dataset:
         text = (
             f"{folder}: {train} training and {test} test views"
             f"{', the latter also under ' if lights else ''}{', '.join(lights)}; "
-            f"next: refgs train {folder} -o runs/{folder.name}"
+            f"next: {shlex.join(['refgs', 'train', str(folder), '-o', f'runs/{folder.name}'])}"
         )
         return Result({**data, "relight": lights}, text)

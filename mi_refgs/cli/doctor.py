@@ -85,7 +85,7 @@ def _failure() -> str | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
-    """Exit code 1 means that the installation is unusable.
+    """Exit code 1 means that the installation is unusable, 2 that a fit refuses the data.
 
     example:
       refgs doctor data/glossy
@@ -99,11 +99,14 @@ class Doctor:
     def run(self) -> Result:
         """Examine the data set or the installation."""
         if self.data is not None:
-            from mi_refgs.data.survey import survey, survey_text, write_masks
+            from mi_refgs.data import checks, survey
 
-            found = survey(self.data)
-            written = {"masks written": write_masks(self.data, found)} if self.masks else {}
-            return Result(found | written, survey_text(found | written))
+            found = survey.survey(self.data)
+            if self.masks:
+                survey.write_masks(self.data, found)
+                found = survey.survey(self.data)
+            refused = any(check["result"] == checks.REFUSED for check in found["checks"].values())
+            return Result(found, survey.survey_text(found), 2 if refused else 0)
         if self.masks:
             raise InputError("no data set is given", "--masks", remedy="name its folder")
         report = examine()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,7 @@ class Train:
         text = (
             f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s "
             f"({taken:.0f} s in all), {trainer.surfels.count} surfels{beside}; "
-            f"next: refgs eval {self.output}{plugin_options()}"
+            f"next: refgs eval {shlex.quote(str(self.output))}{plugin_options()}"
         )
         if trainer.fit.decisions:
             data["decisions"] = trainer.fit.decisions

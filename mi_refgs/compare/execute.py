@@ -19,8 +19,7 @@ from mi_refgs.errors import InputError, require_between
 from mi_refgs.io.files import cannot_write, read_json
 from mi_refgs.runs.interrupt import held_interrupts
 
-Report = Callable[[Job, str | None], None]
-"""Called with each job that ended: the reason is None if it is done."""
+Report = Callable[[Job, str | None], None]  # of each job that ended: the reason is None if it is done
 LOG = "job.log"  # of a run folder: output of its processes
 RETRIES = 2  # restarts from the checkpoint of a job whose process was killed or crashed
 POLL = 0.2  # seconds between checks of processes and interrupts

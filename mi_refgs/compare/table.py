@@ -109,7 +109,10 @@ def table_of(folder: Path) -> Table:
             for job in jobs_of_row:
                 try:
                     if job.run.exists():
-                        _describe(row, job, table)
+                        method = job.run.method().about
+                        row.name, row.paper_row = method.name or row.variant, method.paper_row
+                        table.footnotes += [x for x in method.deviations if x not in table.footnotes]
+                        row.footnotes = [table.footnotes.index(text) + 1 for text in method.deviations]
                     done = finished(job)
                 except InputError as error:  # a config.toml of another version
                     row.failed[job.seed] = str(error)
@@ -134,14 +137,6 @@ def table_of(folder: Path) -> Table:
         require_one_size(str(folder), sizes, "remove the runs of one size, and fit them again in the other")
         table.scenes.append(scene)
     return table
-
-
-def _describe(row: Row, job: Job, table: Table) -> None:
-    """Fill in the method's title and its deviations, as footnotes that rows share."""
-    about = job.run.method().about
-    row.name, row.paper_row = about.name or row.variant, about.paper_row
-    table.footnotes += [text for text in about.deviations if text not in table.footnotes]
-    row.footnotes = [table.footnotes.index(text) + 1 for text in about.deviations]
 
 
 def _fill(row: Row, found: list[dict[str, Any]]) -> None:

@@ -23,8 +23,7 @@ CAMERA_SHARE = 0.8  # its largest radius over the nearest camera's distance: cam
 SAME = 1e-6  # difference of two regions, in radii, up to which they are the same: last digits of solvers
 SMALLEST = 1e-6  # least radius over the largest coordinate of a camera: float32 resolves no smaller lengths
 
-Plane = tuple[float, float, float, float]
-"""Unit normal (a, b, c) and offset d of the half-space a x + b y + c z ≥ d."""
+Plane = tuple[float, float, float, float]  # unit normal (a, b, c) and offset d of a x + b y + c z ≥ d
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ NORMALS = [f"normal.{axis}" for axis in AXES]
 COMPARISON = re.compile(r"\s*([A-Za-z_][\w.]*)\s*([<>]=?)\s*(\S+)\s*", re.ASCII)
 OPERATORS: dict[str, Callable[..., Any]]
 OPERATORS = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
-Condition = list[list[tuple[str, str, float]]]
-"""Groups of comparisons: those of at least one group are all true."""
+Condition = list[list[tuple[str, str, float]]]  # groups of comparisons: all those of one are true
 
 
 def parse_condition(text: str) -> Condition:

@@ -24,8 +24,7 @@ Maps = dict[str, np.ndarray]  # images by title, or maps by name
 LIGHT_KEY = 0.36  # average luminance of a displayed environment before the tone curve, which maps it to 0.55
 CELL_MIN = 128  # pixels: smaller images are enlarged by a whole factor
 MARGIN = 4  # pixels between images
-TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 14
-"""Heights of titles in pixels, and widths of images per height: the longest title then fits."""
+TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 14  # heights of titles, pixels, and widths of images per height
 BESIDE_GREYS = np.array([0.80, 0.87, 0.95])  # pale blue: on white, a metallic of 1 would not be visible
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 

@@ -27,8 +27,7 @@ PHASES = (
 """Every phase, in the order of a step. The adjoint of forward shading is in `surfels backward`, with the
 projection. `rest`: all that no other covers."""
 
-WARM_UP = 4
-"""Steps with barriers before the first measured one: a kernel that ends at a barrier is compiled anew."""
+WARM_UP = 4  # steps with barriers that are not measured: a kernel that ends at one is compiled anew
 NEAR_END = 100  # steps before the end of a stage, where every SH degree is in use
 
 

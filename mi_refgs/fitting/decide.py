@@ -93,7 +93,7 @@ class Decision(Event[Trainer]):
                 return Row(component, begin, False, reason)
             better = validation_psnr(run(rival, steps, trainer))
         except InputError as error:
-            return Row(component, begin, False, f"its fit failed: {error}")
+            return Row(component, begin, False, f"cannot be tried: {error}")
         plain = run(fork(trainer, trainer.method), steps, trainer)
         psnr = validation_psnr(plain)
         gained = better - psnr

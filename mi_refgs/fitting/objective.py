@@ -99,11 +99,6 @@ def _materials(inputs: LossInputs) -> Float | None:
     return losses.smoothness(maps, inputs.target.image, camera.width, camera.height, MATERIAL_EDGE)
 
 
-def _alpha(inputs: LossInputs) -> Float | None:
-    mask = inputs.target.alpha
-    return None if mask is None else losses.alpha_loss(inputs.frame.alpha, mask)
-
-
 def _photographed(inputs: LossInputs) -> Float | None:
     known, light = inputs.photographed, inputs.light
     return None if known is None or light is None else known.difference(light)
@@ -120,7 +115,12 @@ register_loss(
     Loss("light_colour", lambda of: None if of.light is None else losses.light_colour(of.light), light=True)
 )
 register_loss(Loss("photographed", _photographed, light=True))
-register_loss(Loss("alpha", _alpha))
+register_loss(
+    Loss(
+        "alpha",
+        lambda of: None if of.target.alpha is None else losses.alpha_loss(of.frame.alpha, of.target.alpha),
+    )
+)
 
 
 def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss[LossInputs]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -149,10 +150,9 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress, force: bo
         trainer.train(progress.step)
     except KeyboardInterrupt as error:
         kept = "" if run.checkpoints() else " (before the first iteration was done)"
-        raise type(error)(
-            f"interrupted at iteration {trainer.iteration}{kept}; "
-            f"resume with: refgs train {views.folder or 'DATA'} -o {output} --resume{plugin_options()}"
-        ) from None
+        again = shlex.join(["refgs", "train", str(views.folder or "DATA"), "-o", str(output), "--resume"])
+        what = f"interrupted at iteration {trainer.iteration}{kept}; resume with: {again}{plugin_options()}"
+        raise type(error)(what) from None
     except InputError as error:  # a full disk, no surfel left
         saved = run.checkpoints()
         kept = f" (saved up to iteration {int(saved[-1].stem)}; --resume goes on from there)" if saved else ""

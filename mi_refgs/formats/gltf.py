@@ -26,8 +26,7 @@ from mi_refgs.surfels.table import Surfels
 Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))  # glTF's world from ours
 Y_UP_QUATERNION = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)  # the same (x, y, z, w): the turn by -90° about x
 EXTENSION = "KHR_gaussian_splatting"
-FLOAT, POINTS, VERTICES = 5126, 0, 34962
-"""glTF's numbers of a component type, of a mode, and of a buffer's use."""
+FLOAT, POINTS, VERTICES = 5126, 0, 34962  # of a component type, of a mode, of a buffer's use
 
 
 def write_mesh(

@@ -136,13 +136,6 @@ def resource_dir(name: str) -> Path:
     raise InputError("the folder is missing from this installation", package, name, "install mi_refgs again")
 
 
-def remove_temporaries(folder: Path) -> None:
-    """Remove temporary files that killed processes have left in a folder."""
-    for path in folder.iterdir():
-        if TEMPORARY.fullmatch(path.name):
-            path.unlink(missing_ok=True)
-
-
 def is_file(path: Path) -> bool:
     """Whether a file exists; False for an impossible name."""
     try:

@@ -11,8 +11,7 @@ import mitsuba as mi
 from mi_refgs.errors import InputError
 from mi_refgs.shade.light.light_file import read_image, read_radiance
 
-IMAGES = {"envmap": read_radiance, "bitmap": lambda file: read_image(file)[0]}
-"""Readers of the files of Mitsuba's plugins."""
+IMAGES = {"envmap": read_radiance, "bitmap": lambda file: read_image(file)[0]}  # by plugin
 
 
 def load_scene(

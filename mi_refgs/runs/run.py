@@ -153,7 +153,9 @@ class Run:
         """Remove checkpoints and lines of the logs of later iterations, and files of killed processes."""
         self._make_folders()
         for folder in (self.path, self.path / "checkpoints", self.path / "previews"):
-            files.remove_temporaries(folder)
+            for path in folder.iterdir():  # that killed processes have left
+                if files.TEMPORARY.fullmatch(path.name):
+                    path.unlink(missing_ok=True)
         for path in self.checkpoints():
             if int(path.stem) > iteration:
                 path.unlink()

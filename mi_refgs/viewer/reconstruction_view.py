@@ -31,12 +31,10 @@ from mi_refgs.viewer.pose import Pose
 from mi_refgs.viewer.resolution import FINEST, SAMPLES
 
 IMAGE = "image"  # what is displayed unless an AOV is chosen
-BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}
-"""Display-encoded brightness behind the object, by name."""
+BACKDROPS = {"white": 1.0, "grey": 0.25, "black": 0.0}  # display-encoded, behind the object
 ENVIRONMENT, BACKGROUND = "environment map", "background"
 """More backdrops: with all but the photographed background the object only is displayed."""
-Change = Callable[[TrainedScene], TrainedScene]
-"""An edit of a scene that keeps number and order of its surfels."""
+Change = Callable[[TrainedScene], TrainedScene]  # keeps number and order of its surfels
 
 
 @dataclass(frozen=True)

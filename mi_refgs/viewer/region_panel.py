@@ -16,8 +16,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_json
 from mi_refgs.viewer.page import Page
 
-RADII, STEPS = (0.1, 3.0), 100
-"""Smallest and largest radius of the slider, in the first radius, and steps of a slider per radius."""
+RADII, STEPS = (0.1, 3.0), 100  # limits of the slider, in the first radius, and steps of a slider per radius
 OPPOSITE = 1e-6  # difference of unit normals up to which planes are opposite sides of a box
 
 

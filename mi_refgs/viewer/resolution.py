@@ -5,26 +5,19 @@ from __future__ import annotations
 
 import math
 
-SIDES = (141, 200, 283, 400, 566, 800, 1131, 1600)
-"""Resolution levels: side in pixels of the square of the same area."""
-COARSEST, FINEST = SIDES[0], SIDES[6]
-"""The coarsest level, and the finest unless the user chooses a finer one: 1.28 million pixels."""
-SHAPES = (0.625, 1.0, 1.6, 2.5)
-"""Aspect ratios, width over height. Between two of them pixels are oblong by up to 1.26."""
+SIDES = (141, 200, 283, 400, 566, 800, 1131, 1600)  # levels: of the square of the same area, pixels
+COARSEST, FINEST = SIDES[0], SIDES[6]  # levels, unless the user chooses a finer one: 1.28 million pixels
+SHAPES = (0.625, 1.0, 1.6, 2.5)  # width over height; between two of them pixels are oblong by up to 1.26
 MULTIPLE = 4  # width and height are multiples of this, the smallest tile
 
-STILL_AFTER, SMOOTH_AFTER = 0.15, 0.4
-"""Seconds without a change after which an image is drawn large, and after which it is supersampled."""
+STILL_AFTER, SMOOTH_AFTER = 0.15, 0.4  # seconds without a change until an image is drawn large, supersampled
 GRID = 4
 SAMPLES = GRID * GRID  # of a supersampled image: a raster of GRID × GRID per pixel, as in `render.samples`
-SLOW, FAST = 1 / 22, 1 / 60
-"""Seconds per image during motion above and below which the next image is a level coarser, or finer."""
+SLOW, FAST = 1 / 22, 1 / 60  # seconds per image in motion from which the next is a level coarser, or finer
 
-NOTHING, COARSE, LARGE = 0, 1, 2
-"""Progress of a display: no image of the present state, a coarse one, a large one of 1 sample, of 2, …"""
+NOTHING, COARSE, LARGE = 0, 1, 2  # images of the present state: none, a coarse one, a large one of 1 sample
 DONE = COARSE + SAMPLES
-SHOWN_AT = frozenset({COARSE, LARGE, COARSE + SAMPLES // 4, DONE})
-"""Progress at which images are sent: each has to be encoded and transferred."""
+SHOWN_AT = frozenset({COARSE, LARGE, COARSE + SAMPLES // 4, DONE})  # when images are encoded and sent
 
 
 def shape_of(width: int, height: int) -> float:

@@ -137,7 +137,7 @@ def test_constant_background_becomes_masks(tmp_path: Path, capsys: pytest.Captur
     for path in data.glob("*/*.png"):
         write_png(path, over_white(read_png(path)))
     assert main(["doctor", str(data), "--masks", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["masks written"] == 11
+    assert json.loads(capsys.readouterr().out)["with alpha"] == 11
     for view, alpha in zip(read_dataset(data, "train").views, before, strict=True):
         mask = view.load().alpha
         assert (mask <= alpha).all() and mask.sum() > 0.6 * alpha.sum()  # type: ignore[union-attr, operator]

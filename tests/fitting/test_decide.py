@@ -134,9 +134,8 @@ def test_components_stay_by_their_gain_alone(
 
 def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> None:
     """Those of tables that the other method has not are left out; what Python changed is kept."""
-    settings = ["loss.ssim=0.3", "light.height=16", "event.mesh.resolution=9"]
-    settings.append("stage.deferred.traced_bounces=1")
-    own = methods.load(file, "quick", [*SETTINGS, *settings])
+    given = ["loss.ssim=0.3", "light.height=16", "event.mesh.resolution=9", "stage.deferred.traced_bounces=1"]
+    own = methods.load(file, "quick", [*SETTINGS, *given])
     own = replace(own.downscaled(3), seed=5)
     (decision,) = (x for name, x in own.event.items() if name == "colour_alone")
     assert isinstance(decision, Decision)
@@ -148,6 +147,8 @@ def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> No
     decided = as_decided(own, rows)
     assert decided == replace(chosen, surfels=replace(chosen.surfels, capacity=2.0))
     assert as_decided(decided, rows) == decided
+    with pytest.raises(InputError, match="light: it is given"):
+        decision.chosen(methods.load(file, "quick", [*SETTINGS, "light.turntable=true"]), "colour_alone")
 
 
 def test_a_fork_keeps_common_parameters(method: Method, views: Dataset) -> None:
@@ -241,8 +242,7 @@ def test_what_cannot_be_tried_is_said(
     method: Method, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     late = fitted(replace(method, iterations=3), views, tmp_path / "late")
-    assert [row["reason"] for row in late.fit.decisions] == ["too late in the fit"]
-    assert late.iteration == 3
+    assert [row["reason"] for row in late.fit.decisions] == ["too late in the fit"] and late.iteration == 3
 
     ended = without(method, "colour_alone", "densify")
     found = fitted(ended, views, tmp_path / "ended").fit.decisions

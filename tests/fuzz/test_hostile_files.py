@@ -79,8 +79,8 @@ def test_images_with_huge_sizes_are_refused(tmp_path: Path) -> None:
     large = "a.exr: size: 32768 × 8193 pixels are more than 268 million"
     for corner, words in (((2**15 - 1, 2**13), large), ((-5, 3), ""), ((2**31 - 1, 2**31 - 1), "")):
         other = good.replace(window, struct.pack("<4i", 0, 0, *corner)) + bytes(2**22)
-        for read in (read_exr_image, image_size, EnvironmentLight.from_file):
-            refuse_file(read, tmp_path / "a.exr", other, words)
+        for reader in (read_exr_image, image_size, EnvironmentLight.from_file):
+            refuse_file(reader, tmp_path / "a.exr", other, words)
 
 
 @pytest.mark.parametrize("first", [b"#?RADIANCE\n\n-Y 100000 +X 100000\n", b"PF\n100000 100000\n-1.0\n"])

@@ -196,7 +196,7 @@ def test_mesh_file_round_trip(tmp_path: Path) -> None:
     """Vertices, faces, voxel, and the empty mesh; foreign files get a voxel from their edges."""
     solid = trimesh.creation.icosphere(2)
     mesh = meshes.Mesh(solid.vertices, solid.faces, 0.0123)  # of trimesh's types
-    assert (type(mesh.vertices), mesh.vertices.dtype, mesh.faces.dtype) == (np.ndarray, np.float32, np.uint32)
+    assert type(mesh.vertices) is np.ndarray and [mesh.vertices.dtype, mesh.faces.dtype] == ["f4", "u4"]
     for case in (mesh, meshes.Mesh.empty(0.5)):
         meshes.write_mesh(tmp_path / "mesh.ply", case)
         back = meshes.read_mesh(tmp_path / "mesh.ply")

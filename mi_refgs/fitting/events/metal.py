@@ -53,7 +53,7 @@ class Metal(Event[Trainer]):
         views = [trainer.data.views[i] for i in evenly_spread(len(trainer.data.views), JUDGED_VIEWS)]
         errors = [[_squared_error(fit, view) for view in views] for fit in fits]
         dielectric, metal = (psnr_of(float(np.mean([error.mean() for error in one]))) for one in errors)
-        gain = required_gain(len(trainer.data.views))
+        gain = METAL_GAIN * max(MANY_VIEWS / len(trainer.data.views), 1) ** 0.5
         is_metal = metal >= dielectric + gain
         trainer.take(fits[is_metal], trainer.method)
         trainer.fit.optimiser.factors["metallic"] = 1.0
@@ -70,11 +70,6 @@ class Metal(Event[Trainer]):
         )
         row = Row(self.name, 0, bool(is_metal), reason, dielectric, metal)
         conclude(trainer, row, began, f"continues as {'metal' if is_metal else 'dielectric'}")
-
-
-def required_gain(views: int) -> float:
-    """dB by which so many training views have to be explained better as metal."""
-    return METAL_GAIN * max(MANY_VIEWS / views, 1) ** 0.5
 
 
 def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:

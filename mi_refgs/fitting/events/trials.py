@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from mi_refgs import methods
+from mi_refgs.errors import InputError
 from mi_refgs.fitting.decide import Decision, Trial
 from mi_refgs.fitting.events.densify import fill
 from mi_refgs.fitting.train import Trainer
@@ -28,7 +29,9 @@ class ColourAlone(Decision, Trial):
 
     def chosen(self, method: Method, component: str) -> Method:
         """The other method, with the length, the size of images and the settings of this one, but for those
-        of tables that the other has not, such as those of its light."""
+        of tables that the other has not. Raises InputError for a light that is given, which it has not."""
+        if method.light is not None and (method.light.turntable or method.light.name != "learnt"):
+            raise InputError("it is given", field="light")
         preset = method.preset or f"{method.iterations}:{method.surfels.max_count}"
         plain = methods.plain(methods.load(self.method, preset))
         fitting = [text for text in method.assignments if _has_table(plain, text)]

@@ -21,7 +21,7 @@ from tests.scenes.tiny import SETTINGS, SIZE, write_data, write_method
 
 TRIAL = "event.metal.trial=4"
 VIEWS = 6
-GAIN = event.required_gain(VIEWS)  # few: more than METAL_GAIN
+GAIN = event.METAL_GAIN * (event.MANY_VIEWS / VIEWS) ** 0.5
 
 
 @pytest.fixture(scope="module")
