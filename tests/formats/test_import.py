@@ -161,7 +161,7 @@ FACES = b"element face 0\nproperty list uchar int vertex_indices\n"
         (HEADER + b"x\n" + FACES + b"end_header\n0\n", "vertex: a mesh, no Gaussians"),
         (b"<!DOCTYPE html>\n", "not a PLY file but a web page"),
         (b"PK\x03\x04" + bytes(26) + b"archive/data.pkl", "not a PLY file but PyTorch's or a zip file"),
-        (gzip.compress(b"hello"), "a compressed file, but not SPZ; decompress it first"),
+        (gzip.compress(b"hello", mtime=0), "a compressed file, but not SPZ; decompress it first"),
         (b"hello\n", "not a PLY file; give the PLY file of 3DGS or 2DGS"),
         (None, "unusable are 40 of 40 rows: 0 with NaN or infinity, 40 with zero rotation"),
     ],
