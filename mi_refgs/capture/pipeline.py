@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -28,7 +27,7 @@ from mi_refgs.data.region import Region, write_region
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import read_json, replace_file, write_json
 from mi_refgs.io.images import image_size
-from mi_refgs.io.progress import with_bar
+from mi_refgs.io.progress import command_line, with_bar
 
 PLOT = "capture.png"
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
@@ -181,9 +180,8 @@ def report_text(c: dict[str, Any], folder: Path) -> str:
         lines.append(f"not placed: {', '.join(missing[:NAMED])}{more}; take more between them and the others")
     if c["mean_reprojection_error"] > 1:  # pixel: lens, rolling shutter or scene are wrong
         lines.append("the error is high: something moved, or the lens needs another --camera-model")
-    train = shlex.join(["refgs", "train", str(folder), "-o", f"runs/{folder.name}"])
-    lines.append(f"look at {folder / PLOT}; next: {train}")
-    return "\n".join(lines)
+    train = command_line("train", folder, "-o", f"runs/{folder.name}")
+    return "\n".join([*lines, f"look at {folder / PLOT}; next: {train}"])
 
 
 def draw(path: Path, world: Solved, region: Region) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ from tyro.conf import Positional, arg
 
 from mi_refgs.cli.command import Flag, Output, Rendering, Result, optional, separated
 from mi_refgs.errors import InputError
+from mi_refgs.io.progress import command_line
 from mi_refgs.synthesis.options import DatasetOptions
 
 
@@ -50,6 +50,6 @@ class Dataset:
         text = (
             f"{folder}: {train} training and {test} test views"
             f"{', the latter also under ' if lights else ''}{', '.join(lights)}; "
-            f"next: {shlex.join(['refgs', 'train', str(folder), '-o', f'runs/{folder.name}'])}"
+            f"next: {command_line('train', folder, '-o', f'runs/{folder.name}')}"
         )
         return Result({**data, "relight": lights}, text)

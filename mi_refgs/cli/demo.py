@@ -8,7 +8,7 @@ from typing import Any
 from mi_refgs.cli.command import Output, Preset, Rendering, Result, Settings, joined
 from mi_refgs.cli.evaluate import table
 from mi_refgs.io.files import resource_dir
-from mi_refgs.io.progress import say
+from mi_refgs.io.progress import command_line, say
 from mi_refgs.registry import plugin_options
 
 SCENE = "glossy_demo.xml"
@@ -53,6 +53,7 @@ class Demo:
         result, sheet = read_metrics(folder), output / SHEET
         if result is None or result.get("iterations") != found.trained.iteration or not sheet.is_file():
             result = found.evaluate(progress=True)
-        text = f"{table(result)}\ncontact sheet: {sheet}; next: refgs view {output}{plugin_options()}"
+        then = command_line("view", output) + plugin_options()
+        text = f"{table(result)}\ncontact sheet: {sheet}; next: {then}"
         paths = {"contact_sheet": str(sheet), "run": str(output), "data": str(data)}
         return Result({**paths, "metrics": result}, text)

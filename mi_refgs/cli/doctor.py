@@ -101,10 +101,9 @@ class Doctor:
         if self.data is not None:
             from mi_refgs.data import checks, survey
 
-            found = survey.survey(self.data)
             if self.masks:
-                survey.write_masks(self.data, found)
-                found = survey.survey(self.data)
+                survey.write_masks(self.data)
+            found = survey.survey(self.data)
             refused = any(check["result"] == checks.REFUSED for check in found["checks"].values())
             return Result(found, survey.survey_text(found), 2 if refused else 0)
         if self.masks:

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 from mi_refgs.cli.command import Cameras, Flag, Output, Preset, Rendering, Result, optional
 from mi_refgs.editing.options import Six
 from mi_refgs.errors import InputError, counted
+from mi_refgs.io.progress import command_line
 
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera
@@ -85,6 +86,6 @@ class Import:
         text = (
             f"{self.output}: {trained.iteration} iterations in {trained.seconds:.0f} s, "
             f"{trained.surfels.count} surfels, fitted to views in {dataset}; "
-            f"next: refgs relight {self.output} --envmap MAP.exr"
+            f"next: {command_line('relight', self.output, '--envmap', 'MAP.exr')}"
         )
         return Result(data, text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from mi_refgs.cli.command import (
     joined,
     optional,
 )
+from mi_refgs.io.progress import command_line
 from mi_refgs.registry import plugin_options
 
 
@@ -68,7 +68,7 @@ class Train:
         text = (
             f"{self.output}: {trainer.iteration} iterations in {trainer.fit.seconds:.0f} s "
             f"({taken:.0f} s in all), {trainer.surfels.count} surfels{beside}; "
-            f"next: refgs eval {shlex.quote(str(self.output))}{plugin_options()}"
+            f"next: {command_line('eval', self.output)}{plugin_options()}"
         )
         if trainer.fit.decisions:
             data["decisions"] = trainer.fit.decisions

@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import itertools
 import os
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.fitting.decide import differences
 from mi_refgs.io.files import read_json, write_json
 from mi_refgs.io.ownership import RUN, own_folder
+from mi_refgs.io.progress import command_line
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
@@ -133,7 +133,7 @@ def begin(folder: Path, planned: Sequence[Job], workers: int, arguments: Sequenc
         "preset": planned[0].preset,
         "set": list(planned[0].settings),
         "workers": workers,
-        "command": shlex.join(["refgs", *arguments]),
+        "command": command_line(*arguments),
         "version": __version__,
     }
     write_json(folder / SETTINGS, about, indent=2)

@@ -60,10 +60,10 @@ def survey(folder: Path) -> dict[str, Any]:
     }
 
 
-def write_masks(folder: Path, found: dict[str, Any]) -> int:
-    """Write masks of images with a plain backdrop by their survey, without the pixels that mix it with
-    the object; returns their number. Raises InputError for other images, and for a folder that has masks."""
-    if found["checks"].get("background", {}).get("result") != SAID:
+def write_masks(folder: Path) -> None:
+    """Write masks of images with a plain backdrop, without the pixels that mix it with the object. Raises
+    InputError for other images, and for a folder that has masks."""
+    if survey(folder)["checks"].get("background", {}).get("result") != SAID:
         raise InputError("no plain background", folder, "--masks", "segment the object by another program")
     files = list[Path]()
     for split in ("train", "test"):
@@ -78,7 +78,6 @@ def write_masks(folder: Path, found: dict[str, Any]) -> int:
         alike[[0, -1]], alike[:, [0, -1]] = True, True
         label = ndimage.label(alike)[0]
         write_png(masks / name, ~ndimage.binary_dilation(label == label[0, 0])[1:-1, 1:-1])
-    return len(files)
 
 
 def survey_text(found: dict[str, Any]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from mi_refgs.fitting.per_view import gains_of
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import resource_dir
+from mi_refgs.io.progress import command_line
 from mi_refgs.methods.method import POSE, Method
 from mi_refgs.registry import plugin_options
 from mi_refgs.runs.export import write_if_stale
@@ -150,7 +150,7 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress, force: bo
         trainer.train(progress.step)
     except KeyboardInterrupt as error:
         kept = "" if run.checkpoints() else " (before the first iteration was done)"
-        again = shlex.join(["refgs", "train", str(views.folder or "DATA"), "-o", str(output), "--resume"])
+        again = command_line("train", views.folder or "DATA", "-o", output, "--resume")
         what = f"interrupted at iteration {trainer.iteration}{kept}; resume with: {again}{plugin_options()}"
         raise type(error)(what) from None
     except InputError as error:  # a full disk, no surfel left

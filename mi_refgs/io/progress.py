@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
-
 _NOTED: set[tuple[Path, str]] = set()
 
 
@@ -29,6 +29,11 @@ def note(path: Path, what: str) -> None:
     if (path.parent, what) not in _NOTED:
         _NOTED.add((path.parent, what))
         warn(f"{path}: {what}")
+
+
+def command_line(*words: object) -> str:
+    """A `refgs` command as a shell reads it."""
+    return shlex.join(["refgs", *map(str, words)])
 
 
 def progress_bar(total: int, what: str, **options: Any) -> Any:

@@ -45,9 +45,7 @@ class NewLight:
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
 
 
-AnyLight: TypeAlias = (
-    NewLight | EnvironmentLight | str | Path | np.ndarray
-)  # the last: linear radiance (h, w, 3)
+AnyLight: TypeAlias = NewLight | EnvironmentLight | str | Path | np.ndarray  # linear radiance (h, w, 3)
 
 
 def any_light(light: AnyLight, world: bool, rotate: float, exposure: float) -> EnvironmentLight:

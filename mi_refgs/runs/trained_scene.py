@@ -133,9 +133,8 @@ class TrainedScene:
         with dr.suspend_grad():
             light = self.shading.light_of(self.light)
         occluder = Occluder(self.mesh)
-        turntable, around = self.turntable if turning else None, light
-        if turntable is not None:
-            around = self.shading.light_of(EnvironmentLight.constant())
+        turntable = self.turntable if turning else None
+        around = light if turntable is None else self.shading.light_of(EnvironmentLight.constant())
         update_occluder_caches(occluder, self.surfels, around, self.shading)
         given = (light, occluder, self.surroundings, self.near, turntable)
         scene = SurfelScene(self.surfels, self.shading, *given)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,6 +13,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import REGION_FILE, Plane, Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_json
+from mi_refgs.io.progress import command_line
 from mi_refgs.viewer.page import Page
 
 RADII, STEPS = (0.1, 3.0), 100  # limits of the slider, in the first radius, and steps of a slider per radius
@@ -80,7 +80,7 @@ def save_region(region: Region, data: Dataset, again: bool = False) -> str:
         raise InputError("exists, and is no estimate", data.path / REGION_FILE, "output", remedy)
     moved = replace(region, estimated=False).moved(np.array(data.offset))
     write_json(data.path / REGION_FILE, moved.content)
-    return f"saved `{data.path / REGION_FILE}`; next: `refgs train {shlex.quote(str(data.path))} -o RUN`"
+    return f"saved `{data.path / REGION_FILE}`; next: `{command_line('train', data.path, '-o', 'RUN')}`"
 
 
 def support_planes(planes: Sequence[Plane]) -> Sequence[Plane]:
