@@ -9,8 +9,6 @@ Letters     N surfels, M surfel-tile pairs, P pixels, K channels, α opacity aft
             T transmittance, w = αT, δx the adjoint of x, a_from_b an index map.
 """
 
-from __future__ import annotations
-
 import math
 
 MAX_NUMBER = 1e9  # largest |number| in a method or transforms file: its square fits float32

@@ -1,7 +1,5 @@
 """Exceptions for input that a user can fix, and values in their messages."""
 
-from __future__ import annotations
-
 import math
 from typing import Self
 

@@ -4,8 +4,6 @@ LLVM 15 and 16 abort the process at the first kernel that takes a minimum. Only 
 imported at the top: the set-up script runs `python -P mi_refgs/llvm.py` before anything is installed.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import platform

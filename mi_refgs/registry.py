@@ -1,7 +1,5 @@
 """Registries of named objects that users can extend, and plugins: the files that extend them."""
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import importlib.metadata

@@ -1,7 +1,5 @@
 """Every test starts under one variant with Dr.Jit's defaults, and leaves nothing behind for the next one."""
 
-from __future__ import annotations
-
 import gc
 import os
 import shutil

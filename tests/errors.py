@@ -3,8 +3,6 @@
 Read the file as a list: each sentence names the file, the field and the remedy.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

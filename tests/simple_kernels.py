@@ -3,8 +3,6 @@
 Import before Dr.Jit. With REFGS_TESTS_OPTIMISED=1, LLVM compiles as it does for users.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 from pathlib import Path

@@ -1,8 +1,6 @@
 """COLMAP through pycolmap: features, pairs, matches, reconstruction and lens; silent and deterministic.
 Features and matches are in a database, to which a second run adds. [Schönberger and Frahm 2016]"""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -214,7 +212,7 @@ class Solved:
         return self.rotation[:, 2]
 
     @classmethod
-    def of(cls, model: Reconstruction) -> Solved:
+    def of(cls, model: Reconstruction) -> "Solved":
         images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
         poses = [image.cam_from_world() for image in images]
         cameras = [model.cameras[image.camera_id] for image in images]

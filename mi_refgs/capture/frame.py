@@ -1,8 +1,6 @@
 """World frame of a capture: +z against gravity, the region of interest is the unit ball around the origin.
 Rotation, position and scale are estimated from how cameras are held and where they look."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The data set of a capture: undistorted images and masks, and COLMAP's files of pinhole cameras."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Sequence
@@ -39,7 +37,7 @@ class Straight:
     undo: Undistortion | None  # None without distortion: images are unchanged
 
     @classmethod
-    def of(cls, camera: Any, size: tuple[int, int]) -> Straight:
+    def of(cls, camera: Any, size: tuple[int, int]) -> "Straight":
         """The camera for images of `size`, from a pycolmap.Camera of the working copies."""
         values = dict(zip(MODELS[camera.model_name][1].split(), camera.params, strict=True))
         known = Camera(camera.model_name, camera.width, camera.height, values)

@@ -1,7 +1,5 @@
 """Photographs and their masks: orientation, focal length, and reduced copies for feature detection."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Sequence

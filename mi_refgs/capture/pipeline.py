@@ -2,8 +2,6 @@
 The folder `.work` contains the results of steps, and the hash of their inputs: an interrupted run goes on,
 and other photographs or options begin anew."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

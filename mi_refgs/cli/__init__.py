@@ -1,8 +1,6 @@
 """`refgs …`: the table of commands, the parser, and errors as sentences with exit codes. A new command is a
 module with a dataclass (see command.py) and a line of COMMANDS."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import inspect

@@ -1,7 +1,5 @@
 """`refgs capture`: a data set with cameras from a folder of photographs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

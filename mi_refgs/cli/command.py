@@ -2,8 +2,6 @@
 fields are its options (tyro reads names, types, defaults, and comments beside them or strings below; one is
 `common`, a `Common`), with a method `run` that returns a `Result`."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterable

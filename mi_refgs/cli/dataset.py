@@ -1,7 +1,5 @@
 """`refgs dataset`: a multi-view data set of a Mitsuba scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """`refgs demo`: data set, fit and evaluation of a small scene of the package."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`refgs doctor`: state of the installation or of a data set, problems, and the command that solves each."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """`refgs edit`: a new run with other materials and arrangement."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from mi_refgs.cli.command import Output, Rendering, Result, RunFolder, joined

@@ -1,7 +1,5 @@
 """`refgs eval`: metrics of a run on its test views."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

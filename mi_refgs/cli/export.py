@@ -1,7 +1,5 @@
 """`refgs export`: the files of a run, its own and those of other programs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, make_dataclass
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """`refgs profile`: where the time of a training step goes."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`refgs relight`: a run under another environment map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

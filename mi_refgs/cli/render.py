@@ -1,7 +1,5 @@
 """`refgs render`: scenes that Mitsuba's own command line, which has no Python, cannot render."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """`refgs train`: fit surfels, materials and an environment map to a data set."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`refgs view`: a page that renders a run in the browser."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

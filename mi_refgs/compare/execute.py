@@ -1,7 +1,5 @@
 """Runs jobs, each in a process of its own: several at once on this machine, or on dask.distributed."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,8 +1,6 @@
 """The jobs of a comparison: one per data set, method and seed, each with its own run folder. Files of a
 comparison beside its runs: compare.json (settings), table.json and table.md."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools
@@ -73,7 +71,7 @@ class Job(Shared):
         self.run.write_json(JOB, dataclasses.asdict(self))
 
     @staticmethod
-    def read(folder: Path) -> Job:
+    def read(folder: Path) -> "Job":
         """Read the job of a run folder; raises InputError for another file."""
         content = read_json(folder / JOB)
         try:

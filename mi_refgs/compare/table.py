@@ -1,7 +1,5 @@
 """The table of a comparison: mean ± standard deviation over seeds per scene and method."""
 
-from __future__ import annotations
-
 import json
 import statistics
 from collections.abc import Sequence
@@ -30,7 +28,7 @@ class Statistic:
     values: tuple[float, ...]
 
     @staticmethod
-    def of(values: Sequence[float]) -> Statistic:
+    def of(values: Sequence[float]) -> "Statistic":
         """Return the statistic of at least one value."""
         sd = statistics.stdev(values) if len(values) > 1 else None
         return Statistic(statistics.fmean(values), sd, tuple(map(float, values)))

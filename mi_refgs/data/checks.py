@@ -1,8 +1,6 @@
 """What is looked at before the first step of a fit, and by `refgs doctor DATA`: cameras are compared with
 points, images with those of neighbouring cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -2,8 +2,6 @@
 Every eighth image by name is a test view, unless `test.txt` beside the reconstruction lists them. Of several
 reconstructions, the one with most images is read."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 from glob import glob

@@ -1,8 +1,6 @@
 """COLMAP's model files: read as text or binary, written as text. COLMAP's own library is an extra, and
 allocates what a file promises before it compares the file's length."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Exposure and white balance: the gains that fit a render to an image."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mi_refgs.data.view import View

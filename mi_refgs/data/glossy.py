@@ -2,8 +2,6 @@
 (nearer than 14.5: the object), and `i-camera.pkl`, a pickled list of the pose (3 × 4, world to camera,
 OpenCV's axes) and K (3 × 3). Every eighth image by number is a test view. [Liu et al., SIGGRAPH 2023]"""
 
-from __future__ import annotations
-
 import pickletools
 import re
 from dataclasses import replace

@@ -1,8 +1,6 @@
 """Initial points: on and in the visual hull of alpha masks, or in a box, and their colours. `bounds` is a (2,
 3) array: the lowest and highest corner of a box."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

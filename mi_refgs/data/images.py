@@ -2,8 +2,6 @@
 file is decoded, its colour multiplied by alpha (its own, or that of a mask), averaged over blocks of pixels,
 undistorted and composited onto the background. An orientation in EXIF data is ignored, as in COLMAP."""
 
-from __future__ import annotations
-
 import os
 import re
 import threading
@@ -66,7 +64,7 @@ class ImageFile:
     undistortion: Undistortion | None = None  # of the averaged image
 
     @classmethod
-    def of(cls, path: Path, downscale: int, mask: Mask | None = None) -> ImageFile:
+    def of(cls, path: Path, downscale: int, mask: Mask | None = None) -> "ImageFile":
         """The image in a file, of which only the header is read."""
         width, height = image_size(path)
         if min(width, height) < downscale:
@@ -138,7 +136,7 @@ class Pixels(NamedTuple):
     def has_alpha(self) -> bool:
         return self.alpha is not None
 
-    def without_alpha(self) -> Pixels:
+    def without_alpha(self) -> "Pixels":
         return Pixels(self.image)
 
 
@@ -190,7 +188,7 @@ class ImageSource:
     cache: ImageCache
     has_alpha: bool  # if False, alpha of the file is ignored
 
-    def without_alpha(self) -> ImageSource:
+    def without_alpha(self) -> "ImageSource":
         return replace(self, has_alpha=False)
 
     def read(self) -> Pixels:

@@ -8,8 +8,6 @@ With (x, y) = direction / depth and r² = x² + y², a lens distorts the image o
 
 and to the pixel (fx x' + cx, fy y' + cy), where the centre of the first pixel is (½, ½)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -37,7 +35,7 @@ class Lens:
     tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2
 
     @staticmethod
-    def of(fisheye: bool, given: Mapping[str, float]) -> Lens | None:
+    def of(fisheye: bool, given: Mapping[str, float]) -> "Lens | None":
         """The lens with the given coefficients, 0 where absent; None for a pinhole."""
         k1, k2, k3, k4, p1, p2 = (given.get(name, 0.0) for name in COEFFICIENTS)
         if not (fisheye or any((k1, k2, k3, p1, p2))):

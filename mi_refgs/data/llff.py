@@ -4,8 +4,6 @@ One row per image by name: a 3 × 5 matrix by rows, nearest and farthest depth. 
 axes in the world (down, right, backwards), its position, and height, width and focal length in pixels. Every
 eighth image is a test view. [Mildenhall et al., Local Light Field Fusion, SIGGRAPH 2019]"""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

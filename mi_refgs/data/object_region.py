@@ -2,8 +2,6 @@
 group of close points that most views show. Before a fit, the sphere estimated from the cameras grows until it
 contains that group; during a fit, with points on all surfaces, a sphere and more planes enclose it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

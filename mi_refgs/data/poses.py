@@ -1,7 +1,5 @@
 """Conversion of other programs' cameras to Mitsuba's camera frame: +z forward, +x left, +y up."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

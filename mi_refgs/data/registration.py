@@ -2,8 +2,6 @@
 from averaged images to whole ones, on differences as displayed; derivatives are differences of renders.
 [Lucas and Kanade 1981; coarse to fine: Bergen et al. 1992]"""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

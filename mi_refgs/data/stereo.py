@@ -2,8 +2,6 @@
 Patches of each view are compared with its neighbours at a series of depths [Collins 1996]; a pixel becomes a
 point if the patches at its best depth look alike, and the best depths of other views agree with it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Survey of a data set for `refgs doctor FOLDER`: what was recognised, what it contains, what is missing."""
 
-from __future__ import annotations
-
 import contextlib
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor

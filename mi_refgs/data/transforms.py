@@ -8,8 +8,6 @@ Keys, per frame or for the whole file: `camera_angle_x` (radians) or `fl_x`, `ca
 without alpha, the file of the image's name in `masks` is the mask. `ply_file_path` names points in the frame
 of the poses; `train_filenames` and `test_filenames` (or `val_filenames`) list the images of a split."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -64,7 +62,7 @@ class Frame:
     given: dict[str, Any]  # the same, and those of the whole file that it lacks
 
     @staticmethod
-    def all_of(file: Path) -> list[Frame]:
+    def all_of(file: Path) -> "list[Frame]":
         content = read_json(file)
         frames = content.get("frames")
         if not isinstance(frames, list):

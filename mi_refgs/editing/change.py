@@ -1,7 +1,5 @@
 """An edit of a scene: changes of selected surfels and of their triangles, and the notes for the user."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -35,7 +33,7 @@ class Assignment:
     text: str  # as it was written
 
     @staticmethod
-    def parse(text: str) -> Assignment:
+    def parse(text: str) -> "Assignment":
         """Parse `name=value` or `name*=value` with numbers between commas; raises InputError."""
         try:
             name, sign, values = ASSIGNMENT.fullmatch(text).groups()  # type: ignore[union-attr]

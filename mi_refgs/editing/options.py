@@ -1,7 +1,5 @@
 """Options of an edit: which surfels, and what is done to them. `refgs edit` reads its own from here."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Selection of surfels by their values, such as `metallic > 0.5 and z < 0`, and their positions."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

@@ -2,8 +2,6 @@
 unknown scale per channel: albedo is compared after one least-squares scale for all pixels of all views, the
 light after its own (`metrics.environment`); both are reported."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any

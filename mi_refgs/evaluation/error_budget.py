@@ -1,8 +1,6 @@
 """Error budget: how the squared error of test images divides among silhouettes, creases and smooth surfaces.
 Pixels are classified by ground truth alone, so that the classes of two runs on one data set are the same."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Evaluate a run on the test views of its data set: metrics.json, renders, a contact sheet."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

@@ -2,8 +2,6 @@
 floats, clamped to [0, 1] and never quantised; normals (H, W, 3) world vectors; environment maps (h, w, 3)
 linear lat-long radiance in Mitsuba's orientation. A data set's value is the mean over its images."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Callable, Sequence

@@ -2,8 +2,6 @@
 listens to the hooks of `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit: identities at the
 boundaries between phases notify the clock of the phase that the pass has reached."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import Callable

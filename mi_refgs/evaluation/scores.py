@@ -1,7 +1,5 @@
 """The numbers of metrics.json that `refgs eval` prints and `refgs compare` tabulates."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

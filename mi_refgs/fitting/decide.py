@@ -3,8 +3,6 @@
 Only errors and counts decide, never a clock: the same command decides the same on every machine.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field

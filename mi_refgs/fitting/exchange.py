@@ -5,8 +5,6 @@ SH; one of the background that is as far inside becomes one of the object, whose
 method says. Neither has a history. A table keeps one surfel at least, and may exceed what its method allows.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mi_refgs.data.region import Region

@@ -3,8 +3,6 @@
 The optimiser does not apply such steps, so the state is always the last good one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Displayed images of a fit as NumPy arrays, and their errors."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """Initial parameters of a fit: surfels where an initialiser says, the background, and the light."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

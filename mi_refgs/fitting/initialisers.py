@@ -1,7 +1,5 @@
 """Where surfels start: functions from data and random draws to points, each registered under its name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

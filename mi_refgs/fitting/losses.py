@@ -5,8 +5,6 @@ unit). Every loss is of width 1, is zero for a perfect image, and has finite gra
 Targets, weights and masks have no derivative.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import drjit as dr

@@ -10,8 +10,6 @@ OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half 
 to RAW_LIMIT, whose square float32 can represent: else v would stop an entry after one huge gradient.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Mapping, MutableMapping

@@ -9,8 +9,6 @@ A step subtracts the mean over the views, that of corrections along the world's 
 brightness and its place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import drjit as dr

@@ -1,8 +1,6 @@
 """The light that photographs show: a panorama of the fitted background, near which the environment map stays.
 What no photograph shows, such as a ceiling, is left to the reflections."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,7 +40,7 @@ class PhotographedLight:
     @staticmethod
     def of(
         surfels: Surfels, surroundings: Surroundings, region: Region, views: Sequence[View], height: int
-    ) -> PhotographedLight:
+    ) -> "PhotographedLight":
         """Render the background from the region's centre, with `height` rows; what views show counts."""
         centre, radius = np.array(region.centre), region.radius
         seen = panorama(surroundings, centre, height, NEAR * radius)
@@ -82,7 +80,7 @@ class PhotographedLight:
         return {name: getattr(self.panorama, name) for name in PANORAMA} | {"weight": self.weight}
 
     @staticmethod
-    def restored(arrays: Mapping[str, np.ndarray]) -> PhotographedLight:
+    def restored(arrays: Mapping[str, np.ndarray]) -> "PhotographedLight":
         """Restore `arrays`, bit for bit."""
         return PhotographedLight(Panorama(*(arrays[name] for name in PANORAMA)), arrays["weight"])
 

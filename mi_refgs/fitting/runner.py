@@ -1,7 +1,5 @@
 """A fit from data to artefacts: chooses method and image size, begins or resumes a run, finishes it."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence

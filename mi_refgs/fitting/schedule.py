@@ -1,7 +1,5 @@
 """What follows from the method, the data and the iteration number alone, and lights that steps share."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property

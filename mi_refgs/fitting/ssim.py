@@ -6,8 +6,6 @@ G is symmetric and reads zeros outside the image, hence Gᵀ = G and the adjoint
     δx = G(∂S/∂μx) + 2x G(∂S/∂q) + y G(∂S/∂p).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence

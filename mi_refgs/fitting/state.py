@@ -9,8 +9,6 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
     iteration  seconds  held_until  decisions  region  light_gradient
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Mapping, MutableMapping
@@ -143,14 +141,14 @@ class FitState:
     light_kind: LightKind | None = None  # of the method
 
     @staticmethod
-    def start(setup: FitSetup) -> FitState:
+    def start(setup: FitSetup) -> "FitState":
         """The state before the first step."""
         draws = setup.rng(0, "start")
         params = initial_parameters(setup.method, setup.data, draws, setup.open_scene)
         return FitState._assembled(setup, params, Occluder())
 
     @staticmethod
-    def _assembled(setup: FitSetup, params: dict[str, TensorXf], occluder: Occluder) -> FitState:
+    def _assembled(setup: FitSetup, params: dict[str, TensorXf], occluder: Occluder) -> "FitState":
         optimiser, method = Adam(params, setup.groups(params)), setup.method
         limits = {"": method.surfels.most}
         if setup.open_scene and method.surroundings is not None:
@@ -235,7 +233,7 @@ class FitState:
         return state
 
     @staticmethod
-    def from_arrays(setup: FitSetup, state: Mapping[str, np.ndarray]) -> FitState:
+    def from_arrays(setup: FitSetup, state: Mapping[str, np.ndarray]) -> "FitState":
         """Restore the content of a checkpoint of this setup, bit for bit."""
         made = FitState._assembled(setup, checkpoint.tensors(state, PARAMS), _occluder_of(state))
         made.optimiser.load_state_dict(checkpoint.part(state, OPTIMISER))

@@ -1,7 +1,5 @@
 """The images of a fit, kept on the device as far as memory allows."""
 
-from __future__ import annotations
-
 import math
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -48,7 +46,7 @@ class Target:
     alpha: Float | None  # (H*W,)
 
     @staticmethod
-    def of(view: View, background: np.ndarray) -> Target:
+    def of(view: View, background: np.ndarray) -> "Target":
         """Upload a view; `background` (3,) is in the colour space of its image."""
         loaded = view.load()
         planes = [upload(loaded.image[..., i]) for i in range(3)]
@@ -59,7 +57,7 @@ class Target:
         dr.eval(target.image, target.clipped, target.alpha)
         return target
 
-    def cropped(self, x: int, y: int, width: int, height: int) -> Target:
+    def cropped(self, x: int, y: int, width: int, height: int) -> "Target":
         """The part from column x and row y on."""
         camera = self.camera.window(x, y, width, height)
         index = camera.image_index(dr.arange(mi.UInt32, width * height))

@@ -2,8 +2,6 @@
 views: of the blended surfels, averaged over the views that see a point of the mesh. Points that no view sees
 get those of the surfels around the mesh's vertices."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

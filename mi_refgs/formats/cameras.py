@@ -1,7 +1,5 @@
 """transforms.json and COLMAP's text files of cameras: written for a scene, and transforms.json read."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

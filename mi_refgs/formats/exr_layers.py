@@ -1,7 +1,5 @@
 """One view with all its layers in one EXR file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -13,8 +13,6 @@ direction d_iv from the camera to the Gaussian, the coefficients c minimise
 by conjugate gradients; W_i is the weight of a Gaussian in all views, l the degree of a coefficient. The
 preconditioner, whose solution is the first step, is the least-squares problem of each Gaussian by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -133,7 +131,7 @@ class _BlendedView:
     alpha: Float  # (H*W,)
 
     @staticmethod
-    def of(tables: Tables, colours: Sequence[np.ndarray], camera: Camera) -> _BlendedView:
+    def of(tables: Tables, colours: Sequence[np.ndarray], camera: Camera) -> "_BlendedView":
         inputs = [*(upload(plane) for plane in colours), dr.opaque(mi.Float, 0, surfel_count(tables))]
         dr.enable_grad(inputs)
         blended = splat(tables, inputs, camera)

@@ -1,7 +1,5 @@
 """Binary glTF 2.0 files of meshes and of Gaussians."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Scenes of textured meshes that Mitsuba renders without this package."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Cameras around a scene: on a sphere where there is no data set, on a circle for a turntable."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

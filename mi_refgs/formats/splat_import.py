@@ -3,8 +3,6 @@
 Their colours are blended display-encoded (`shade.reflectance.radiance`). Two differences to 2DGS: its screen
 filter has a variance of 1/2 pixel², ours 1/12; and it sorts surfels by their centres."""
 
-from __future__ import annotations
-
 import gzip
 import importlib.util
 import math

@@ -1,7 +1,5 @@
 """EXR files as NumPy arrays, read in a process of their own (`exr_process`), and written atomically."""
 
-from __future__ import annotations
-
 import atexit
 import itertools
 import json

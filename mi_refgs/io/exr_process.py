@@ -1,8 +1,6 @@
 """Reads EXR files in a process of its own, which a broken file may end; a script that `exr` runs. A line of
 standard input is JSON of a path and whether its pixels are wanted; out come pickled parts, or a message."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Files of the package, atomic writes, locks, names from untrusted files, JSON, and size checks."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

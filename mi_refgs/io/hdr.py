@@ -1,7 +1,5 @@
 """Radiance images (.hdr) as NumPy arrays."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

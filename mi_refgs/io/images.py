@@ -1,7 +1,5 @@
 """8-bit image files, the sRGB transfer function and PSNR in NumPy; linear formats are in `exr` and `hdr`."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Ownership of output folders: the file MARK says which command fills one, and for which run or input."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mi_refgs.errors import InputError

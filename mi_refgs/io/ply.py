@@ -1,7 +1,5 @@
 """Header and vertices of a PLY file, compared with its length before memory is allocated."""
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Messages and progress bars on standard error: results alone go to standard output."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from collections.abc import Iterator, Sequence

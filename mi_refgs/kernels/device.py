@@ -1,7 +1,5 @@
 """The machine, supported variants, NumPy arrays on the device, functions that are traced once."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import gc

@@ -1,7 +1,5 @@
 """Linear functions of arrays under AD, by the transposed function."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Memory that a computation needs and that is available; upper bounds."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

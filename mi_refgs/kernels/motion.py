@@ -4,8 +4,6 @@ A motion is an array of zeros under AD: a rotation (3,), radians about world axe
 shear of a matrix have no derivative.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

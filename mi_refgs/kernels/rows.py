@@ -1,8 +1,6 @@
 """Rows of floats, read and written in a few wide accesses per row, not in one per column; their columns under
 AD; and arrays one after the other."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -33,12 +31,12 @@ class PackedRows:
         return -(-self.width // self.access)
 
     @staticmethod
-    def zeros(count: int, width: int) -> PackedRows:
+    def zeros(count: int, width: int) -> "PackedRows":
         """Rows of zeros."""
         return PackedRows(dr.zeros(mi.Float, count * -(-width // ACCESS) * ACCESS), count, width)
 
     @staticmethod
-    def pack(columns: list[Float], access: int = ACCESS) -> PackedRows:
+    def pack(columns: list[Float], access: int = ACCESS) -> "PackedRows":
         """Pack columns (N,)."""
         count, width = dr.width(columns[0]), len(columns)
         rows = PackedRows(dr.empty(mi.Float, count * -(-width // access) * access), count, width, access)

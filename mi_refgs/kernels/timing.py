@@ -1,7 +1,5 @@
 """Named phases (of `evaluation.profile`) of a step, for a listener that times them, if there is one."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

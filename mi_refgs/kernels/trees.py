@@ -1,7 +1,5 @@
 """Functions of arrays, applied to sequences, dictionaries and dataclasses of arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any

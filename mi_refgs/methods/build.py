@@ -1,7 +1,5 @@
 """Plain data, as TOML has it, to frozen dataclasses and back, strictly by their type hints."""
 
-from __future__ import annotations
-
 import dataclasses
 import types
 import typing

@@ -1,7 +1,5 @@
 """What users can add to a fit: events, initialisers and losses, which methods know by their names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the fields of settings say of themselves, `field(default=0.25, metadata=at_least(0))`, and windows."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

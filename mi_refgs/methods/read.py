@@ -1,7 +1,5 @@
 """Read methods strictly from TOML: a file, those that it extends, `key=value` assignments, a preset."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

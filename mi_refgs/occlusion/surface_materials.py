@@ -1,7 +1,5 @@
 """Materials on the extracted mesh, under AD: of the surfels around each vertex, found once per mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -42,7 +40,7 @@ class VertexSurfels:
         self.normal = mi.Vector3f(*(upload(row) for row in arrays["normals"]))  # (V,)
 
     @staticmethod
-    def of(mesh: Mesh, surfels: Surfels) -> VertexSurfels:
+    def of(mesh: Mesh, surfels: Surfels) -> "VertexSurfels":
         """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint, which is
         wider by a voxel along the normal. Detached. Raises InputError without surfels."""
         if not surfels.count:

@@ -10,8 +10,6 @@ in no view's image                       +1: nothing is known to be there
 =======================================  ===================================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Visibility of the light through Mitsuba's rays: one bit per ray, whether the extracted mesh blocks it."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Each variant has base classes of its own, so a plugin's module is imported or re
 `load` (and Mitsuba 3.10's entry point). Never import it before a variant is set, nor classes from it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import importlib

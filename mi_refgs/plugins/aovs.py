@@ -1,7 +1,5 @@
 """Arbitrary output variables (AOVs): Mitsuba's `name:type` lists, names of image channels, values."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 

@@ -1,7 +1,5 @@
 """The `refgs_bsdf` BSDF, for path tracers: the reflectance model that `mi_refgs.shade` approximates."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ and radiance that rays find with it; the side to which a normal is turned; what 
 order, tile lists, cuts, clamps).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """The `refgs` integrator: Gaussian surfels and deferred shading for `mi.render`."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

@@ -1,7 +1,5 @@
 """Mitsuba's environment emitters as the lights of `mi_refgs.shade`."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Any

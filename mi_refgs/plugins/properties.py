@@ -1,7 +1,5 @@
 """The properties of the `refgs` integrator, read once while it is constructed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Fit a `Reconstruction` to a data set, with previews in the run folder and a bar in the terminal."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import warnings

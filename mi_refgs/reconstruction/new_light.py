@@ -2,8 +2,6 @@
 zenith, Mitsuba's y axis; in the world of a scene z is up. Maps that this package writes (environment.exr,
 envmap.exr) are in world directions already."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

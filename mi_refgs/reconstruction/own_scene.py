@@ -1,7 +1,5 @@
 """The state of a loop of one's own as a fitted scene."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from typing import Any

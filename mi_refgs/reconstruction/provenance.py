@@ -1,7 +1,5 @@
 """The method and data set that a reconstruction was fitted with, and their cameras."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,7 +32,7 @@ class Provenance:
     """Corrections of the fit by file: of its cameras and of the exposure."""
 
     @staticmethod
-    def of(run: Run) -> Provenance:
+    def of(run: Run) -> "Provenance":
         """Read a run folder; raises InputError if it is none, or has a record that cannot be used."""
         method, (edits, exposure) = run.method(), (run.path / name for name in (EDITS, EXPOSURE))
         made = read_json(edits).get("edits", []) if edits.is_file() else []
@@ -42,7 +40,7 @@ class Provenance:
         records |= {EXPOSURE: read_json(exposure)} if exposure.is_file() else {}
         return Provenance(method, run.dataset(), run.region(), tuple(made), records)
 
-    def with_data(self, folder: Path | None) -> Provenance:
+    def with_data(self, folder: Path | None) -> "Provenance":
         """Replace the data set, unless `folder` is None; raises InputError for a path that is no folder."""
         if folder is not None and not folder.is_dir():
             raise InputError("no such folder", folder, "--data", "give the folder of a data set")

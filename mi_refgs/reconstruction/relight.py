@@ -7,8 +7,6 @@ relight.json            the settings, and the score where the data set has groun
 sheet.png               relit images and the ground truth; and the environment map
 turntable/relight.json, sheet.png    the same of a turntable, with the frames"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

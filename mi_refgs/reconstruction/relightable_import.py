@@ -1,7 +1,5 @@
 """A PLY file of splats as a relightable object: views of it are rendered, and fitted like photographs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

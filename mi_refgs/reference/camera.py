@@ -1,7 +1,5 @@
 """A pinhole camera and its pose, in float64 or complex numbers, in Mitsuba's frame: +z forward, +y up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@
 Letters: N primitives, P pixels. Raw channels are real or, for derivatives by a complex step, complex.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ digit: the imaginary part of f(x + ih) is h f'(x). The order of surfels is an in
 Letters: N surfels, P pixels, K features, D raw columns. Maps are (P, …).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

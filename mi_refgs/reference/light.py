@@ -1,8 +1,6 @@
 """Environment maps in float64: prefiltered levels, lookups (texels (n, k) of the flat levels, and their
 weights, which may be complex)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,8 +1,6 @@
 """The GGX lobe by brute force in float64: α = roughness², height-correlated Smith, Schlick. Directions are
 unit (3,) or (n, 3) arrays that point away from the surface; colours have three channels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

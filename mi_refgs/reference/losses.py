@@ -1,7 +1,5 @@
 """Losses, depth normals and Adam in float64; images are (H, W, 3), planes (H, W)."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

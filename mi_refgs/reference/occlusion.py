@@ -5,8 +5,6 @@ Cameras are (to_world, focal, size): rigid (4, 4), Mitsuba camera frame; pixels;
 at its centre.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -4,8 +4,6 @@ Derivatives of footprints are complex steps, exact to the last digit: the imagin
 h f'(x). Derivatives of compositing follow from its sums. Letters: N primitives, P pixels, K features.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

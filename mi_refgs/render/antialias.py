@@ -1,7 +1,5 @@
 """Antialiasing of reflections: each pixel, composited once, is shaded at four interpolated points."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -3,8 +3,6 @@
 Letters: z expected camera depth, A accumulated alpha, X(i, j) the point that pixel (i, j) sees at depth z.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 

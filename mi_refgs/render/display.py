@@ -1,7 +1,5 @@
 """Display of linear radiance, the one place of the sRGB curve: lists of mi.Float planes (H·W)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

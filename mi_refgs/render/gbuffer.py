@@ -1,7 +1,5 @@
 """The G-buffer: named values of the surfels, composited together and divided by alpha once."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any

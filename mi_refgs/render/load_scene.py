@@ -1,7 +1,5 @@
 """Load a Mitsuba scene file, with further AOVs of its `refgs` integrator or the object only."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Panorama of the background: its radiance and distance in all directions from one point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product
 

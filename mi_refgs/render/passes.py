@@ -1,7 +1,5 @@
 """Rendering by bands of rows of one image's tiles, equally high for one set of kernels: bounded memory."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

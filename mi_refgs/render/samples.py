@@ -1,7 +1,5 @@
 """Several samples per pixel: a view is rendered larger, and its pixels are averaged."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The `scene.xml` of a run: what `mi.load_file` renders after `import mi_refgs`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

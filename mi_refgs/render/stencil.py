@@ -1,7 +1,5 @@
 """Neighbouring pixels of an image plane, with an adjoint that only gathers (deterministic)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """Surroundings of the object in images without alpha, splatted together with it in one sort."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +23,7 @@ class Surroundings:
     background: EnvironmentLight | None = None
 
     @staticmethod
-    def read(ply: str | Path, background: str | Path | None) -> Surroundings:
+    def read(ply: str | Path, background: str | Path | None) -> "Surroundings":
         """Read the files of a run; raises InputError for one that cannot be used."""
         light = None if background is None else EnvironmentLight.from_file(Path(background))
         return Surroundings(read_ply(ply), light)

@@ -1,7 +1,5 @@
 """A checkpoint: named arrays in an .npz file whose comment is "sha256 " and that of all bytes before it."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import zipfile

@@ -1,8 +1,6 @@
 """The artefacts of a run, which other programs can read (docs/formats.md). model.json has the iteration and
 training seconds of these files, their names, and the shading options."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace

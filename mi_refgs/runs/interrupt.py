@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM between two steps of a fit, never inside one."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Conversion of a fitted scene to materials that any light can illuminate."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

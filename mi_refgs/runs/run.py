@@ -5,8 +5,6 @@ surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json                        
 metrics.json  contact_sheet.png  eval/                                          by `evaluation`
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """The views of a run: a split of its data set, read as its method says, with its region of interest."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Mapping

@@ -10,8 +10,6 @@ where it blocks the ray, shaded with the ratios of the previous round, 1 in the 
 albedo × irradiance × ratio; ratios are detached.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

@@ -1,8 +1,6 @@
 """How light becomes radiance, as data: the one declaration of every shading option, for method files, plugin,
 `scene.xml` and `model.json`. Name a new field in `Reflectance.honoured` of models that honour it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args, get_type_hints
 

@@ -1,7 +1,5 @@
 """Traced mirror rays: visibility of the light, and radiance of the mesh where it blocks it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -33,7 +31,7 @@ class MeshHit:
     triangle: UInt32
     barycentric: Point2f
     visibility: Float  # 0 or 1
-    next: MeshHit | None = None  # what blocks it, if that is shaded too
+    next: "MeshHit | None" = None  # what blocks it, if that is shaded too
 
 
 class MeshRadiance:

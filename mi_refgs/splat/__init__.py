@@ -1,7 +1,5 @@
 """The splatter: project surfels, list them by tile, composite features front to back."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import reduce
 

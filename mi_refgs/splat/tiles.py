@@ -1,7 +1,5 @@
 """Lists of the surfels that each tile may show, nearest first."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Blending weights of surfels: how much of an image each one is responsible for."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import drjit as dr

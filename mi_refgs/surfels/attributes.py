@@ -1,7 +1,5 @@
 """Attributes of a surfel: the one place where they are declared. A new one is a `register`ed `Attribute`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

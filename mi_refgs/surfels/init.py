@@ -1,7 +1,5 @@
 """Initial surfels, one per point; `data.hull` finds such points. The order of surfels in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ constant coefficients of r, g, b, then all others of r, of g, of b. The column o
 coefficient + rgb.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Path-traced views of a Mitsuba scene in memory: `Dataset.from_mitsuba`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

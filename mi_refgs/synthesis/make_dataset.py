@@ -4,8 +4,6 @@ Of an object among other shapes, images are RGB without alpha, and maps and surf
 The transforms are written last. dataset.json has the settings, which decide whether a folder is continued.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path

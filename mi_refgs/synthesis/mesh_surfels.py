@@ -1,7 +1,5 @@
 """Surfels on a mesh or on Mitsuba shapes, with the normals and materials that are known there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

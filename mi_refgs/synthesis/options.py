@@ -1,7 +1,5 @@
 """Options of a path-traced data set; `refgs dataset` reads its own from here."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -117,7 +115,7 @@ class LightFile:
     sha256: str
 
     @staticmethod
-    def of(path: Path) -> LightFile:
+    def of(path: Path) -> "LightFile":
         require_file(path)
         name = re.sub(r"[^0-9A-Za-z_-]+", "_", path.stem).strip("_") or "light"
         return LightFile(path, name, hashlib.sha256(path.read_bytes()).hexdigest())

@@ -1,7 +1,5 @@
 """Path tracing of views of a Mitsuba scene: its size, cameras, images and maps, the environment map."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The folder of a path-traced data set, which records its settings, and its scene under each light."""
 
-from __future__ import annotations
-
 import contextlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence

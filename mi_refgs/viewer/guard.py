@@ -2,8 +2,6 @@
 only unless the user names another address. A request needs the page's own host name, so that no foreign name
 that resolves to this machine reaches it, and no other site's `Origin`; messages have a largest size."""
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import socket

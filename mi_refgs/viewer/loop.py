@@ -1,8 +1,6 @@
 """The render thread: coarse frames during motion, refined at rest by one sample per pixel after another.
 Callbacks of the page run on other threads: they only queue tasks here."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

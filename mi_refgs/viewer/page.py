@@ -1,7 +1,5 @@
 """The page: a viser server whose background image is drawn by a `RenderLoop`."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

@@ -1,7 +1,5 @@
 """Panels of controls: display options, light, materials, cameras; saving of views."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from functools import partial

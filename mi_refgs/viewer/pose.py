@@ -1,7 +1,5 @@
 """Viewing poses, and their conversion to cameras of viser, of the renderer, of a data set, and of a file."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +22,7 @@ class Pose:
     near: float = 0.0  # depth of the near plane, scene units
 
     @staticmethod
-    def of_page(camera: Any, near: float = 0.0) -> Pose:
+    def of_page(camera: Any, near: float = 0.0) -> "Pose":
         """Convert a camera of viser, whose axes are OpenCV's."""
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat(np.roll(np.asarray(camera.wxyz, np.float64), -1)).as_matrix()
@@ -33,7 +31,7 @@ class Pose:
         return Pose(matrix @ MITSUBA_FROM_OPENCV, float(camera.fov), aspect, near)
 
     @staticmethod
-    def of_view(view: View) -> Pose:
+    def of_view(view: View) -> "Pose":
         """Convert an image's camera, without its principal point, which a page cannot represent."""
         fov = 2 * math.atan(view.height / 2 / view.fy)
         return Pose(view.to_world, fov, view.width / view.fx / (view.height / view.fy), view.near)

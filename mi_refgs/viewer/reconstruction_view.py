@@ -1,7 +1,5 @@
 """What a page displays: a reconstruction, with changed materials, under a rotated or another light."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The region of interest: displayed as a wireframe, moved, resized, and saved for the next fit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

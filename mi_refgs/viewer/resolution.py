@@ -1,8 +1,6 @@
 """Sizes of displayed images, and when they are due: coarse during motion, fine at rest, then supersampled. A
 kernel is compiled per size. So there are few: levels whose areas double, in a few aspect ratios."""
 
-from __future__ import annotations
-
 import math
 
 SIDES = (141, 200, 283, 400, 566, 800, 1131, 1600)  # levels: of the square of the same area, pixels

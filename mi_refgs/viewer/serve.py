@@ -1,7 +1,5 @@
 """Pages of `refgs view`, ready to be opened."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The small instance of the benchmark that a test module names as its BENCHMARK."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

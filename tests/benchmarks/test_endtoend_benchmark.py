@@ -1,7 +1,5 @@
 """The benchmark of whole frames, as a small instance."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

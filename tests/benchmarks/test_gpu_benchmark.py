@@ -1,7 +1,5 @@
 """The script for a machine with a GPU: its small instance on the CPU, and a step that takes too long."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from benchmarks.common.build import read_result

@@ -1,7 +1,5 @@
 """Every module of the benchmarks can be imported."""
 
-from __future__ import annotations
-
 import importlib
 
 import pytest

@@ -1,7 +1,5 @@
 """Every mutant applies, and its test exists. `python -m benchmarks.mutation` runs them."""
 
-from __future__ import annotations
-
 import ast
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The tables of the paper: which figures are whose, and ours below them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The benchmark of the splatter: counts, errors and fits are what they say. No times are tested."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The benchmark of the split sum: its references, and numbers ordered as they must be; no times."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """The benchmark of visibility: its scenes, its choice of settings, and numbers ordered as they must be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`refgs capture`: cameras of a scene that the tests photograph, and error messages."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Sequence

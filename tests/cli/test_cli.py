@@ -1,7 +1,5 @@
 """Every command through `main`: what it writes and prints, and how it refuses bad input."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

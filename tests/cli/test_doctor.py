@@ -1,7 +1,5 @@
 """`refgs doctor`'s report, on this machine and for installations that lack something."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

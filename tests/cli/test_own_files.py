@@ -1,7 +1,5 @@
 """A command writes into a folder of its own only: every command, run where others have put a file."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """CONTRIBUTING's recipe "a command", followed: a command of this test's own, from its help to its result."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterator

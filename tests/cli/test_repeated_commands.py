@@ -1,7 +1,5 @@
 """A repeated command does what its options say, or refuses and names the option that cannot change."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

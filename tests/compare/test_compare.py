@@ -1,7 +1,5 @@
 """Comparisons: jobs that resume, rows that say why they failed, tables whose arithmetic is written here."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Checks before a fit: cameras against points, and images against those of neighbouring cameras."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

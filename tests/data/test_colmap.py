@@ -1,7 +1,5 @@
 """COLMAP's layout, text and binary, as this test writes it: cameras, images, copies, masks, points."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import time

@@ -1,7 +1,5 @@
 """The reader of multi-view data sets: conventions, compositing, intrinsics, what it says about bad input."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Points to start from: on and in the visual hull of alpha masks, in a box, and their colours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import kstest

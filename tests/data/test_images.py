@@ -1,7 +1,5 @@
 """From image files to pixels: shrinking decoders, masks, opaque alpha, loading on request, the cache."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from concurrent.futures import ThreadPoolExecutor

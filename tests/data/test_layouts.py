@@ -1,7 +1,5 @@
 """Layouts of data sets as this test writes them: nerfstudio, Shiny Blender, LLFF, NeRO's Glossy Synthetic."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from functools import partial

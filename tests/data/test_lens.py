@@ -1,7 +1,5 @@
 """Lens distortion: images of a lens become those of a pinhole, or are refused."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The region of an object: what supports it is left out, what it consists of is inside."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

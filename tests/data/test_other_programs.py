@@ -1,7 +1,5 @@
 """Folders as other programs write them: what they mean is read, and what was changed is said."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """CONTRIBUTING's recipe "add a reader", followed: a layout of this test's own, from the folder to a fit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The region of interest: contraction, the sphere that cameras suggest, its file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Registration of cameras: poses that are found again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

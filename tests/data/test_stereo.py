@@ -1,7 +1,5 @@
 """Stereo: points on the surfaces of photographs with known cameras."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`refgs doctor FOLDER`, and data sets that are unusual: one place, one view, images of several sizes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Photographs of an object that turns: the background that stays is said, a plain one cut off."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

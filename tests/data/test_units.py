@@ -1,7 +1,5 @@
 """The unit of length is free: a scene that is scaled as a whole, or moved far away, stays the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

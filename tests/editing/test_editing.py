@@ -1,7 +1,5 @@
 """Edits: exact surfels, meshes, run folders."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Errors of materials and surface against ground truth, over all pixels and over concave ones."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Error budget: classes of pixels of surfaces in closed form, and shares of planted errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Evaluation: numbers of the exported scene, reasons of missing ones, contact sheets, names of images."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Panels of environment maps, and contact sheets."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

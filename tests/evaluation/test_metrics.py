@@ -1,7 +1,5 @@
 """Metrics: closed forms, the training definition of SSIM, normals on both masks, light up to a scale."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

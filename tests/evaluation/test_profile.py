@@ -1,7 +1,5 @@
 """`refgs profile`: time is booked where it is spent, and nothing is changed."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Distance between a mesh and the true surface, and its concave regions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Helpers of the loss tests: planes, differences of a float64 definition, and one check of both modes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Decisions by trial: what is tried when, what decides, forks of a fit, interrupts and resumption."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

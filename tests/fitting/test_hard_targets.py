@@ -1,7 +1,5 @@
 """Fits to images nobody would wish for: they run with finite numbers, or end with one sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

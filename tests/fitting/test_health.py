@@ -1,7 +1,5 @@
 """Steps whose loss or gradient is not finite: not applied, culprits named and removed, or one sentence."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

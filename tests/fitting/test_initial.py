@@ -1,7 +1,5 @@
 """What a fit starts from: surfels on and inside the visual hull, coloured by the images."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

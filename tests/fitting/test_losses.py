@@ -1,7 +1,5 @@
 """Losses against their float64 definitions: values, and gradients against central differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

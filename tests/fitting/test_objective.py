@@ -1,7 +1,5 @@
 """What a step lowers: zero for the perfect image, and the sum that the method's weights say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

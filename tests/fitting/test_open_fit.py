@@ -1,7 +1,5 @@
 """The fit of images without alpha: what it starts from, its two tables, checkpoints, the default method."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Adam against NumPy and Dr.Jit's own, schedules, moments that follow their rows, bitwise resume."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

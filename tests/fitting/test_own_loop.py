@@ -1,7 +1,5 @@
 """A loop of one's own: `mi.render`, Adam over `mi.traverse`, rows that split and move."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

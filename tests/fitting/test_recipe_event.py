@@ -1,7 +1,5 @@
 """The recipe of an event in CONTRIBUTING.md, followed line by line: it can be copied."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """The recipe of an initialiser in CONTRIBUTING.md, followed line by line: it can be copied."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The recipe of a loss in CONTRIBUTING.md, followed line by line: it can be copied."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The loop: it learns, resumes to the same bits, survives a kill, and compiles nothing new once warm."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

@@ -1,7 +1,5 @@
 """Meshes with baked textures: a known scene in glTF and plain Mitsuba, read by other libraries."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`--to cameras` of every layout of data sets, read back with the package's own readers."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The registry of formats, `refgs export --to`, and cameras around a scene."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """PLY files of other programs: read, rendered by their own formulas, refused, imported and exported."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path

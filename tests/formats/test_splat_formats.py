@@ -1,7 +1,5 @@
 """3D Gaussians of a scene in PLY and glTF files for other viewers, and a view with its layers as EXR."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

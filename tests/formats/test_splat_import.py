@@ -1,7 +1,5 @@
 """Splat files as other programs write them: what is left out, replaced or refused, with the right values."""
 
-from __future__ import annotations
-
 import gzip
 import importlib.util
 import json

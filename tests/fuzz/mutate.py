@@ -1,7 +1,5 @@
 """Mutations of a file, decided by a seeded generator: the same seed makes the same file."""
 
-from __future__ import annotations
-
 import json
 import math
 import random

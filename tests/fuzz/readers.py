@@ -1,7 +1,5 @@
 """The readers of the package, each with a folder of files that it accepts and a call that reads them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable
 from functools import partial

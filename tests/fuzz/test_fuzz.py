@@ -1,8 +1,6 @@
 """Mutated files of every reader are read or refused: no other exception, no crash, no hang, no code, little
 memory."""
 
-from __future__ import annotations
-
 import random
 import re
 import signal

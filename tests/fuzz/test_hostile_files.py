@@ -1,7 +1,5 @@
 """Files made to harm: each once ended in another exception than an InputError, a hang, or much memory."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The cheap hard cases of `benchmarks.stability` with its limits, and tests of the measurement itself."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Image files, the sRGB curve, and files that appear whole or not at all."""
 
-from __future__ import annotations
-
 import os
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """PLY files: bit-exact round trip, 2DGS's layout, tolerance of other writers' files, and every refusal."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

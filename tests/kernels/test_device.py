@@ -1,7 +1,5 @@
 """Arrays on the device: the values, and one kernel whatever the memory that they come from."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is computed says beforehand how much memory it needs, and is refused where there is less."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Covering arrays: few cases in which every allowed combination of values of any t dimensions occurs."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

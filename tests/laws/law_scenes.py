@@ -1,7 +1,5 @@
 """Random scenes for the laws, always of the same size, so that kernels are compiled once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -48,7 +46,7 @@ class View:
         fov = float(2 * np.degrees(np.arctan(self.width / 2 / FOCAL)))
         return scenes.sensor(fov=fov, to_world=mi.ScalarTransform4f(self.to_world), film=film)
 
-    def moved(self, matrix: np.ndarray) -> View:
+    def moved(self, matrix: np.ndarray) -> "View":
         return replace(self, to_world=matrix @ self.to_world)
 
 
@@ -59,10 +57,10 @@ class Scene:
     raw: Raw
     view: View
 
-    def with_rows(self, parent: np.ndarray) -> Scene:
+    def with_rows(self, parent: np.ndarray) -> "Scene":
         return replace(self, raw={name: values[parent] for name, values in self.raw.items()})
 
-    def changed(self, **channels: np.ndarray) -> Scene:
+    def changed(self, **channels: np.ndarray) -> "Scene":
         return replace(self, raw=self.raw | {k: np.asarray(v, np.float32) for k, v in channels.items()})
 
 

@@ -1,7 +1,5 @@
 """The options of a rendered image: their values, and which of these do not go together."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from mi_refgs.methods.read import load, names

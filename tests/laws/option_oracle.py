@@ -1,7 +1,5 @@
 """The image of a case of options in float64: maps of the reference, and sensor, film and AOVs in NumPy."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

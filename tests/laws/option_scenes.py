@@ -1,7 +1,5 @@
 """A Mitsuba scene of a case of options, by each way that scenes are made, and its differentiable values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

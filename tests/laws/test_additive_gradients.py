@@ -3,8 +3,6 @@
 Losses of the parameters read them as priors do: their adjoints write to the same leaves as the image's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 from itertools import permutations

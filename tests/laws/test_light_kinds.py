@@ -1,7 +1,5 @@
 """Every kind of light × resume, render, export, edit, relight: they keep the light of the fit."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

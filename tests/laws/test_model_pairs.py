@@ -3,8 +3,6 @@
 The model of a plugin is fitted. Its run is then used without the loss, event and initialiser of the fit.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

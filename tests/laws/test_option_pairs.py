@@ -3,8 +3,6 @@
 Without `-m slow`, each value once; with `--hypothesis-profile thorough`, every three values of three options.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

@@ -3,8 +3,6 @@
 Every shading of every method and model goes through every route, and every pair of the other features occurs.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence

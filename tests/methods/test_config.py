@@ -1,7 +1,5 @@
 """Methods as data: every shipped file loads, presets scale it, and anything unknown is refused by name."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

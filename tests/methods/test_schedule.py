@@ -1,7 +1,5 @@
 """What an iteration number determines: the view, random numbers, the SH degree."""
 
-from __future__ import annotations
-
 import ast
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The shipped methods: what defines each, and that each fits; settings of the paper's code for its scenes."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Depth fusion and extraction against shapes whose distance is known, and the float64 specification."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

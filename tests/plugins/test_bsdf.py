@@ -1,7 +1,5 @@
 """The BSDF: against its formula, quadrature and the split-sum table; its samples, derivatives and faces."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Images of the `refgs` plugin: AOVs, films, crop windows, samples, sensors."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """The plugin, scene.xml and a run's files with what is around and behind the object, and the object alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Plugins follow Mitsuba from variant to variant; each case is a fresh process: import order counts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

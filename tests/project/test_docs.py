@@ -1,7 +1,5 @@
 """README and pages: Python blocks run, commands exist, links resolve, the site builds without a warning."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

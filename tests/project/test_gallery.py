@@ -1,7 +1,5 @@
 """docs/gallery_maker.py: its images, its page, and that existing files are not made again."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re

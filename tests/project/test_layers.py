@@ -1,7 +1,5 @@
 """The rules that keep the package in layers, read off its imports."""
 
-from __future__ import annotations
-
 import ast
 import re
 import tomllib

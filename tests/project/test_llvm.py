@@ -1,7 +1,5 @@
 """The choice of libLLVM; imports are tried in fresh processes, since Dr.Jit loads a library only once."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

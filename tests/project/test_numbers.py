@@ -1,7 +1,5 @@
 """Numbers of the pages are those of the data files in benchmarks/results, each table of one build."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """Sdist and wheel contain what they should, install in a clean environment, declare command and plugins."""
 
-from __future__ import annotations
-
 import configparser
 import json
 import re

@@ -1,7 +1,5 @@
 """What surrounds the code: citation, changelog, licences and hosted checks say what is true."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The public names: each is documented, and imported on first use."""
 
-from __future__ import annotations
-
 import inspect
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The tutorials run, with their assertions and without a warning; what is kept of them is small and clean."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re

@@ -1,7 +1,5 @@
 """New lights: orientation, rotation, exposure; ground truth under them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

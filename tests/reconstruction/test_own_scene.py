@@ -1,7 +1,5 @@
 """`Reconstruction.from_params`: the state of a loop is what save, relight, export and view take."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`mi_refgs.load`, `fit` and `Reconstruction`: images, Mitsuba scenes, changes, run folders, refusals."""
 
-from __future__ import annotations
-
 import gc
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Relighting: a known scene under another light against path tracing; lights, files, scores, refusals."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

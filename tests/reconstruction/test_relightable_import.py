@@ -1,7 +1,5 @@
 """A PLY file as a relightable object: its views are images of the file, and are fitted as data sets are."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Neighbours, depth normals and the losses on them, against their float64 definitions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """The background in all directions from one point: orientation, distances, what is near or large."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

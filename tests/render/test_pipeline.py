@@ -1,7 +1,5 @@
 """Surfels to image: both orders against float64, the side of normals, SH, bounds of opacity."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Several samples per pixel in metrics; those of images are cases of `tests/laws/test_option_pairs.py`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import mitsuba as mi

@@ -1,7 +1,5 @@
 """Open scenes: object, surroundings and background in one image, against float64."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

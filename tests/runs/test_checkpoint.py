@@ -1,7 +1,5 @@
 """Checkpoints: what is cut off, flipped or wrong is found, named and passed over; no run is lost unasked."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

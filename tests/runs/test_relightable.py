@@ -1,7 +1,5 @@
 """Materials of a run that can be relit: recovered, required, kept."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

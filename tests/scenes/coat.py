@@ -1,7 +1,5 @@
 """A plugin: a clear coat over Ref-Gaussian's model, and one of each other thing that a fit can be given."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar
 

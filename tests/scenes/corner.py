@@ -1,7 +1,5 @@
 """Two plates that meet in a concave edge, or three that form a channel: for tests of rays and their hits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

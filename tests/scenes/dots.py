@@ -1,7 +1,5 @@
 """Dots in space as cameras of OpenCV's axes see them: a flipped axis or half a pixel moves them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

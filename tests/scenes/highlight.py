@@ -1,7 +1,5 @@
 """Images of a ball whose highlight moves with the camera, and a method that fits it in 30 steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A path-traced data set whose every material is known, and the run that has found all of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Data sets of dots in the layouts of other programs: COLMAP, nerfstudio, LLFF, NeRO."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import struct

@@ -1,7 +1,5 @@
 """An open scene in the renderer and in float64: object, surroundings and background, in either order."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """Photographs of a patterned block on a patterned ground, ray traced in NumPy, with their cameras."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Random shading points, and their radiance by the float64 reference."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

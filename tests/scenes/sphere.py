@@ -1,7 +1,5 @@
 """A Mitsuba scene of one diffuse sphere under a lit studio."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.helpers import ROOT

@@ -1,7 +1,5 @@
 """A ball of Gaussians as a PLY file of another program, and small imports of it that are fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A data set of a ball made by NumPy alone, and a method small enough to fit to it in seconds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The share of diffuse light that arrives at a mesh: against rays one by one, and where it is used."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Split-sum table: brute-force quadrature, derivatives, and the cache."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Environment light: orientation, activation, the prefilter and its adjoint, lookups and their slopes."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

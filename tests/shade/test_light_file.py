@@ -1,7 +1,5 @@
 """Lat-long images of lights, averaged to fewer rows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lights as other programs write them: each is the lat-long map of the same place, or says how it is read."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Rays of the GGX lobe: their distribution, and the visibility that they find."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

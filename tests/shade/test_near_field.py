@@ -1,7 +1,5 @@
 """Environment maps of surfaces at finite distances: directions against geometry, files, bad values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """Shading options: which are allowed together, what they are for, and the plugin's."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """CONTRIBUTING's recipe "a light", followed: a sun whose direction and colour are learnt."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The recipe "A shading option" of CONTRIBUTING.md, followed in a copy of the package."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

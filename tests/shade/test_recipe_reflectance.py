@@ -1,7 +1,5 @@
 """CONTRIBUTING's recipe "add a reflectance model", followed: Phong's, by one attribute and one class."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

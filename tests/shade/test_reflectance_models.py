@@ -1,7 +1,5 @@
 """Reflectance models: terms and derivatives against the float64 reference, degenerate points, lights."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 

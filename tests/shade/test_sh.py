@@ -1,7 +1,5 @@
 """Spherical harmonics: values against two other formulas, the sign convention, and derivatives."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

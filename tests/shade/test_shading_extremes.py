@@ -1,7 +1,5 @@
 """Shading at the limits of its formulas: against the float64 reference, and conservation of energy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """What blocked mirror rays hit, shaded there: materials on the mesh, radiance, derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

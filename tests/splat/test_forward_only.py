@@ -1,7 +1,5 @@
 """Images without derivatives: equal to those with derivatives, with requested AOVs only."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The splatter against its float64 reference: images, gradients of every parameter, tile lists."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

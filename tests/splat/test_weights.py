@@ -1,7 +1,5 @@
 """Blending weights of surfels, against the blended image of one surfel alone."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """3D Gaussians by EWA: what `tests/splat` does not compare with surfels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mi_refgs.constants import ALPHA_MAX, GAUSSIAN_LOW_PASS

@@ -1,7 +1,5 @@
 """Initial surfels from points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """CONTRIBUTING's recipe "a primitive": balls with one radius, from points to a fit and a file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

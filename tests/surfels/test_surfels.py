@@ -1,7 +1,5 @@
 """The surfel table: activations, degenerate rows, gradients in both modes, rows, refusals."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """Path-traced data sets: cameras, pixels, maps and light agree with each other; folders resume."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

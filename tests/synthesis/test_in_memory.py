@@ -1,7 +1,5 @@
 """Data sets in memory: the views that `make_dataset` writes, and those of sensors; fits that take them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

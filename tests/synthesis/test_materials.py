@@ -1,7 +1,5 @@
 """Ground truth of materials and surface: what BSDFs declare comes out of the data set as it is meant."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

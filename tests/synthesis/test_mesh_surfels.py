@@ -1,7 +1,5 @@
 """Surfels on meshes and Mitsuba shapes: no holes, normals, materials of BSDFs and their textures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import mitsuba as mi

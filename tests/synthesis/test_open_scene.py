@@ -1,7 +1,5 @@
 """Path-traced data sets of an object in a room: images of all, maps of the object, COLMAP's files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree

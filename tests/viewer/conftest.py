@@ -1,7 +1,5 @@
 """The scene of the viewer's tests."""
 
-from __future__ import annotations
-
 import mitsuba as mi
 import pytest
 

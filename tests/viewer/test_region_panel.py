@@ -1,7 +1,5 @@
 """The region panel of a page, without a browser: displayed, changed, written."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

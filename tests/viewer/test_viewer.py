@@ -1,7 +1,5 @@
 """The viewer without a browser: sizes and times of images, poses, the render loop, the displayed scenes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import socket

@@ -1,7 +1,5 @@
 """Access control of a page against viser's real server, by raw sockets: who may connect, largest message."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`refgs view` in a real browser: every panel of a page."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -3,8 +3,6 @@
 Splits run a few dozen times per fit, in NumPy.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar

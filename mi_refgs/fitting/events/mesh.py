@@ -1,7 +1,5 @@
 """The mesh that occludes: extracted from the rendered depth of training views. [Ref-Gaussian §3.3]"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import tee

@@ -4,8 +4,6 @@ The fit that explains the training images better continues; each of its surfels 
 images around it better.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field, replace
 from typing import ClassVar

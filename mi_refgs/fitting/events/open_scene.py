@@ -1,7 +1,5 @@
 """Events of open scenes: the region follows the object, the background becomes the light of photographs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar

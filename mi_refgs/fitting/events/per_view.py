@@ -5,8 +5,6 @@ it count as 1, they learn slowly, and the loss has a prior on them. Corrections 
 learn slowly, since true cameras hardly move (`schedule.LEARNT_BESIDE`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar
 

@@ -3,8 +3,6 @@
 Reflections then follow normals that explain them. [3DGS-DR, Ye et al. 2024, §3.3; Ref-Gaussian §3.4]
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar
 

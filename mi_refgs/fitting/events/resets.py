@@ -1,7 +1,5 @@
 """Resets: opacities that surfels grow back if images require them, and what a stage begins anew."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import dataclass

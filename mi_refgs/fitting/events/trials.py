@@ -1,7 +1,5 @@
 """Trials on validation views: whether spherical-harmonic colour suffices, and whether more surfels pay."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar

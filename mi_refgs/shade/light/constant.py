@@ -1,7 +1,5 @@
 """A light that is the same from everywhere, and whose colour a fit learns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Kinds of light, what a fit learns of it: a new one is a `FittedLight` and a registered `LightKind`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 

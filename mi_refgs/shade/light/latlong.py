@@ -1,7 +1,5 @@
 """Lat-long images of radiance that is known by direction: of lights, and of emitters of Mitsuba."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import drjit as dr

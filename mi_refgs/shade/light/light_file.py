@@ -1,7 +1,5 @@
 """Lights in image files: lat-long images, and cubes and angular maps, which become lat-long."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from functools import partial

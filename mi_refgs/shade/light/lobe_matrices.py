@@ -8,8 +8,6 @@ Rows are at θ = πi/(h-1) from +y (first and last row are the poles), columns a
 φ = atan2(x, -z), as in Mitsuba's `envmap`. Radiance between texels is bilinear, as Mitsuba looks it up.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import csr_matrix
 

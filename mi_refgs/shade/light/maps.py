@@ -1,7 +1,5 @@
 """Kinds of light that are environment maps: learnt, or read from a file."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self

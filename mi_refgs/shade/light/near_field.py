@@ -1,7 +1,5 @@
 """Environment maps of surfaces at finite distances, such as a room: lookups from points beside the centre."""
 
-from __future__ import annotations
-
 import io
 import os
 import zipfile
@@ -44,7 +42,7 @@ class NearField:
             raise InputError("a value is negative or not finite", "near field", remedy="replace it")
 
     @staticmethod
-    def read(path: str | os.PathLike[str]) -> NearField:
+    def read(path: str | os.PathLike[str]) -> "NearField":
         """Read what `write` has written; raises InputError for any other file."""
         try:
             # Opened here: NumPy leaves a file open that is no archive.

@@ -1,7 +1,5 @@
 """A known environment map whose rotation and scale a fit learns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

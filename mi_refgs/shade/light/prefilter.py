@@ -7,8 +7,6 @@ for a GPU, which would wait for it: `prefilter_kernels`. The levels are one flat
 texel: RGBA, A unused; the map itself comes first.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from typing import Any

@@ -1,8 +1,6 @@
 """The prefilter as kernels, for a GPU: sums over a row in place of the FFTs of `prefilter` on the host, whose
 steps and names these are. Maps (h, 2h) and their coefficients are one after the other."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

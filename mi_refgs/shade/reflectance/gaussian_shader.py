@@ -1,7 +1,5 @@
 """The model of GaussianShader: a colour, a diffuse and a tinted specular layer. [Jiang et al. 2024, §4]"""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

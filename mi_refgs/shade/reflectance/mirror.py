@@ -1,7 +1,5 @@
 """The model of 3DGS-DR: a fitted radiance mixed with a perfect mirror. [Ye et al. 2024, §3.2]"""
 
-from __future__ import annotations
-
 from typing import Any
 
 from mi_refgs.shade.light.light import Light

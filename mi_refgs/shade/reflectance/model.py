@@ -1,7 +1,5 @@
 """Interface and registry of reflectance models."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args

@@ -1,7 +1,5 @@
 """The model of R3DG: incident light summed over directions of the hemisphere. [Gao et al. 2024, §3.3-3.4]"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Fitted radiance without a light: a view-dependent SH colour, linear or display-encoded. [3DGS, §4; 2DGS]"""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

@@ -17,8 +17,6 @@ whose determinant is a sum of squares too: (v_i × v_j) = (s_i s_j / p_z²) (q, 
 needles and pancakes keep their digits in float32.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 

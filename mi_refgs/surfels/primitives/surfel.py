@@ -18,8 +18,6 @@ and the sample lies at depth z, or at the centre's depth where the low-pass is t
 intersection may be anywhere along the ray).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import drjit as dr

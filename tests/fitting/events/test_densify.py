@@ -1,7 +1,5 @@
 """Densification, pruning and propagation: parents of the rows, what changes, and what must not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The choice between metal and dielectric at the start of a fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

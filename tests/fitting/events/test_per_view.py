@@ -1,7 +1,5 @@
 """Gains of images and corrections of cameras: what is fitted, its derivative, when they begin to learn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

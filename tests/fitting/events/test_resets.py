@@ -1,7 +1,5 @@
 """Resets of opacity and restarts of materials: what changes, and what must not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
