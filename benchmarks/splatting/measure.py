@@ -24,7 +24,6 @@ from benchmarks.common import timing
 from benchmarks.common.fits import make_trainer, sphere_data
 from benchmarks.common.timing import once, peak_bytes
 from benchmarks.splatting.cases import COLOUR, FEATURES, Settings, Workload, sphere
-from benchmarks.splatting.counts import Counts
 from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.measure import measure as measure_case
@@ -55,11 +54,6 @@ def measure_peak() -> float:
         return sum(sums, mi.Float(0))
 
     return 2e-9 * lanes * STEPS * CHAINS / min(once(multiply_add) for _ in range(TRIES))
-
-
-def lower_bound(counts: Counts, gflops: float) -> dict[str, float]:
-    """Milliseconds below which no renderer gets at this rate."""
-    return {kind: 1e-6 * counts.contributing * flops / gflops for kind, flops in FLOPS.items()}
 
 
 MARGIN = 16
@@ -97,8 +91,6 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
     return found | {f"gradient_{name}": row.gradients[name] for name in CLASSES}
 
 
-PHASES = ("project", "tile lists", "sort", "splat forward", "splat backward", "surfels backward")
-PHASE_REPEATS = 5
 COST = ("contributing", "pairs", "surfels")  # what time is linear in
 Row = dict[str, Any]
 
@@ -152,7 +144,7 @@ STEP_SECONDS = 1.0  # for which the splat of a step is timed by itself, at most
 
 
 def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
-    """For every stage of the schedule: a step's time, launches, cache misses, and where its time goes.
+    """For every stage of the schedule: a step's time, launches, and where its time goes.
 
     Surfels cover a unit sphere; about half of them are seen. Each phase is timed between barriers, in steps
     of their own; `step_ms` is the wall time of undisturbed steps, less than the sum of the phases because
@@ -165,56 +157,43 @@ def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
         step, times = stepper(trainer, name), []
         phases = phases_of(step, max(steps // 3, 5))
         for _ in range(steps):
-            begin, misses = time.perf_counter(), dr.detail.launch_stats()[2]
+            begin = time.perf_counter()
             step()
             dr.sync_thread()
             times.append(1e3 * (time.perf_counter() - begin))
-        misses = dr.detail.launch_stats()[2] - misses
         splat_ms = timing.milliseconds({name: Ours.of_step(step).both}, STEP_SECONDS, steps)[name]
         result[name] = {
             "step_ms": round(float(np.median(times)), 2),
             "splat_ms": round(splat_ms, 2),
             "launches": sum(row.launches for row in phases),
-            "cache_misses": misses,
             "phases_ms": {row.phase: round(row.ms, 2) for row in phases},
         }
     return result
 
 
 def case(workload: Workload, settings: Settings, gflops: float) -> Row:
-    """One row: counts, times in turns, phases, launches, lower bounds."""
+    """One row: counts, times in turns, lower bounds."""
     count, size = workload.count, workload.pinhole.width
     full, colour = Ours.of(workload, FEATURES), Ours.of(workload, COLOUR)
     counts = full.counts()
-    calls = {
-        "forward": full.forward,
-        "both": full.both,
-        "colour_forward": colour.forward,
-        "colour_both": colour.both,
-    }
+    calls = {"forward": full.forward, "both": full.both}
+    calls |= {"colour_forward": colour.forward, "colour_both": colour.both}
     slow = {}
     if (count, size) in settings.volprim:
         volprim = Volprim(workload)
         slow["volprim_forward"] = (volprim.forward, settings.volprim_repeats)
         slow["volprim_both"] = (volprim.both, settings.volprim_repeats)
     times = timing.milliseconds(calls, settings.seconds / len(calls), settings.repeats, slow)
-    launches = {kind: full.launches(getattr(full, kind)) for kind in ("forward", "both")}
-    bound = lower_bound(counts, gflops)
-    phases = {row.phase: row.ms for row in phases_of(full.both, min(PHASE_REPEATS, settings.repeats))}
     row: Row = {"spread": workload.spread, "surfels": count, "size": size}
-    names = ("pixels", "covered", "pairs", "evaluated", "contributing")
-    row |= {name: getattr(counts, name) for name in names}
+    row |= {name: getattr(counts, name) for name in ("pairs", "evaluated", "contributing")}
     row["share"] = counts.contributing / counts.evaluated if counts.evaluated else 1.0
     row |= {f"{name}_ms": times.get(name) for name in (*calls, "volprim_forward", "volprim_both")}
-    row |= {f"{phase.replace(' ', '_')}_ms": phases[phase] for phase in PHASES}
-    for kind in ("forward", "both"):
-        row[f"bound_{kind}_ms"] = bound[kind]
-        row |= {f"launches_{kind}": launches[kind][0], f"misses_{kind}": launches[kind][1]}
-    return row
+    bound = {kind: 1e-6 * counts.contributing * flops / gflops for kind, flops in FLOPS.items()}
+    return row | {f"bound_{kind}_ms": ms for kind, ms in bound.items()}
 
 
 def plane(rows: Sequence[Row], target: str, names: Sequence[str]) -> dict[str, float]:
-    """row[target] = constant + Σ c row[name], no coefficient negative; R², and the worst relative residual.
+    """row[target] = constant + Σ c row[name], no coefficient negative, and the worst relative residual.
 
     Squares of relative residuals are summed, so that small cases count as much as large ones."""
     values = np.array([float(row[target]) for row in rows])
@@ -222,10 +201,5 @@ def plane(rows: Sequence[Row], target: str, names: Sequence[str]) -> dict[str, f
     scale = design.max(axis=0)  # keeps the solver's columns of one size
     solution, _ = nnls(design / scale / values[:, None], np.ones(len(rows)))
     found = solution / scale
-    residual = design @ found - values
-    return {
-        "constant": float(found[0]),
-        **{name: float(value) for name, value in zip(names, found[1:], strict=True)},
-        "r2": 1 - float(np.sum(residual**2) / np.sum((values - values.mean()) ** 2)),
-        "worst": float(np.abs(residual / values).max()),
-    }
+    worst = np.abs(design @ found / values - 1).max()
+    return {name: float(x) for name, x in zip(("constant", *names, "worst"), (*found, worst), strict=True)}

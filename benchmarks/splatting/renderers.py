@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -11,11 +11,19 @@ import numpy as np
 
 from benchmarks.common.view import perspective
 from benchmarks.splatting.cases import COLOUR, Workload
-from benchmarks.splatting.counts import Counts, count
 from mi_refgs.kernels.device import upload
-from mi_refgs.kernels.timing import listening, phase
+from mi_refgs.kernels.timing import listening
 from mi_refgs.splat import Camera, Composited, list_by_tile, project, splat
+from mi_refgs.splat.lanes import advance
 from mi_refgs.surfels.table import Surfels
+
+
+class Counts(NamedTuple):
+    """Splatting work of one view."""
+
+    pairs: int  # surfel-tile pairs listed
+    evaluated: int  # surfel-pixel pairs of a tile at all of its pixels, until the last of these has ended
+    contributing: int  # surfel-pixel pairs with α ≥ ALPHA_MIN, before the pixel's end
 
 
 class Ours:
@@ -55,29 +63,40 @@ class Ours:
         raw, columns = dr.detach(self.raw), dr.detach(self.columns)
         dr.enable_grad(raw, columns)
         maps = _maps(splat(Surfels(raw), columns, self.camera))
-        return [*maps, *self._gradients(maps, [*raw.values(), *columns])]
-
-    @phase("splat backward")
-    def _gradients(self, maps: list[Any], leaves: list[Any]) -> list[Any]:
         for image, weight in zip(maps, self.weights, strict=True):
             dr.set_grad(image, weight)
         dr.enqueue(dr.ADMode.Backward, maps)
         dr.traverse(dr.ADMode.Backward)
-        return [dr.grad(leaf) for leaf in leaves]
+        return [*maps, *(dr.grad(leaf) for leaf in (*raw.values(), *columns))]
 
     def counts(self) -> Counts:
-        """The work of a view."""
-        with dr.suspend_grad():
-            footprints = project(Surfels(self.raw), self.camera)
-            return count(footprints, list_by_tile(footprints, self.camera), self.camera)
+        """Walk the lists as `splat.composite` does, and count; waits for the device."""
+        camera, footprints = self.camera, project(Surfels(dr.detach(self.raw)), self.camera)
+        lists, (width, height) = list_by_tile(footprints, camera), camera.tile
+        if not lists.pairs:
+            return Counts(0, 0, 0)
+        lane = dr.arange(mi.UInt32, camera.tiles[0] * camera.tiles[1] * width * height)
+        tile, local = lane // (width * height), lane % (width * height)
+        x = (tile % camera.tiles[0]) * width + local % width - camera.tile_offset[0]
+        y = (tile // camera.tiles[0]) * height + local // width - camera.tile_offset[1]
+        pixel = mi.Point2f(mi.Float(x) + 0.5, mi.Float(y) + 0.5)
+        begin = dr.gather(mi.UInt32, lists.pair_begin, tile)
+        end = dr.gather(mi.UInt32, lists.pair_end, tile)
 
-    def launches(self, call: Callable[[], Any]) -> tuple[int, int]:
-        """Kernel launches of a warm call, and the kernels that it compiled."""
-        before = dr.detail.launch_stats()
-        dr.eval(call())
-        dr.sync_thread()
-        after = dr.detail.launch_stats()
-        return after[0] - before[0], after[2] - before[2]
+        def body(pair: Any, active: Any, transmittance: Any, steps: Any, hits: Any) -> Any:
+            surfel = dr.gather(mi.UInt32, lists.surfel_from_pair, pair, active)
+            row = [dr.gather(mi.Float, column, surfel, active) for column in footprints.columns]
+            sample = footprints.primitive.evaluate(row, pixel, camera.near)
+            weight, after, goes_on = advance(sample, active, transmittance)
+            hits = hits + dr.select(weight > 0, mi.UInt32(1), mi.UInt32(0))
+            return pair + 1, goes_on, after, steps + 1, hits
+
+        inside = (x < camera.width) & (y < camera.height)
+        state = (begin, inside, mi.Float(1), mi.UInt32(0), mi.UInt32(0))
+        *_, steps, hits = dr.while_loop(state, lambda pair, active, *_: active & (pair < end), body)
+        dr.eval(steps, hits)
+        visited = int(dr.sum(dr.block_reduce(dr.ReduceOp.Max, steps, width * height))[0])
+        return Counts(lists.pairs, width * height * visited, int(dr.sum(hits)[0]))
 
 
 class _Arguments:

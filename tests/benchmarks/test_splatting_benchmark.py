@@ -23,11 +23,9 @@ def test_small_instance_is_consistent(result: dict[str, Any]) -> None:
     assert len(result["rows"]) == 4
     for row in result["rows"]:
         assert 0 < row["contributing"] <= row["evaluated"] <= 16 * row["pairs"]
-        assert row["covered"] <= min(row["pixels"], row["contributing"])
-        assert row["misses_forward"] == row["misses_both"] == 0
         assert row["bound_forward_ms"] < row["forward_ms"] and row["bound_both_ms"] < row["both_ms"]
     for stage in result["step"].values():
-        assert set(measure.PHASES) <= set(stage["phases_ms"])
+        assert {"project", "tile lists", "splat forward", "splat backward"} <= set(stage["phases_ms"])
     for row in result["errors"]:
         assert row["image"] <= 1e-4 and row["left_out"] < 0.2 and row["order"] < 1e-5
         assert all(0 < row[f"gradient_{name}"] <= 1e-3 for name in measure.CLASSES)
@@ -48,10 +46,8 @@ def test_counts_match_reference(make: Any) -> None:
     shown = reference.render(scene_of(case, pixels, product_order(case, pixels))).shown
     counts = Ours.of(workload, 0).counts()
     assert counts.contributing == pytest.approx(shown.sum(), rel=2e-3)  # float32 may decide otherwise
-    assert counts.covered == pytest.approx(shown.any(axis=0).sum(), abs=2)
-    assert np.abs(np.array(counts.pixels_of_surfel) - shown.sum(axis=1)).max() <= 2
     if make is opaque:
-        assert counts.visited < 0.9 * counts.pairs  # or this would not test that pixels end
+        assert counts.evaluated < 0.9 * 16 * counts.pairs  # or this would not test that pixels end
 
 
 def test_volprim_shows_the_same_object() -> None:

@@ -11,8 +11,8 @@ from benchmarks.common.errors import compare
 from benchmarks.common.montecarlo import estimate
 from benchmarks.common.report import where
 from benchmarks.visibility import cases, harmonics
+from benchmarks.visibility.__main__ import HARMONICS, tradeoffs
 from benchmarks.visibility.cases import SMALL, Rule
-from benchmarks.visibility.measure import HARMONICS, tradeoffs
 from benchmarks.visibility.setup import Setup
 from mi_refgs.shade.sh import sh_basis
 
