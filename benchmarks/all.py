@@ -12,14 +12,12 @@ same command continues an interrupted run."""
 from __future__ import annotations
 
 import argparse
-import json
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 
@@ -29,22 +27,19 @@ from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
 from benchmarks.fits.measure import Workplace, group
 from benchmarks.fits.plan import GROUPS, TIMED, Fit
-from benchmarks.tables import PAGES
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 
 
 @dataclass(frozen=True)
 class Part:
-    """A data file, and the module with arguments that measures it.
+    """A data file, and what measures it: a group of fits, or the module of this name.
 
-    {data} is --data, {run} the run of TIMED. Modules of `tables.PAGES` write their file themselves;
-    others print JSON, which becomes `result`. Groups of fits have no module."""
+    In its arguments, {data} is --data, {run} the run of TIMED."""
 
     name: str
     minutes: float  # on an idle machine with two cores
-    module: str = ""
-    small: str | None = None  # arguments of a small instance
+    arguments: str = ""
 
 
 TRACING = {"front": 5, "decisions": 20, "photographs": 14}  # minutes of path tracing in a group
@@ -54,18 +49,18 @@ def _fits() -> Iterator[Part]:
     done: set[Fit] = set()  # a fit of two groups is measured once
     for name, fits in GROUPS.items():
         minutes = sum(fit.minutes for fit in {*fits} - done) + TRACING.get(name, 0)
-        yield Part(name, round(minutes), small="")
+        yield Part(name, round(minutes))
         done |= {*fits}
 
 
 PARTS = (
-    Part("splatting", 5, "benchmarks.splatting", "--small"),
-    Part("splitsum", 9, "benchmarks.splitsum", "--small"),
-    Part("visibility", 4, "benchmarks.visibility --mesh {data}/meshes/bob_tri.obj", "--small"),
-    Part("endtoend", 4, "benchmarks.endtoend", "--small"),
-    Part("stability", 15, "benchmarks.stability", "--quick --only light"),
+    Part("splatting", 5),
+    Part("splitsum", 9),
+    Part("visibility", 4, "--mesh {data}/meshes/bob_tri.obj"),
+    Part("endtoend", 4),
+    Part("stability", 15),
     *_fits(),
-    Part("frames", 2, "benchmarks.frames {run}"),
+    Part("frames", 2, "--run {run}"),
 )
 """In this order: those with {run} need groups of fits."""
 
@@ -85,8 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
     mi.set_variant("llvm_ad_rgb")
     folder, build = (options.output or RESULTS).resolve(), commit()
     chosen = [part for part in PARTS if part.name in options.only]
-    if options.small:
-        chosen = [part for part in chosen if part.small is not None]
+    chosen = [part for part in chosen if not (options.small and "{run}" in part.arguments)]
     left = [part for part in chosen if not is_done(folder / f"{part.name}.json", build)]
     for part in chosen:
         print(f"{part.name:<15}{part.minutes:>4} min  {'to do' if part in left else 'done'}")
@@ -108,27 +102,18 @@ def is_done(path: Path, build: str) -> bool:
 def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
     """Measure a part, and print how long it took; returns whether that succeeded."""
     begin, work = time.monotonic(), folder / "work" if options.small else Path("runs", "all")
-    words = part.module.format(data=options.data, run=work / commit() / TIMED.name / "run").split()
-    words += (part.small or "").split() if options.small else []
-    writes = part.name in PAGES  # its data file itself
-    if writes:
-        words += ["--quiet", *(["-o", str(folder)] if options.small else [])]
-
-    def measure() -> dict[str, Any]:
-        if part.name in GROUPS:
-            return group(part.name, Workplace(ROOT / work, options.data, options.small))
-        done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        if done.returncode:
-            raise InputError(f"python -m {' '.join(words)}: exit code {done.returncode}; see above")
-        return {} if writes else {"result": json.loads(done.stdout)}
-
+    arguments = part.arguments.format(data=options.data, run=work / commit() / TIMED.name / "run").split()
+    words = [f"benchmarks.{part.name}", "--quiet", "-o", str(folder)]
+    words += ["--small"] if options.small else arguments
     print(f"{part.name} …", flush=True)
     try:
-        if options.data is None and "{data}" in part.module and not options.small:
+        if options.data is None and "{data}" in part.arguments and not options.small:
             raise InputError(f"{part.name}: --data: missing; give the folder")
-        found = recorded(measure)
-        if not writes:
-            write_result(folder / f"{part.name}.json", found)
+        if part.name in GROUPS:
+            place = Workplace(ROOT / work, options.data, options.small)
+            write_result(folder / f"{part.name}.json", recorded(lambda: group(part.name, place)))
+        elif code := subprocess.run([sys.executable, "-m", *words], cwd=ROOT).returncode:
+            raise InputError(f"python -m {' '.join(words)}: exit code {code}; see above")
     except InputError as error:
         print(error, file=sys.stderr, flush=True)
         return False

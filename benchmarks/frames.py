@@ -1,20 +1,16 @@
-"""Times of images of a run at three sizes, without derivatives.
-
-python -m benchmarks.frames RUN"""
+"""Times of images of a run at three sizes, without derivatives: python -m benchmarks.frames --run RUN"""
 
 from __future__ import annotations
 
-import json
 import math
+import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
-
-from benchmarks.common.report import plain_parser
+from benchmarks.common.report import benchmark
 from benchmarks.common.timing import milliseconds
 from mi_refgs import Camera, load
 
@@ -37,9 +33,17 @@ def measure(run: Path, sizes: Sequence[int | tuple[int, int]] = SIZES) -> list[d
     return [{"width": width, "height": height, "frame_ms": ms} for (width, height), ms in times.items()]
 
 
+@dataclass(frozen=True)
+class Settings:
+    """The runs, each of whose images are timed."""
+
+    runs: tuple[str, ...] = ()
+
+
+def measure_runs(settings: Settings, quiet: bool) -> dict[str, Any]:
+    """Times of the images of all runs."""
+    return {"frames": [row for run in settings.runs for row in measure(Path(run))]}
+
+
 if __name__ == "__main__":
-    mi.set_variant("llvm_ad_rgb")
-    parser = plain_parser("frames", __doc__)
-    parser.add_argument("run", type=Path)
-    frames = measure(parser.parse_args().run)
-    print(json.dumps({"frames": frames, "threads": int(dr.thread_count())}))
+    sys.exit(benchmark("frames", __doc__, measure_runs, Settings(), several=("--run", "runs")))

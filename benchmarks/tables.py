@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,18 +22,7 @@ def values(name: str, result: Result) -> Values:
     """Return the tables and numbers of a data file by name; raises InputError for rows of several builds."""
     if name in GROUPS:
         return fits(name, result)
-    if name in PAGES:
-        return PAGES[name](result)
-    return dict(_numbers(result["result"]))
-
-
-def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the numbers of nested objects and lists as text, by the path of their keys."""
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inner in items:
-        yield from _numbers(inner, f"{name}_{key}".strip("_"))
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        yield name, f"{value:,}" if isinstance(value, int) else number(value)
+    return PAGES[name](result)
 
 
 # ---------- Fits ----------
@@ -445,6 +434,11 @@ def corpus(result: Result) -> Values:
     return {"table": table(["file", "result", "what is said first"], cells)}
 
 
+def frames(result: Result) -> Values:
+    """Return the time of an image of each size."""
+    return {f"frames_{i}_frame_ms": number(row["frame_ms"]) for i, row in enumerate(result["frames"])}
+
+
 PAGES: dict[str, Callable[[Result], Values]] = {
     "splatting": splatting,
     "splitsum": splitsum,
@@ -452,5 +446,6 @@ PAGES: dict[str, Callable[[Result], Values]] = {
     "stability": stability,
     "endtoend": endtoend,
     "corpus": corpus,
+    "frames": frames,
 }
-"""Benchmarks that write their data file themselves."""
+"""By benchmark."""

@@ -91,44 +91,36 @@ def plain_parser(name: str, description: str | None) -> argparse.ArgumentParser:
     )
 
 
-def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
-    """Return a parser of the options of every benchmark that writes a data file. Sets Mitsuba's variant."""
-    mi.set_variant("llvm_ad_rgb")
-    mi.set_log_level(mi.LogLevel.Error)
-    parser = plain_parser(name, description)
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="folder of the data file")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    return parser
-
-
 def benchmark(
     name: str,
     description: str | None,
     measure: Callable[[Any, bool], dict[str, Any]],  # of the settings, and whether quiet
     page: Any,
-    small: Any,
-    files: tuple[str, str] = ("", ""),  # a repeatable option, and the settings' field to which it adds
+    small: Any = None,
+    several: tuple[str, str] = ("", ""),  # a repeatable option, and the settings' field to which it adds
 ) -> int:
-    """Measure by `page`, with --small by `small`; write the data file. The exit code is 2 for bad input."""
-    parser, (option, field) = make_parser(name, description), files
-    text = "a coarse instance, below a minute"
-    parser.add_argument("--small", action="store_const", const=small, default=page, help=text)
+    """Measure by `page`, with --small by `small`, and write NAME.json; returns the exit code: 2 for bad
+    input, 1 if the result has cases under "failed", which are printed."""
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    parser, (option, field) = plain_parser(name, description), several
+    parser.set_defaults(settings=page)
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="folder of the data file")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    if small is not None:
+        text = "a coarse instance, below a minute"
+        parser.add_argument("--small", action="store_const", const=small, dest="settings", help=text)
     if option:
-        parser.add_argument(option, metavar="FILE", action="append", default=[], dest="files")
+        parser.add_argument(option, action="append", default=[], dest="several", help="repeatable")
     options = parser.parse_args()
-    settings = options.small
+    settings, path = options.settings, options.output / f"{name}.json"
     if option:
-        settings = replace(settings, **{field: (*getattr(settings, field), *options.files)})
-    return write_measured(name, options, lambda: measure(settings, options.quiet))
-
-
-def write_measured(name: str, options: argparse.Namespace, measure: Callable[[], dict[str, Any]]) -> int:
-    """Measure, and write NAME.json to the output folder; returns the exit code, 2 for bad input."""
-    path = options.output / f"{name}.json"
+        settings = replace(settings, **{field: (*getattr(settings, field), *options.several)})
     try:
-        write_result(path, recorded(measure))
+        result = write_result(path, recorded(lambda: measure(settings, options.quiet)))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
     print(path)
-    return 0
+    print(*result.get("failed", []), sep="\n", end="", file=sys.stderr)
+    return int(bool(result.get("failed")))

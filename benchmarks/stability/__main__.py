@@ -1,17 +1,16 @@
 """Hard cases against a float64 reference.
 
     python -m benchmarks.stability                     every case, in 15 minutes on 2 cores
-    python -m benchmarks.stability --quick -o out      without large cases, fits, the method's own error
     python -m benchmarks.stability --only light -o out cases whose name contains a word; repeatable
+    python -m benchmarks.stability --small -o out      one case
 
-Writes stability.json; `python -m benchmarks.pages` makes the tables and the plot of docs/stability.md. The
-exit code is 1 if a case fails."""
+Writes stability.json; `python -m benchmarks.pages` makes the tables and the plot of docs/stability.md."""
 
 from __future__ import annotations
 
 import math
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -19,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common.fits import make_trainer, sphere_data
-from benchmarks.common.report import make_parser, write_measured
+from benchmarks.common.report import benchmark
 from benchmarks.stability import bias, response
 from benchmarks.stability.cases import catalogue
 from benchmarks.stability.measure import IMAGE_LIMIT, measure as measure_case
@@ -84,11 +83,17 @@ def fit(name: str) -> dict[str, Any]:
     }
 
 
-def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = False) -> dict[str, Any]:
-    """Measure everything on the page; `only`: cases whose name contains one of these words."""
-    words = only or [""]
-    cases = [case for case in catalogue() if case.quick or not quick]
-    chosen = [case for case in cases if any(word in case.name for word in words)]
+@dataclass(frozen=True)
+class Settings:
+    """One run: all that the page shows, or `only` cases whose name contains one of these words."""
+
+    only: tuple[str, ...] = ()
+
+
+def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
+    """Measure; `failed` has a line for each case that does not hold."""
+    only = settings.only
+    chosen = [case for case in catalogue() if any(word in case.name for word in only or [""])]
     rows = []
     for case in tqdm(chosen, desc="cases", disable=quiet):
         rows.append(_finite(measure_case(case, floors=case.quick).record()))
@@ -97,9 +102,8 @@ def measure(quick: bool = False, only: list[str] | None = None, quiet: bool = Fa
     result |= {name: [] for name in ("curve", "losses", "fits", "rules", "gradient")}
     if not only:
         result |= {name: [_finite(row) for row in found] for name, found in response.measure().items()}
-    if not (only or quick):
         result |= bias.measure() | {"fits": [fit(name) for name in FITS]}
-    return result
+    return result | {"failed": failures(result)}
 
 
 def _finite(row: dict[str, Any]) -> dict[str, Any]:
@@ -124,22 +128,9 @@ def _misses(row: dict[str, Any]) -> bool:
     return not all(row[key] is not None and row[key] <= IMAGE_LIMIT for key in ("value", "slope"))
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure; returns the exit code, 1 if a case fails, 2 for bad input."""
-    parser = make_parser("stability", __doc__)
-    parser.add_argument("--quick", action="store_true", help="what every test run can afford")
-    parser.add_argument("--only", metavar="WORD", action="append", default=[], help="cases named so")
-    options = parser.parse_args(arguments)
-    failed: list[str] = []
-
-    def run() -> dict[str, Any]:
-        result = measure(options.quick, options.only, options.quiet)
-        failed.extend(failures(result))
-        return result
-
-    code = write_measured("stability", options, run)
-    print(*failed, sep="\n", end="\n" * bool(failed), file=sys.stderr)
-    return code or int(bool(failed))
+def main() -> int:
+    """Measure; returns the exit code of `benchmark`."""
+    return benchmark("stability", __doc__, measure, Settings(), Settings(("one surfel",)), ("--only", "only"))
 
 
 if __name__ == "__main__":

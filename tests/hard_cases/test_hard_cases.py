@@ -1,5 +1,6 @@
 """The cheap hard cases of `benchmarks.stability` with its limits, and tests of the measurement itself."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +105,9 @@ def test_wrong_footprint_gradients_fail(monkeypatch: pytest.MonkeyPatch) -> None
     assert verdict.startswith("FAILS") and "position" in verdict and "image" not in verdict
 
 
-def test_measured_file(tmp_path: Path) -> None:
-    assert run.main(["--only", "one surfel", "-o", str(tmp_path), "--quiet"]) == 0
+def test_measured_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["", "--only", "one surfel", "-o", str(tmp_path), "--quiet"])
+    assert run.main() == 0
     text = (tmp_path / "stability.json").read_text()
     assert '"one surfel"' in text and '"within limits"' in text and "NaN" not in text
 

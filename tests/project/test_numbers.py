@@ -55,14 +55,14 @@ def results(tmp_path: Path) -> Path:
     build = recorded(dict)["build"] | {"commit": "abc", "clean": True}
     first = {"build": build, "seconds": 1.0, "rows": [row(), row(psnr=30.04), row(source="chair")]}
     write_result(tmp_path / "front.json", first)
-    write_result(tmp_path / "times.json", {"build": build, "seconds": 1.0, "result": {"a": [{"b": 7}]}})
+    write_result(tmp_path / "frames.json", {"build": build, "seconds": 1.0, "frames": [{"frame_ms": 7}]})
     return tmp_path
 
 
 def test_markers_are_filled(results: Path) -> None:
-    names = ("front.mirror_ring_auto_psnr", "times.a_0_b", "frames.not_measured")
+    names = ("front.mirror_ring_auto_psnr", "frames.frames_0_frame_ms", "images.not_measured")
     text = " ".join(f"<!-- {name} -->?<!-- / -->" for name in names)
-    assert re.sub(r"<!--.*?-->", "", pages.filled(text, results)) == "28.0 dB 7 ?"
+    assert re.sub(r"<!--.*?-->", "", pages.filled(text, results)) == "28.0 dB 7.00 ?"
     found = pages.filled("<!-- front.table -->?<!-- / -->", results)
     assert "| 29.0 dB ± 1.4 dB |" in found and "*Commit abc, " in found and "load " in found
     assert pages.filled(found, results) == found
@@ -73,7 +73,7 @@ def test_markers_are_filled(results: Path) -> None:
 def test_results_of_several_builds_are_refused(results: Path) -> None:
     with pytest.raises(InputError, match="several builds"):
         tables.fits("front", {"build": {"commit": "abc"}, "rows": [row(), row(build="abd")]})
-    first = pages.values(results / "times.json")["about"]
+    first = pages.values(results / "frames.json")["about"]
     with pytest.raises(InputError, match="abc and abd; measure all with one"):
         merged([first, first | {"commit": "abd"}])
 
