@@ -61,7 +61,6 @@ class Row:
     order: float
     image_floor: float  # change of the exact answer by one ulp of the inputs
     gradient_floor: dict[str, float]
-    negligible: list[str]  # classes of less than NEGLIGIBLE
 
     @property
     def verdict(self) -> str:
@@ -88,7 +87,7 @@ class Row:
         gradient = max(self.gradient_floor.values(), default=0.0)
         flat = {"case": self.name, "image": self.image, "maps": self.maps, "ulp_image": self.image_floor}
         flat |= {"ulp_gradient": gradient, "non_finite": self.non_finite, "kept": self.kept}
-        flat |= {"order": self.order, "negligible": " ".join(self.negligible), "verdict": self.verdict}
+        flat |= {"order": self.order, "verdict": self.verdict}
         return flat | {f"gradient_{name}": self.gradients.get(name) for name in GRADIENTS}
 
 
@@ -116,14 +115,8 @@ def product(case: Case, weights: dict[str, Array]) -> Found:
     used = light.prefilter() if case.reflectance == "split_sum" else None
     scene = SurfelScene(surfels, shading, used, occluder)
     frame = render(scene, camera, Request(scene.all_aovs if used is not None else ("normal",)))
-    planes: dict[str, list[Any]] = {
-        "radiance": list(frame.radiance),
-        "alpha": [frame.alpha],
-        "depth": [frame.depth],
-        "normal": list(frame.normal),
-    }
-    for name, value in frame.maps.items():
-        planes[name] = list(value) if name == "albedo" else [value]
+    maps = {"radiance": frame.radiance, "alpha": frame.alpha, "depth": frame.depth, "normal": frame.normal}
+    planes = {n: [x] if dr.depth_v(x) == 1 else [*x] for n, x in (maps | frame.maps).items()}
     others: list[Any] = list(normals_from_depth(frame.depth, frame.alpha, camera)[0])
     if frame.terms is not None:
         others += [*frame.terms.diffuse, *frame.terms.specular, *frame.terms.indirect]
@@ -131,15 +124,14 @@ def product(case: Case, weights: dict[str, Array]) -> Found:
     for name, weight in weights.items():
         for plane, w in zip(planes[name], weight.reshape(len(weight), -1).T, strict=True):
             loss += dr.sum(plane * upload(w))
-    attached = dr.grad_enabled(loss)
-    if attached:
+    if dr.grad_enabled(loss):
         dr.backward(loss)
     gradients = {name: dr.grad(x).numpy() for name, x in surfels.raw.items()}
     gradients["light"] = dr.grad(light.raw).numpy()
     pixels = case.camera.width * case.camera.height
-    maps = {n: np.stack([_plane(x, pixels) for x in values], 1) for n, values in planes.items()}
-    arrays = [*maps.values(), *gradients.values(), *(_plane(x, pixels) for x in others)]
-    return Found(maps, gradients, sum(int(np.sum(~np.isfinite(x))) for x in arrays))
+    shown = {n: np.stack([_plane(x, pixels) for x in values], 1) for n, values in planes.items()}
+    arrays = [*shown.values(), *gradients.values(), *(_plane(x, pixels) for x in others)]
+    return Found(shown, gradients, sum(int(np.sum(~np.isfinite(x))) for x in arrays))
 
 
 def _plane(x: Any, pixels: int) -> Array:
@@ -183,19 +175,16 @@ def measure(case: Case, floors: bool = True) -> Row:
     kept = float(np.mean(~band[shown])) if shown.any() else 1.0
     inverted = inversion(case, scene, truth) if len(order) else 0.0
     return Row(
-        case.name, image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor,
-        negligible(exact, scene.raw),
-    )  # fmt: skip
+        case.name, image, others, gradients, found.non_finite, kept, inverted, image_floor, gradient_floor
+    )
 
 
 def map_errors(found: dict[str, Array], exact: dict[str, Array], keep: Array) -> tuple[float, float]:
     """Largest errors, relative to the largest value of a map: radiance and alpha; the other maps."""
     errors = {}
-    for name, values in exact.items():
-        if name in found and keep.any():
-            peak = float(np.abs(values).max())
-            error = float(np.abs(found[name] - values)[keep].max())
-            errors[name] = error / peak if peak > 0 else error
+    for name in exact.keys() & found.keys() if keep.any() else ():
+        error = float(np.abs(found[name] - exact[name])[keep].max())
+        errors[name] = error / (float(np.abs(exact[name]).max()) or 1)
     first = [errors.pop(name, 0.0) for name in ("radiance", "alpha")]
     return max(first), max(errors.values(), default=0.0)
 
@@ -212,12 +201,6 @@ def gradient_errors(
     return {n: e / s if (s := max(sizes[n], least)) > 0 else e for n, e in errors.items()}
 
 
-def negligible(exact: dict[str, Array], raw: dict[str, Array]) -> list[str]:
-    """Classes with a gradient, but of less than NEGLIGIBLE."""
-    sizes = _sizes(exact, raw)
-    return [n for n, size in sizes.items() if 0 < size < NEGLIGIBLE * max(sizes.values())]
-
-
 def _sizes(gradients: dict[str, Array], raw: dict[str, Array]) -> dict[str, float]:
     units: dict[str, Any] = {"position": _extent(raw["position"])}
     length = np.linalg.norm(raw["rotation"], axis=1, keepdims=True)
@@ -228,10 +211,7 @@ def _sizes(gradients: dict[str, Array], raw: dict[str, Array]) -> dict[str, floa
 
 def _extent(position: Array) -> float:
     """Root mean square distance of positions to their mean; 1 where they coincide."""
-    position = np.asarray(position, np.float64)
-    if not len(position):
-        return 1.0
-    return float(np.sqrt(np.mean(np.sum((position - position.mean(0)) ** 2, 1)))) or 1.0
+    return float(np.sqrt(np.asarray(position, np.float64).var(0).sum())) or 1.0 if len(position) else 1.0
 
 
 def _gradients(case: Case, scene: reference.Scene, truth: reference.Image) -> dict[str, Array]:
@@ -295,12 +275,8 @@ def condition(
         pose[:3, 3] = nudged(pose[:3, 3])
         raw_light = nudged(np.asarray(case.light, np.float64))
         light = None if scene.light is None else light_of(raw_light)
-        moved = replace(
-            scene,
-            raw={name: nudged(x) for name, x in scene.raw.items()},
-            camera=replace(scene.camera, to_world=pose),
-            light=light,
-        )
+        raw = {name: nudged(x) for name, x in scene.raw.items()}
+        moved = replace(scene, raw=raw, camera=replace(scene.camera, to_world=pose), light=light)
         image = reference.render(moved, weights)
         images.append(max(map_errors(image.maps, truth.maps, ~band)))
         gradients.append(

@@ -117,7 +117,6 @@ def test_verdicts() -> None:
         given: dict[str, Any] = {
             "name": "", "image": 1e-5, "maps": 1e-5, "gradients": {"scale": 1e-3}, "non_finite": 0,
             "kept": 1.0, "order": 0.0, "image_floor": 0.0, "gradient_floor": {"scale": 0.0},
-            "negligible": [],
         }  # fmt: skip
         return Row(**(given | changes)).verdict
 
