@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import paper_tables
-from benchmarks.paper_tables import Figures, place_of
+from benchmarks.paper_tables import TABLES, place_of
 from mi_refgs.compare.table import Row, Scene, Statistic, Table
 from mi_refgs.errors import InputError
 from mi_refgs.methods import load, names
@@ -22,12 +22,11 @@ PLACES = {
 
 
 def test_scenes_are_recognised_by_folder_name() -> None:
-    assert {folder: place_of(Path(folder), Figures.read()) for folder in PLACES} == PLACES
+    assert {folder: place_of(Path(folder)) for folder in PLACES} == PLACES
 
 
 def test_methods_name_rows_of_the_paper() -> None:
-    figures = Figures.read()
-    known = {s for t in figures.tables.values() for systems in t.metrics.values() for s in systems}
+    known = {s for t in TABLES.values() for systems in t["metrics"].values() for s in systems}
     rows = {name: load(name).about.paper_row for name in names()}
     assert rows["ref_gaussian"] == "Ref-Gaussian" and set(rows.values()) <= known | {""}
     for name, row in rows.items():  # a row that a file inherits is another method's
@@ -42,28 +41,26 @@ def scene_of(name: str, psnr: float, seconds: float) -> Scene:
 
 
 def test_paper_table_contains_our_figures() -> None:
-    figures = Figures.read()
     ours = Table([scene_of("ball", 36.0, 1800), scene_of("car", 30.0, 5400)])
-    found = paper_tables.compared(1, ours, figures)
+    found = paper_tables.compared(1, ours)
     lines = {line.title: line for line in found.lines["psnr"]}
     assert lines["  ours: mine"].values == (36.0, 30.0, *[None] * 15)
     assert lines["  ours − paper"].values[:2] == pytest.approx((36.0 - 37.01, 30.0 - 31.04))
     assert found.missing["Shiny Blender"] == ["coffee", "helmet", "teapot", "toaster"]
     assert len(found.missing["Glossy Synthetic"]) == 8 and len(found.missing["Ref-Real"]) == 3
     assert [line.title for line in found.lines["ssim"] if "ours" in line.title] == []
-    text = paper_tables.text(found, figures)
+    text = paper_tables.text(1, ours)
     assert "shiny_blender/toaster" in text and "shiny_blender/ball" not in text and "-1.01" in text
 
-    means = paper_tables.compared(6, ours, figures)
+    means = paper_tables.compared(6, ours)
     by_title = {line.title: line.values for line in means.lines["psnr"]}
     assert by_title["  ours: mine"] == (33.0,) and by_title["  ours − paper"] == (None,) and means.partial
-    hours = {line.title: line.values for line in paper_tables.compared(2, ours, figures).lines["train_hours"]}
+    hours = {line.title: line.values for line in paper_tables.compared(2, ours).lines["train_hours"]}
     assert hours["  ours: mine"] == (1.0,)
 
 
 def test_table_without_runs() -> None:
-    figures = Figures.read()
-    text = paper_tables.text(paper_tables.compared(5, None, figures), figures)
+    text = paper_tables.text(5, None)
     assert "NeRO (published)" in text and "29.73" in text and "glossy_synthetic/tbell" in text
     with pytest.raises(InputError, match="give one of 1, 2"):
-        paper_tables.compared(9, None, Figures.read())
+        paper_tables.compared(9, None)
