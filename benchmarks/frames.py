@@ -1,7 +1,5 @@
 """Times of images of a run at three sizes, without derivatives: python -m benchmarks.frames --run RUN"""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Sequence

@@ -6,8 +6,6 @@
 The figures of paper_tables.json are the paper's: nothing here measured them. A data set counts as a scene of
 the paper by the name of its folder."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from statistics import fmean

@@ -7,8 +7,6 @@
 Every method shades the same pixels. Writes splitsum.json; `python -m benchmarks.pages` makes the tables and
 the plot of docs/splitsum.md."""
 
-from __future__ import annotations
-
 import functools
 import sys
 from collections.abc import Callable

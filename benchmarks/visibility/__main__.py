@@ -6,8 +6,6 @@
 
 Writes visibility.json; `python -m benchmarks.pages` makes the tables and the plot of docs/visibility.md."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any
