@@ -1,6 +1,7 @@
 """Write the numbers of benchmarks/results/ into the pages: python -m benchmarks.pages
 
-A marker <!-- FILE.NAME --> … <!-- / --> contains what FILE.json says: a table with its caption, or a number.
+A marker <!-- FILE.NAME --> … <!-- / --> contains what FILE.json says: a number, or a table, whose caption is
+left out if the page has it already.
 <!-- caption.FILE.FILE --> is the caption of a table whose cells contain markers. Where FILE.json is missing,
 the text stays. results/settings.toml lists, by page, the numbers that nothing measures, such as bounds."""
 
@@ -52,6 +53,7 @@ def filled(text: str, folder: Path) -> str:
     """Return a page with the markers filled whose data files are in a folder.
 
     Raises InputError for an unknown name, and for captions of several builds."""
+    captions: set[str] = set()
 
     def replaced(found: re.Match[str]) -> str:
         names = files_of(found[0])
@@ -65,7 +67,8 @@ def filled(text: str, folder: Path) -> str:
         elif found[2] not in known[0]:
             raise InputError(f"<!-- {found[1]}.{found[2]} -->: not in the data file; correct the marker")
         elif (content := str(known[0][found[2]])).startswith("|"):
-            content = f"\n\n{content}\n\n{caption}"
+            content = f"\n\n{content}\n\n{'' if caption in captions else caption}"
+            captions.add(caption)
         return f"<!-- {found[1]}.{found[2]} -->{content}<!-- / -->"
 
     return MARKER.sub(replaced, text)

@@ -166,9 +166,6 @@ def splatting(result: Result) -> Values:
     ratios = [row["volprim_both_ms"] / row["both_ms"] for row in compared]
     (typical,) = where(rows, surfels=50_000, size=512, spread=1.5) or rows[-1:]
     case = {"surfels, image": "{surfels:,}, {size}², k = {spread:g}"}
-    keys = ("surfels", "size", "spread")
-    error = {tuple(row[k] for k in keys): row["image"] for row in wrong}
-    brief = [row | {"image": error.get(tuple(row[k] for k in keys))} for row in compared]
     cost, gradients = result["cost"], [key for key in wrong[0] if key.startswith("gradient_")]
     terms = {"contributing": "contributing pair", "pairs": "listed pair", "surfels": "surfel"}
     formula = "" if cost is None else f"{number(cost['constant'])} ms" + "".join(
@@ -196,15 +193,6 @@ def splatting(result: Result) -> Values:
                 "image": "{image:.1e}",
                 "depth, normals": "{maps:.1e}",
                 **{f"∂ {key.removeprefix('gradient_')}": f"{{{key}:.1e}}" for key in gradients},
-            },
-        ),
-        "brief": row_table(
-            [row for row in brief if row["image"] is not None],
-            {
-                **case,
-                "ours, 16 channels": "{both_ms:n} ms",
-                "`volprim_rf_basic`, colour only": "{volprim_both_ms:n} ms",
-                "largest error of the image": "{image:.1e}",
             },
         ),
         "steps": _steps(result["step"]),
@@ -398,7 +386,8 @@ def stability(result: Result) -> Values:
 
 
 def endtoend(result: Result) -> Values:
-    """Time and errors of frames and gradients, by scene and renderer."""
+    """Time and errors of frames and gradients, by scene and renderer, with the fewest and most surfels."""
+    least, *_, most = result["settings"]["surfels"] * 2
 
     def name(row: Row) -> str:
         tracer = "`path`, `prb`" if row["renderer"] == "path" else f"`refgs`, {row['surfels']:,} surfels"
@@ -415,7 +404,7 @@ def endtoend(result: Result) -> Values:
         "error by light": lambda row: percent(row["gradient_error"]),
         "by material": lambda row: percent(row["material_gradient_error"]),
     }
-    return {"frames": row_table(result["rows"], columns)}
+    return {"frames": row_table(where(result["rows"], surfels=(0, least, most)), columns)}
 
 
 def worst_gradient(row: Row) -> float:

@@ -76,7 +76,7 @@ def text_of(build: dict[str, Any]) -> str:
     """Return commit, machine, load and date in words."""
     last, changed, _ = build["commit"].partition("+")
     name = f"{last} with changes" if changed else last
-    load = "load {:.1f} before and {:.1f} after".format(*build["load"])
+    load = "load {:.1f} to {:.1f}".format(*build["load"])
     return f"commit {name}, {build['cpu']}, {build['cores']} cores, {load}, {build['date']}"
 
 
