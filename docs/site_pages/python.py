@@ -77,6 +77,10 @@ def entry(name: str, value: Any) -> Iterator[str]:
 
 
 def _function(name: str, node: ast.FunctionDef) -> Iterator[str]:
+    for part in ast.walk(node):  # annotations of names that the module defines later are strings
+        for field in {"annotation", "returns"} & {*part._fields}:
+            if isinstance(quoted := getattr(part, field), ast.Constant) and isinstance(quoted.value, str):
+                setattr(part, field, ast.parse(quoted.value, mode="eval").body)
     marks = [ast.unparse(mark) for mark in node.decorator_list]
     result = f" -> {ast.unparse(node.returns)}" if node.returns else ""
     if "property" in marks or "cached_property" in marks:

@@ -1,7 +1,5 @@
 """`refgs compare`: methods fitted to the same data sets, and their table."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import sys
@@ -63,7 +61,7 @@ class Compare:
             say(f"{self.output}: {len(wanted)} of {len(planned)} jobs to do, {workers} at once")
             begin, numbers = time.perf_counter(), itertools.count(1)
 
-            def report(job: Job, reason: str | None) -> None:
+            def report(job: "Job", reason: str | None) -> None:
                 outcome = "done" if reason is None else f"failed: {reason}"
                 minutes = (time.perf_counter() - begin) / 60
                 number = f"[{next(numbers)}/{len(wanted)}]"
@@ -84,7 +82,7 @@ class Compare:
         text = f"{markdown(table)}\n{files}"
         return Result(dataclasses.asdict(table), text, 0 if table.complete else 3)
 
-    def _plan(self, workers: int, threads: int | None) -> list[Job]:
+    def _plan(self, workers: int, threads: int | None) -> list["Job"]:
         """Return the checked jobs, after writing them into their run folders."""
         from mi_refgs.compare import jobs
 

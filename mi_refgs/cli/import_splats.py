@@ -1,7 +1,5 @@
 """`refgs import`: a run folder from a PLY of another program, as it is or fitted with materials."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +54,7 @@ class Import:
         cameras = None if self.camera is None else read_cameras(self.camera)
         return self._fitted(cameras) if self.relightable else self._as_it_is(cameras)
 
-    def _as_it_is(self, cameras: Sequence[Camera] | None) -> Result:
+    def _as_it_is(self, cameras: "Sequence[Camera] | None") -> Result:
         from mi_refgs.reconstruction.reconstruction import import_splats
         from mi_refgs.runs.export import save
         from mi_refgs.runs.run import Run
@@ -72,7 +70,7 @@ class Import:
         what = f"{counted(surfels.count, kind)} of SH degree {degree}"
         return Result(data, f"{self.output}: {what}, {counted(len(cameras), 'camera')} in scene.xml")
 
-    def _fitted(self, cameras: Sequence[Camera] | None) -> Result:
+    def _fitted(self, cameras: "Sequence[Camera] | None") -> Result:
         from mi_refgs import methods
         from mi_refgs.reconstruction.relightable_import import import_relightable
 

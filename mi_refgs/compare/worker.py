@@ -2,8 +2,6 @@
 saves its state and ends when its standard input closes, which means that its parent is gone. Exit codes: 0
 done, 2 failed (failed.json has the reason), 143 stopped."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

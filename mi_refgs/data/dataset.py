@@ -2,8 +2,6 @@
 Colour: PNG targets stay sRGB-encoded and are composited in that space, as such data are made: A·rgb + (1 −
 A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·background."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 from collections.abc import Sequence
@@ -61,7 +59,7 @@ class PointCloud:
     position: np.ndarray  # (P, 3) float64, world
     colour: np.ndarray | None = None  # (P, 3) linear, 0 … 1
 
-    def followed_by(self, other: PointCloud) -> PointCloud:
+    def followed_by(self, other: "PointCloud") -> "PointCloud":
         """These points, then others; with colours only if both have some."""
         position = np.concatenate([self.position, other.position])
         if self.colour is None or other.colour is None:
@@ -213,7 +211,7 @@ class Dataset:
     source: Path | None = None  # the file that lists the views
 
     @staticmethod
-    def from_mitsuba(scene: Any, sensors: Any = None, **options: Any) -> Dataset:
+    def from_mitsuba(scene: Any, sensors: Any = None, **options: Any) -> "Dataset":
         """Path-trace views of a Mitsuba scene in memory: what `make_dataset` writes, and a fit takes.
 
         scene: an `mi.Scene` or its file. sensors: Mitsuba sensors or `Camera`s, a number of views around the
@@ -236,7 +234,7 @@ class Dataset:
         """Whether all images have alpha; views need not be loaded."""
         return all(view.has_alpha for view in self.views)
 
-    def held_out(self, every: int) -> tuple[Dataset, Dataset]:
+    def held_out(self, every: int) -> "tuple[Dataset, Dataset]":
         """Two data sets: without every so many views, the first included, and of these validation views."""
         kept = tuple(view for i, view in enumerate(self.views) if i % every)
         return replace(self, views=kept), replace(self, views=self.views[::every])

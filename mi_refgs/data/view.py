@@ -1,7 +1,5 @@
 """One image of a data set with its camera, in NumPy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,7 +53,7 @@ class View:
     tracks: np.ndarray | None = field(default=None, repr=False)
     """(K, 5) column and row of keypoints in pixels of that file, 0 at its corner, and their points, world."""
 
-    def load(self) -> View:
+    def load(self) -> "View":
         """The view with its image decoded; raises InputError for an unreadable file or another size."""
         if isinstance(self.pixels, ImageSource):
             return replace(self, pixels=self.pixels.read()).load()
@@ -91,7 +89,7 @@ class View:
         """The image (H, W, 3), sRGB-encoded."""
         return srgb_from_linear(self.image) if self.is_linear_radiance else self.image
 
-    def camera(self) -> Camera:
+    def camera(self) -> "Camera":
         """The splatter's camera; in Mitsuba's frame both of its focal lengths are negative."""
         from mi_refgs.splat.camera import Camera
 
@@ -108,7 +106,7 @@ class View:
             return (self.depth > 0).astype(np.float32)
         return np.ones((self.height, self.width), np.float32)
 
-    def averaged(self, block: int) -> View:
+    def averaged(self, block: int) -> "View":
         """The loaded view averaged over `block`² pixels, without maps; InputError if it is smaller."""
         if min(self.width, self.height) < block:
             what = f"{self.width} × {self.height} pixels are less than a block of {block}²"

@@ -1,7 +1,5 @@
 """The loss of one rendered view: the sum of registered losses, with the weights of the method."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -52,7 +50,7 @@ class LossInputs:
         light: Light | None = None,
         log_gain: list[Float] | None = None,
         photographed: PhotographedLight | None = None,
-    ) -> LossInputs:
+    ) -> "LossInputs":
         """Display a frame as its target is, with highlights clipped where those of the target are."""
         gain = None
         if log_gain is not None:  # one per pixel: the sum of its derivatives then needs no kernels of its own

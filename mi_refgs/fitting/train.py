@@ -4,8 +4,6 @@ A step is a pure function of the state and the iteration number (view order and 
 the seed and the iteration), so a resumed run repeats a straight one: bit for bit with one thread.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -89,7 +87,7 @@ class Trainer:
         self.targets = Targets(data, self.method.data)
         self.fit.optimiser.groups.update(self.setup.groups(self.fit.params))
 
-    def take(self, other: Trainer, method: Method) -> None:
+    def take(self, other: "Trainer", method: Method) -> None:
         """Continue with the state of another fit of the same views, which may not go on, by this method."""
         self.setup, self.fit = FitSetup(method, self.data), other.fit
         self.health.checked = self.iteration
@@ -156,7 +154,7 @@ class Trainer:
             "skipped_steps": self.health.skipped,
         }
 
-    def train(self, progress: Callable[[Trainer], None] | None = None) -> None:
+    def train(self, progress: "Callable[[Trainer], None] | None" = None) -> None:
         """Run to the last iteration; an interrupt ends it after the current step, saved, and is passed on.
         `progress` is called after each step. Raises InputError when the run folder cannot be written."""
         with held_interrupts() as release:

@@ -1,7 +1,5 @@
 """Interface of the formats of other programs, their registry, and the function that writes them."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,8 +24,8 @@ class Shot:
 
     name: str  # of the image, without ending, such as "train/r_003"
     split: str  # "train" or "test"
-    camera: Camera
-    file: FileCamera | None = None  # where there is a data set; its path is relative to that
+    camera: "Camera"
+    file: "FileCamera | None" = None  # where there is a data set; its path is relative to that
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def options_of(names: Iterable[str]) -> dict[str, Option]:
 
 
 def write(
-    trained: TrainedScene,
+    trained: "TrainedScene",
     names: Sequence[str],
     output: Path,
     shots: Sequence[Shot],

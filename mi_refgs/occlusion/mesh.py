@@ -1,7 +1,5 @@
 """A signed distance field's surface as a clean triangle mesh, and its PLY file."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,11 +34,11 @@ class Mesh:
             object.__setattr__(self, name, np.asarray(getattr(self, name), kind))
 
     @staticmethod
-    def empty(voxel: float = 1.0) -> Mesh:
+    def empty(voxel: float = 1.0) -> "Mesh":
         """The mesh of an empty volume."""
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), voxel)
 
-    def part(self, kept: np.ndarray) -> Mesh:
+    def part(self, kept: np.ndarray) -> "Mesh":
         """The kept triangles (F,) bool, with the vertices that they have."""
         used, faces = np.unique(self.faces[kept], return_inverse=True)
         return Mesh(self.vertices[used], faces.reshape(-1, 3), self.voxel)
@@ -51,7 +49,7 @@ class Mesh:
         scaled = (self.vertices - self.vertices[0]) / self.voxel
         return np.asarray(trimesh.Trimesh(scaled, self.faces, process=False).vertex_normals)
 
-    def of_vertices(self, kept: np.ndarray) -> Mesh:
+    def of_vertices(self, kept: np.ndarray) -> "Mesh":
         """The triangles all of whose vertices are kept (V,) bool."""
         return self.part(kept[self.faces].all(axis=1))
 

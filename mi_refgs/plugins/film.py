@@ -1,7 +1,5 @@
 """Images through a sensor's film, and their derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -143,7 +141,7 @@ class FilmImage:
         self.film.put_block(mi.ImageBlock(tensor, self.film.crop_offset()))
         return self.film.develop()
 
-    def _through_film(self, mode: dr.ADMode, derivative: Any) -> Any:
+    def _through_film(self, mode: Any, derivative: Any) -> Any:
         """Tangent of the image for that of the channels, or their adjoint for that of the image."""
         before = self.film.develop(True)
         height, width = self._size

@@ -4,8 +4,6 @@ A `Reconstruction` never changes; methods that change something return another o
 run folder. Images are NumPy arrays (H, W, channels) of float32, linear radiance, their first row at the top.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -42,7 +40,7 @@ from mi_refgs.runs.trained_scene import SCENE, TrainedScene
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.splat import Camera
 
-CameraLike: TypeAlias = "Camera | View | int | Any"
+CameraLike: TypeAlias = Camera | View | int | Any
 """A `Camera`, a data set's `View`, the index of one of `Reconstruction.cameras`, or a Mitsuba sensor."""
 
 
@@ -66,7 +64,7 @@ class Reconstruction:
         shading: ShadingOptions | None = None,
         data: str | Path | None = None,
         name: str = "own",
-    ) -> Reconstruction:
+    ) -> "Reconstruction":
         """Make a reconstruction, in memory, of the state of a loop of one's own.
 
         params: an `mi.Scene` with the `refgs` integrator or its `mi.traverse`, with its light, mesh, shading
@@ -210,7 +208,7 @@ class Reconstruction:
             export(self.trained, Path(folder), first, more)
             return load_scene(Path(folder) / SCENE, aovs, object_only)
 
-    def save(self, folder: str | Path) -> Reconstruction:
+    def save(self, folder: str | Path) -> "Reconstruction":
         """Write a run folder without checkpoints, which every command reads, and load it.
 
         It renders the same images, bit for bit. Raises InputError for a folder that has other files."""
@@ -231,7 +229,7 @@ class Reconstruction:
 
     def relight(
         self, light: AnyLight, *, world: bool = False, rotate: float = 0.0, exposure: float = 0.0
-    ) -> Reconstruction:
+    ) -> "Reconstruction":
         """Replace the light: only materials stay, with shadows and bounces of the mesh.
 
         light: a lat-long map (EXR, HDR), its linear radiance (h, w, 3), or an `EnvironmentLight`. Its first
@@ -242,7 +240,7 @@ class Reconstruction:
         scene = replace(relightable(self.trained), light=any_light(light, world, rotate, exposure))
         return self.changed(scene)
 
-    def edit(self, **options: Unpack[EditOptions]) -> Reconstruction:
+    def edit(self, **options: Unpack[EditOptions]) -> "Reconstruction":
         """Change some surfels, as `refgs edit` does; `provenance.edits[-1]` then records how many.
 
         options: `EditOptions`, such as where="metallic > 0.5", set={"roughness": 0.3}. Raises InputError for
@@ -252,7 +250,7 @@ class Reconstruction:
         provenance = replace(self.provenance, edits=(*self.provenance.edits, record))
         return replace(self.changed(edited), provenance=provenance)
 
-    def changed(self, trained: TrainedScene) -> Reconstruction:
+    def changed(self, trained: TrainedScene) -> "Reconstruction":
         """Return another scene of the same method and data, in memory."""
         return replace(self, trained=trained, folder=None)
 

@@ -6,8 +6,6 @@
 Both use the same splatter and the same `shade`. `mi_refgs.plugins.derivatives` lists what has no derivative.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -59,7 +57,7 @@ class SurfelScene:
             return self.light
         return LocalLight(self.light, self.near, position)
 
-    def lit_for(self, camera: Camera) -> SurfelScene:
+    def lit_for(self, camera: Camera) -> "SurfelScene":
         """The scene as a camera sees it: on a turntable, the light is turned by its rotation."""
         if self.light is None or self.turntable is None:
             return self
@@ -105,7 +103,7 @@ class Frame:
     distance: Float = None  # mean along the ray from the near plane, of several samples per pixel
     attribution: Float = None  # blend of `Request.attribution`, zeros
 
-    def only(self, aovs: Collection[str]) -> Frame:
+    def only(self, aovs: Collection[str]) -> "Frame":
         """The same frame without depth, normal, terms and maps that are not named."""
         return replace(
             self,

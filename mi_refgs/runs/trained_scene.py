@@ -1,7 +1,5 @@
 """A fitted scene, and the names of its files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,7 +52,7 @@ class TrainedScene:
     turntable: TensorXf | None = None  # as in `SurfelScene`; the first training camera's
 
     @staticmethod
-    def from_state(method: Method, state: Mapping[str, np.ndarray]) -> TrainedScene:
+    def from_state(method: Method, state: Mapping[str, np.ndarray]) -> "TrainedScene":
         """The scene of a checkpoint."""
         params, iteration, mesh = tensors(state, PARAMS), int(state["iteration"]), None
         if len(state.get("mesh/faces", ())):
@@ -79,7 +77,7 @@ class TrainedScene:
         return self.surfels.count + (0 if self.surroundings is None else self.surroundings.surfels.count)
 
     @staticmethod
-    def read(folder: Path, plugins: Sequence[str] = ()) -> TrainedScene:
+    def read(folder: Path, plugins: Sequence[str] = ()) -> "TrainedScene":
         """Read the artefacts in a run folder, fitted with these plugins; raises InputError for a file that
         cannot be used."""
         note = folder / MODEL

@@ -4,8 +4,6 @@
 Engine 4"; Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]
 """
 
-from __future__ import annotations
-
 import functools
 import os
 from contextlib import suppress
@@ -19,6 +17,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import replace_file
 from mi_refgs.kernels.device import aligned
+from mi_refgs.types import Float
 
 RESOLUTION = 256  # texels per axis, values at their centres: bilinear lookups are then within 3e-4
 RADIAL_NODES, AZIMUTH_NODES = 48, 32  # of half vectors: errors below 4e-4 at the smallest N·V, else 1e-4
@@ -83,7 +82,7 @@ def device_table(variant: str) -> Any:
     return mi.Float(aligned(table()))
 
 
-def split_sum(n_dot_v: mi.Float, roughness: mi.Float) -> tuple[mi.Float, mi.Float]:
+def split_sum(n_dot_v: Float, roughness: Float) -> tuple[Float, Float]:
     """Scale A and bias B of the reflectance F0·A + B of a GGX surface under constant light: differentiable,
     bilinear in the table, extrapolated over the outer half texels, both arguments clamped to [0, 1]."""
     data = device_table(mi.variant())

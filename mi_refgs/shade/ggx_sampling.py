@@ -1,8 +1,6 @@
 """Rays of the GGX lobe, detached: visible normals at points of a golden-ratio spiral, spread evenly for any
 number of rays, that every pixel turns by a hash of its own index."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,12 +15,12 @@ COSINE_FLOOR = 1e-3  # smallest n·v of a lobe: a view from behind is taken as a
 HORIZON = 1e-6  # smallest n·l of a ray: what goes below leaves no light, and 1/(n·l)² fits float32
 
 
-def lobe_turn(index: mi.UInt32) -> mi.UInt32:
+def lobe_turn(index: UInt32) -> UInt32:
     """The turn of the points of pixels `index` as a 32-bit fraction."""
     return mi.UInt32(mi.sample_tea_32(index, dr.zeros(mi.UInt32, dr.width(index)))[0])
 
 
-def lobe_point(turn: mi.UInt32, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+def lobe_point(turn: UInt32, ray: UInt32, count: UInt32) -> tuple[Float, Float]:
     """Point `ray` of `count` in the unit square, turned along its second coordinate; the first is the middle
     of one of `count` equal steps: jittered, one far out in the lobe's tail would spoil its pixel."""
     turned = mi.Float((ray * GOLDEN + turn) >> 8) * 2.0**-24
@@ -40,7 +38,7 @@ class Lobe:
     turn: UInt32  # of the points, see `lobe_turn`
 
     @staticmethod
-    def of(normal: Vector3f, view: Vector3f, roughness: Float, f0: Color3f, pixel: UInt32 = None) -> Lobe:
+    def of(normal: Vector3f, view: Vector3f, roughness: Float, f0: Color3f, pixel: UInt32 = None) -> "Lobe":
         """Lobes around unit normals, seen from unit directions; lane i has the points of `pixel` i."""
         frame = mi.Frame3f(normal)
         local = frame.to_local(view)
@@ -53,7 +51,7 @@ class Lobe:
             lobe_turn(dr.arange(mi.UInt32, dr.width(normal)) if pixel is None else pixel),
         )
 
-    def sample(self, ray: mi.UInt32, count: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+    def sample(self, ray: UInt32, count: UInt32) -> tuple[Vector3f, Float]:
         """World direction of ray `ray` of `count`, and its weight f cosθ / density = F G / G₁, 0 below the
         horizon. [Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"; Heitz 2018]"""
         along, around = lobe_point(self.turn, ray, count)

@@ -1,7 +1,5 @@
 """Input and output of reflectance models: points to shade, and named terms of outgoing radiance."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +9,7 @@ import mitsuba as mi
 
 from mi_refgs.constants import NORM_FLOOR
 from mi_refgs.errors import InputError
+from mi_refgs.types import Vector3f
 
 
 @dataclass(init=False, eq=False)
@@ -45,7 +44,7 @@ class ShadingPoints:
         """An attribute, or None if the points do not have it."""
         return self.attributes.get(name)
 
-    def replaced(self, **attributes: Any) -> ShadingPoints:
+    def replaced(self, **attributes: Any) -> "ShadingPoints":
         """The same points with these attributes; None removes one."""
         return ShadingPoints(self.normal, self.view, self.attributes, **attributes)
 
@@ -64,7 +63,7 @@ class RadianceTerms:
     def total(self) -> Any:
         return sum(self.known().values(), mi.Color3f(0))
 
-    def filled(self) -> RadianceTerms:
+    def filled(self) -> "RadianceTerms":
         """The same, with zeros for terms that do not exist."""
         return RadianceTerms(**{name: dr.zeros(mi.Color3f, 1) for name in TERMS} | self.known())
 
@@ -72,7 +71,7 @@ class RadianceTerms:
 TERMS = ("diffuse", "specular", "indirect")  # names of the terms
 
 
-def safe_normalize(v: mi.Vector3f) -> mi.Vector3f:
+def safe_normalize(v: Vector3f) -> Vector3f:
     """v / |v|, and (0, 0, 1) with zero gradient where |v|² < NORM_FLOOR."""
     # Scaling by the largest component first keeps the square of a huge or tiny vector inside float32.
     largest = dr.detach(dr.maximum(dr.maximum(dr.abs(v.x), dr.abs(v.y)), dr.abs(v.z)))
@@ -81,6 +80,6 @@ def safe_normalize(v: mi.Vector3f) -> mi.Vector3f:
     return scaled * dr.rsqrt(dr.squared_norm(scaled))
 
 
-def reflect(view: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
+def reflect(view: Vector3f, normal: Vector3f) -> Vector3f:
     """Mirror direction 2 (n·v) n - v of unit vectors that both point away from the surface."""
     return dr.fma(2 * dr.dot(normal, view), normal, -view)

@@ -4,8 +4,6 @@ Y_00 = ½√(1/π) and, in degree 1, (-y, +z, -x)·½√(3/π): the Condon-Short
 of other programs hold the same coefficients. [Ramamoorthi and Hanrahan 2001; Sloan 2013]
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -15,9 +13,10 @@ import mitsuba as mi
 
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
+from mi_refgs.types import Color3f, Float, Vector3f
 
 
-def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
+def sh_basis(direction: Vector3f, degree: int) -> list[Float]:
     """The (degree + 1)² basis functions at unit directions, ordered by degree l ≤ 3, then m = -l … l."""
     x, y, z = direction.x, direction.y, direction.z
     basis: list[Any] = [dr.full(mi.Float, 0.5 * math.sqrt(1 / math.pi), dr.width(x))]
@@ -49,7 +48,7 @@ def sh_basis(direction: mi.Vector3f, degree: int) -> list[mi.Float]:
     return basis
 
 
-def eval_sh(coefs: Sequence[mi.Color3f], direction: mi.Vector3f) -> mi.Color3f:
+def eval_sh(coefs: Sequence[Color3f], direction: Vector3f) -> Color3f:
     """Σ coefs[i] basis_i(direction), not clamped, of 1, 4, 9 or 16 colours (else InputError)."""
     degree = math.isqrt(len(coefs)) - 1
     if (degree + 1) ** 2 != len(coefs) or not 0 <= degree <= MAX_SH_DEGREE:

@@ -1,7 +1,5 @@
 """Shading options that fit together, and the light and attributes that they require."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -59,13 +57,13 @@ class Shading(ShadingOptions):
                 raise InputError(wrong, "shading", option, remedy)
 
     @staticmethod
-    def resolve(options: ShadingOptions, mesh: bool) -> Shading:
+    def resolve(options: ShadingOptions, mesh: bool) -> "Shading":
         """The options of a stage: occluded if `traceable` and there is a `mesh`; else without TRACED ones."""
         untraced = Shading(**options.settings() | UNTRACED)
         traced = mesh and untraced.traceable
         return Shading(**options.settings() | {"occlusion": True}) if traced else untraced
 
-    def relit(self, mesh: bool) -> Shading | None:
+    def relit(self, mesh: bool) -> "Shading | None":
         """The shading under another light, occluded by a `mesh` if there is one; None: the model has none."""
         at = "pixel" if "pixel" in self.model.shaded_at else self.at
         options = self.model.relit(replace(self, at=at, **UNTRACED))
@@ -75,11 +73,11 @@ class Shading(ShadingOptions):
         traced = {name: rays for name, rays in RELIT_RAYS.items() if name in self.model.honoured}
         return Shading.resolve(ShadingOptions(**given | traced), mesh)
 
-    def untraced(self) -> Shading:
+    def untraced(self) -> "Shading":
         """Without visibility, for renders of materials only."""
         return replace(self, antialias=False, **UNTRACED)
 
-    def antialiased(self) -> Shading:
+    def antialiased(self) -> "Shading":
         """With `antialias` where it has an effect: for displayed images; the steps of a fit go without."""
         able = self.shaded_at == "pixel" and "antialias" in self.model.honoured
         return replace(self, antialias=True) if able else self

@@ -4,8 +4,6 @@ Albedo is the reflectance of the diffuse base, or F0 of a metal; the base of a n
 the light inside by ρ (1 - Fᵢ) / (1 - ρ Fᵢ). Roughness is √α, for an anisotropic metal of the geometric mean;
 that of `diffuse`, and all of glass, hair, measured and transmitting `principled` BSDFs, is unknown."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -33,19 +31,19 @@ class Materials(NamedTuple):
     metallic: tuple[Float, Bool]
 
     @staticmethod
-    def of(albedo: Any = None, roughness: Any = None, metallic: Any = None, known: Bool = True) -> Materials:
+    def of(albedo: Any = None, roughness: Any = None, metal: Any = None, known: Bool = True) -> "Materials":
         """Materials of these values, where `known`; None is undefined."""
 
         def pair(kind: Any, value: Any) -> tuple[Any, Bool]:
             return (kind(0), mi.Bool(False)) if value is None else (kind(value), mi.Bool(known))
 
-        return Materials(pair(mi.Color3f, albedo), pair(mi.Float, roughness), pair(mi.Float, metallic))
+        return Materials(pair(mi.Color3f, albedo), pair(mi.Float, roughness), pair(mi.Float, metal))
 
-    def where(self, mask: Bool, other: Materials) -> Materials:
+    def where(self, mask: Bool, other: "Materials") -> "Materials":
         pairs = zip(self, other, strict=True)
         return Materials(*((dr.select(mask, a[0], b[0]), dr.select(mask, a[1], b[1])) for a, b in pairs))
 
-    def cleaned(self) -> Materials:
+    def cleaned(self) -> "Materials":
         """Unknown where a value is not finite; clipped to 0 … 1 elsewhere."""
 
         def clean(value: Any, known: Bool) -> tuple[Any, Bool]:

@@ -7,8 +7,6 @@ Radiance is softplus(raw): positive without an upper bound, and with a slope of 
 optimiser's step bounds the change of radiance.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -32,7 +30,7 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.shade.light.lobe_matrices import LEVEL_ROUGHNESS
 from mi_refgs.shade.light.prefilter import Operator, prefilter
-from mi_refgs.types import TensorXf
+from mi_refgs.types import Color3f, Float, TensorXf, Vector3f
 
 
 def softplus(x: Any) -> Any:
@@ -78,13 +76,13 @@ class PrefilteredLight:
     operator: Operator
     levels: Any  # flat RGBA texels, level after level
 
-    def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
+    def radiance(self, direction: Vector3f) -> Color3f:
         return self._bilinear(*azimuth_polar(direction), mi.UInt32(0))
 
-    def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
+    def irradiance(self, normal: Vector3f) -> Color3f:
         return self._bilinear(*azimuth_polar(normal), mi.UInt32(len(LEVEL_ROUGHNESS)))  # its D is constant
 
-    def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+    def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
         """Radiance averaged over the GGX lobe: linear between levels in 1/roughness, which keeps energy and
         peak, and in roughness⁴ below the first. [split sum, Karis 2013]"""
         first, r = LEVEL_ROUGHNESS[0], dr.clip(roughness, 0, 1)
@@ -110,12 +108,12 @@ class UnfilteredLight:
     height: int
     texels: Any  # flat RGB texels, under AD
 
-    def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
+    def radiance(self, direction: Vector3f) -> Color3f:
         h = dr.opaque(mi.UInt32, self.height)
         u, v = azimuth_polar(direction)
         return interpolated(lambda i: dr.gather(mi.Color3f, self.texels, i), u, v, h, 2 * h)
 
-    def specular(self, direction: mi.Vector3f, roughness: mi.Float | None = None) -> mi.Color3f:
+    def specular(self, direction: Vector3f, roughness: Float | None = None) -> Color3f:
         remedy = "call prefilter(), or look up `radiance`"
         raise InputError("the light is not filtered", "light", "lookup", remedy)
 
@@ -164,7 +162,7 @@ class FittedLight:
         """The light for models that look up `radiance` only, under AD."""
         return self.prefilter()
 
-    def environment(self) -> EnvironmentLight:
+    def environment(self) -> "EnvironmentLight":
         """The map that a run saves, which every application shows, edits and exports."""
         return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, DEFAULT_HEIGHT, 1))
 
@@ -185,12 +183,12 @@ class EnvironmentLight(FittedLight):
             raise InputError(f"shape {shape}", "EnvironmentLight", "raw", need)
 
     @classmethod
-    def constant(cls, radiance: float = 0.5, height: int = DEFAULT_HEIGHT) -> EnvironmentLight:
+    def constant(cls, radiance: float = 0.5, height: int = DEFAULT_HEIGHT) -> "EnvironmentLight":
         """The same positive radiance from everywhere."""
         return cls.from_radiance(np.full((height, 2 * height, 3), radiance))
 
     @classmethod
-    def from_radiance(cls, radiance: np.ndarray) -> EnvironmentLight:
+    def from_radiance(cls, radiance: np.ndarray) -> "EnvironmentLight":
         """Take linear radiance (h, 2h, 3), 1e-4 at least; InputError for NaN, infinity or another shape."""
         radiance = np.asarray(radiance, np.float64)
         if not np.isfinite(radiance).all():
@@ -198,7 +196,7 @@ class EnvironmentLight(FittedLight):
         return cls(upload_tensor(nearest_raw(np.maximum(radiance, RADIANCE_FLOOR))))
 
     @classmethod
-    def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> EnvironmentLight:
+    def from_file(cls, path: str | os.PathLike[str], height: int | None = None) -> "EnvironmentLight":
         """Read a lat-long image (EXR, HDR) and resample it to `height` rows (default: its own, at most
         FINEST), keeping its energy. Raises InputError as `read_radiance` does."""
         image = read_radiance(path, height or FINEST)
@@ -227,5 +225,5 @@ class EnvironmentLight(FittedLight):
             path.parent.mkdir(parents=True, exist_ok=True)
         write_exr(path, self.radiance().numpy())
 
-    def environment(self) -> EnvironmentLight:
+    def environment(self) -> "EnvironmentLight":
         return self

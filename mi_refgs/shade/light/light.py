@@ -1,7 +1,5 @@
 """Lights: the protocol of three lookups that reflectance models use."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,13 +12,13 @@ from mi_refgs.types import Color3f, Float, Vector3f
 class Light(Protocol):
     """Light from far away. Lookups take unit world directions; they are traced and differentiable."""
 
-    def specular(self, direction: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
+    def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
         """Radiance averaged over the GGX lobe of this roughness (α = roughness²) around the directions."""
 
-    def irradiance(self, normal: mi.Vector3f) -> mi.Color3f:
+    def irradiance(self, normal: Vector3f) -> Color3f:
         """∫ L cosθ dω / π over the hemisphere of the normals: a constant light of 1 gives 1."""
 
-    def radiance(self, direction: mi.Vector3f) -> mi.Color3f:
+    def radiance(self, direction: Vector3f) -> Color3f:
         """Radiance that arrives from the directions, unfiltered."""
 
 

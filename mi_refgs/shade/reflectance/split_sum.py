@@ -6,13 +6,10 @@ roughness (mi.Float, 0 … 1, α = roughness²); for diffuse="sh" also radiance 
 [Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.light import Light
@@ -21,21 +18,19 @@ from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_no
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Color3f, Float
+from mi_refgs.types import Color3f, Float, Vector3f
 
 MATERIALS = ("albedo", "metallic", "roughness")  # attributes of the surface under the light
 DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of a dielectric (index of refraction 1.5)
 SMOOTHNESS_FLOOR = 1e-12  # least 1 - α in √(1 - α), whose slope is infinite at α = 1
 
 
-def base_reflectance(points: ShadingPoints) -> mi.Color3f:
+def base_reflectance(points: ShadingPoints) -> Color3f:
     """F0: reflectance at normal incidence, between a dielectric's and the metal's albedo."""
     return dr.fma(points.albedo - DIELECTRIC_F0, points.metallic, DIELECTRIC_F0)
 
 
-def lookup_direction(
-    normal: mi.Vector3f, view: mi.Vector3f, roughness: mi.Float, options: ShadingOptions
-) -> mi.Vector3f:
+def lookup_direction(normal: Vector3f, view: Vector3f, roughness: Float, options: ShadingOptions) -> Vector3f:
     """Unit direction in which the light is looked up: mirrored, or dominant, near the peak of the GGX lobe, s
     (√s + α) of the way from the normal, α = roughness², s = 1 - α. Unit vectors in. [Lagarde and de Rousiers
     2014, "Moving Frostbite to Physically Based Rendering", §4.9.3]"""
