@@ -20,7 +20,7 @@ from mi_refgs.io.progress import command_line
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.views import read_views, sized
+from mi_refgs.runs.views import measured_views, sized
 
 RUNS = "runs"  # runs/<data>/<method>/seed<k>
 SETTINGS = "compare.json"
@@ -148,7 +148,7 @@ def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:
     for job in jobs:
         method = job.method()
         if (key := (job.data, method.data)) not in read:
-            view = read_views(method, Path(job.data), "test", truth=False).views[0]
+            view = measured_views(method, Path(job.data), truth=False).views[0]
             read[key] = [view.width, view.height]
         sizes.setdefault(job.data, {})[job.title] = read[key]
     for path, found in sizes.items():

@@ -161,7 +161,7 @@ def markdown(table: Table) -> str:
             seeds = f" ({len(row.seeds)} seeds)" if len(row.seeds) > 1 else ""
             cells = (cell(c, row.numbers.get(c.key)) for c in columns)
             body.append([f"{row.variant}{marks}{seeds}", *cells])
-        scale = f", downscaled by {scene.downscale}" if scene.downscale not in (None, 1) else ""
+        scale = f", downscaled for the fits by {scene.downscale}" if scene.downscale not in (None, 1) else ""
         size = " × ".join(map(str, scene.image_size))
         images = f" ({scene.test_views} test views of {size} pixels{scale})" if size else ""
         lines += [f"### {scene.name}{images}", "", *aligned(titles, body), ""]

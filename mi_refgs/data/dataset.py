@@ -35,7 +35,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class ReadOptions:
-    downscale: int = 1  # side of the blocks of pixels that are averaged
+    downscale: float = 1  # side of the blocks of pixels that are averaged
     background: float = 1.0  # 0 … 1, in the colour space of the images, where they have alpha
     images: str = "png"  # "png": sRGB-encoded, or "exr": linear radiance
     truth: bool = True  # read ground-truth normals, depth and materials
@@ -207,7 +207,7 @@ class Dataset:
     notes: tuple[str, ...] = ()  # as in `Recording`
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # subtracted from all positions of the files
     unknown: PixelRays | None = None  # pixels whose depth stereo has not found; None: it has not been tried
-    downscale: int = 1  # side of the blocks of pixels that are averaged
+    downscale: float = 1  # side of the blocks of pixels that are averaged
     source: Path | None = None  # the file that lists the views
 
     @staticmethod
@@ -249,7 +249,7 @@ def read_dataset(
     path: str | Path,
     split: str,
     *,
-    downscale: int | None = None,
+    downscale: float | None = None,
     pixels: int = sys.maxsize,
     background: str = "white",
     images: str = "png",
@@ -257,8 +257,8 @@ def read_dataset(
 ) -> Dataset:
     """Read one split ("train" or "test") of the data set in folder `path`.
 
-    `downscale`: side of the blocks of pixels that are averaged, by default the smallest for which the first
-        image has at most `pixels`; incomplete blocks are left out.
+    `downscale`: side of the blocks of pixels that are averaged, by default the smallest whole one for which
+        the first image has at most `pixels`; incomplete blocks are left out.
     `background`: "white" or "black", behind images with alpha.
     `images`: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
     `truth`: read ground-truth normals, depth and materials where there are any.
@@ -273,7 +273,7 @@ def read_dataset(
         raise InputError(f"unknown value '{images}'", path, "images", "give png or exr")
     options = ReadOptions(1 if downscale is None else downscale, BACKGROUNDS[background], images, truth)
     if options.downscale < 1:
-        raise InputError(f"{downscale} is out of range", path, "downscale", "give a whole number from 1")
+        raise InputError(f"{downscale} is out of range", path, "downscale", "give a number from 1")
     reader = reader_of(path, options)
     found = reader.read(path, split, options)
     if downscale is None:

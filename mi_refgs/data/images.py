@@ -2,6 +2,7 @@
 file is decoded, its colour multiplied by alpha (its own, or that of a mask), averaged over blocks of pixels,
 undistorted and composited onto the background. An orientation in EXIF data is ignored, as in COLMAP."""
 
+import math
 import os
 import re
 import threading
@@ -26,6 +27,7 @@ from mi_refgs.io.images import (
     read_bytes,
     read_grey,
     read_mask,
+    whole_blocks,
     with_ending,
 )
 
@@ -59,12 +61,12 @@ class ImageFile:
     path: Path
     width: int  # pixels, of the file
     height: int
-    downscale: int = 1
+    downscale: float = 1
     mask: Mask | None = None
     undistortion: Undistortion | None = None  # of the averaged image
 
     @classmethod
-    def of(cls, path: Path, downscale: int, mask: Mask | None = None) -> "ImageFile":
+    def of(cls, path: Path, downscale: float, mask: Mask | None = None) -> "ImageFile":
         """The image in a file, of which only the header is read."""
         width, height = image_size(path)
         if min(width, height) < downscale:
@@ -75,7 +77,7 @@ class ImageFile:
     @property
     def size(self) -> tuple[int, int]:
         """Of the view's image."""
-        return self.width // self.downscale, self.height // self.downscale
+        return whole_blocks(self.width, self.downscale), whole_blocks(self.height, self.downscale)
 
     @property
     def is_linear_radiance(self) -> bool:
@@ -95,7 +97,7 @@ class ImageFile:
             if pixels.shape[-1] < 3:
                 raise InputError("no R, G, B", self.path, "channels", "export a colour image")
         else:
-            pixels, factor = read_bytes(self.path, 1 if self.mask else self.downscale)
+            pixels, factor = read_bytes(self.path, 1 if self.mask else int(self.downscale))
             if self.downscale == 1 and self.mask is None and self.undistortion is None:
                 return pixels
         mask = None if self.mask is None else self.mask.read()
@@ -106,15 +108,16 @@ class ImageFile:
                 raise InputError(what, self.mask.path, "mask", "make both of one size")
             whole, linearly = (self.width, self.height), Image.Resampling.BILINEAR  # averages, if smaller
             mask = np.asarray(Image.fromarray(mask).resize(whole, linearly))
-        (width, height), block = self.size, self.downscale // factor
-        bands, step = [], max(BAND // block, 1)
+        (width, height), block = self.size, self.downscale / factor
+        bands, step = [], max(int(BAND / block), 1) if block == int(block) else height
+        right = math.ceil(width * block)
         for top in range(0, height, step):
-            rows = slice(top * block, min(top + step, height) * block)
-            band = pixels[rows, : width * block]
+            rows = slice(int(top * block), math.ceil(min(top + step, height) * block))
+            band = pixels[rows, :right]
             if not linear:
                 band = band.astype(np.float32) / np.float32(255)
             if mask is not None:
-                shown = mask[rows, : width * block, None]
+                shown = mask[rows, :right, None]
                 covered = shown * band[..., 3:] if band.shape[-1] == 4 else shown
                 # Colour of an EXR file is premultiplied by its own alpha already.
                 colour = band[..., :3] * shown if linear else band[..., :3]
@@ -272,7 +275,7 @@ def _mask_file(folder: Path, name: str, marks: Sequence[str]) -> Path | None:
 def block_mean(
     pixels: np.ndarray,  # (H, W, C)
     covered: np.ndarray,  # (H, W, 1), 0 … 1
-    downscale: int,
+    downscale: float,
     straight: Undistortion | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean over what is covered in each block, (h, w, C), 0 without coverage; covered fraction (h, w, 1)."""

@@ -17,37 +17,40 @@ COARSEST = 48  # pixels along the shorter side of the image that is averaged mos
 Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a view's camera
 
 
-def registered(view: View, render: Render, distance: float) -> View:
-    """The view with the pose of the least difference; `distance` of what it looks at, scene units."""
+def registered(view: View, render: Render, distance: float, where: np.ndarray) -> View:
+    """The view with the pose of the least difference in the pixels `where` (H, W) bool; `distance` of what it
+    looks at, scene units."""
     view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
     while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
         blocks.insert(0, 2 * blocks[0])
     found = view
     for block in blocks:
-        found = _fitted(found, render, distance, block)
-    errors = [np.mean(_difference(one, render, 1) ** 2) for one in (view, found)]
+        found = _fitted(found, render, distance, where, block)
+    errors = [np.mean(_difference(one, render, where, 1) ** 2) for one in (view, found)]
     return found if errors[1] < errors[0] else view
 
 
-def _difference(view: View, render: Render, block: int) -> np.ndarray:
+def _difference(view: View, render: Render, where: np.ndarray, block: int) -> np.ndarray:
     """Render minus image, flat, both averaged over block² pixels: smaller renders differ in details."""
     shown, truth = (box_downscale(np.clip(image, 0, 1), block) for image in (render(view), view.displayed))
-    return np.asarray(shown - truth, np.float64).ravel()
+    whole = box_downscale(where[..., None].astype(np.float32), block)[..., 0] == 1
+    return np.asarray(shown - truth, np.float64)[whole].ravel()
 
 
-def _fitted(view: View, render: Render, distance: float, block: int) -> View:
+def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> View:
     """The view with its pose fitted to the image averaged over block × block pixels."""
     unit = np.repeat([1.0, distance], 3) * block / view.fx  # moves what the camera looks at by such a pixel
     # Derivatives are those of the first pose: taken anew after every change, they cost most of the time.
-    now = _difference(view, render, block)
-    shifts = [_difference(_moved(view, STEP * unit * axis), render, block) - now for axis in np.eye(6)]
+    now = _difference(view, render, where, block)
+    sides = [_moved(view, STEP * unit * axis) for axis in np.eye(6)]
+    shifts = [_difference(side, render, where, block) - now for side in sides]
     slope = np.stack(shifts, axis=1) / STEP
     normal = slope.T @ slope
     normal += 1e-3 * np.diag(np.diag(normal))  # [Levenberg 1944]: flat scenes hardly tell turn from shift
     for _ in range(5):
         change, *_ = np.linalg.lstsq(normal, -slope.T @ now, rcond=None)
         candidate = _moved(view, unit * change)
-        after = _difference(candidate, render, block)
+        after = _difference(candidate, render, where, block)
         before, now_squared = float(now @ now), float(after @ after)
         if not now_squared < before:
             break

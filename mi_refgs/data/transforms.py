@@ -245,7 +245,7 @@ def _image(frame: Frame, options: ReadOptions) -> Path:
 
 
 def _map(
-    file: Path, field: str, expected: tuple[int, int, int], downscale: int, straight: Undistortion | None
+    file: Path, field: str, expected: tuple[int, int, int], downscale: float, straight: Undistortion | None
 ) -> np.ndarray:
     """A map of `expected` shape, at the view's size: per pixel the mean over the surface in its block. The
     last of two or four channels, where the others are defined, becomes the fraction of the block."""
@@ -277,7 +277,7 @@ def _beside(
 
 
 def _shiny_blender_maps(
-    image: Path, shape: tuple[int, int], downscale: int, straight: Undistortion | None
+    image: Path, shape: tuple[int, int], downscale: float, straight: Undistortion | None
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """World normals n (h, w, 3) in 8 bits as (n + 1) / 2, and depths z (h, w, 1) as 1 / (1 + z), 0 off the
     object, beside an image of Shiny Blender; None without a file. [Ref-NeRF, Verbin et al. 2022]"""

@@ -1,7 +1,8 @@
 """Evaluate a run on the test views of its data set: metrics.json, renders, a contact sheet."""
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,23 +22,26 @@ from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.image_error import displayed_image, with_gain
 from mi_refgs.io.files import read_json
-from mi_refgs.io.images import write_png
+from mi_refgs.io.images import box_downscale, write_png
 from mi_refgs.io.progress import with_bar
 from mi_refgs.kernels.device import machine
+from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import EXPOSURE, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.light_file import read_radiance
+from mi_refgs.splat import Camera
 
 FOLDER = "eval"
 SHEET, METRICS = "contact_sheet.png", "metrics.json"
 LONGEST_STEM = 60  # characters of a view in a file's name; file systems allow 255 bytes
 SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
 ORANGE = np.array([0.75, 0.3, 0.0])  # of concave pixels
-MEANS = """psnr psnr_gain psnr_registered ssim lpips psnr_region ssim_region region_share normal_mae_deg
-    normal_mae_deg_full""".split()  # scores of views whose means are reported
+MEANS = """psnr_aligned psnr_aligned_region psnr_aligned_object psnr psnr_region psnr_object ssim ssim_region
+    region_share lpips normal_mae_deg normal_mae_deg_full""".split()  # scores whose means are reported
+REGISTERED = 256**2  # pixels of the averaged image to which a pose is fitted, at most: the renders take time
 
 
 def evaluate(
@@ -48,15 +52,17 @@ def evaluate(
     Evaluates the scene files in the run folder, which are written first if a checkpoint is newer. Every key
     of the upper level is present; a score that does not apply is null, and `NAME_reason` says why.
 
+    `psnr_aligned`        with the gain per channel (`data.exposure`) and the pose (`data.registration`) that
+                          fit half of the pixels best, on the other half: of images without alpha, and if
+                          the fit corrected its cameras
+    `image_size`          of the test views as `runs.views.measured_views` reads them
     `…_region`            pixels whose ray meets the data's region of interest; `region_share` of all
+    `…_object`            pixels that are mostly covered by the object, by alpha or true surface
     `normal_…`            pixels with true alpha above ½ (where there is alpha) and a true normal
     `…_concave`           pixels where the true surface is concave (`evaluation.surface`)
     `error_budget`        shares of the squared error per class of pixels (`evaluation.error_budget`)
-    `psnr_gain`           after one gain per channel and view (`data.exposure.fitted_gain`)
-    `psnr_registered`     with the pose at which a render fits the view best (`data.registration`), if the fit
-                          corrected its cameras: all may have moved with the scene
     `exposure`, `cameras` whether the fit had gains of its training views, and corrected cameras
-    `image_size`          of the test views as they are read, each pixel the mean of `downscale`² of the file
+    `downscale`           side of the blocks of pixels that the fit averaged
     `ms_per_frame`        median over single frames of the displayed image, the environment map prefiltered
     `caption`             scale, mask and frame of these numbers
 
@@ -64,7 +70,7 @@ def evaluate(
     no run or contains neither a scene nor a checkpoint, and for data that is gone."""
     # The scene, its test views, and the files to write.
     method = run.method()
-    views = views_of_run(run, method, "test", data)
+    views = views_of_run(run, method, "test", data, measured=True)
     renders = render_names(views.views)
     fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
     per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
@@ -74,25 +80,20 @@ def evaluate(
     render, maps_of = fitted.renderer(samples=samples, turning=True), material_maps(fitted, samples)
     plain = fitted.renderer(aovs=False, samples=samples, turning=True)
     around, corrected = fitted.surroundings is not None, bool(run.cameras())
+    aligns = corrected or not views.has_alpha
     object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
     in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
     scores: list[dict[str, Any]] = []
     shown: list[tuple[RenderedView, View, Maps]] = []  # in the sheet, with more images
-
-    def image_of(view: View) -> np.ndarray:
-        return displayed_image(plain(view.camera()), view, views)
-
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
         # Scores.
         view = view.load()
         frame = render(view.camera())
         rendered = RenderedView.of(frame, views, view)
-        scores.append(_scores(rendered, view, views, scores[0] if scores else {}))
-        gain, gained = with_gain(frame, view, views)
-        scores[-1] |= {"psnr_gain": metrics.psnr(gained, view.displayed), "gain": gain.round(4).tolist()}
-        if corrected:
-            moved = registered(view, image_of, views.scene_extent)
-            scores[-1]["psnr_registered"] = metrics.psnr(image_of(moved), moved.displayed)
+        masks = _masks(view, views)
+        scores.append(_scores(rendered, view, masks, scores[0] if scores else {}))
+        if aligns:
+            scores[-1] |= _aligned_scores(view, frame, plain, masks, views)
         # Errors of materials, of concave pixels and per class of pixels.
         concave = None if surface is None else surface.concave(view)
         rendered = replace(rendered, maps=maps_of(view.camera(), rendered))
@@ -144,24 +145,59 @@ def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:
     result["lpips_reason"] = per_view[0]["lpips_reason"] or None
     for name, key, reason in (
         ("region", "psnr_region", "the data set has no region of interest"),
+        ("object", "psnr_object", "the data set has neither masks nor a true surface"),
         ("normal", "normal_mae_deg", "the data set has no ground-truth normals"),
-        ("registered", "psnr_registered", "the fit did not correct its cameras"),
+        ("aligned", "psnr_aligned", "images have alpha, and the fit did not correct its cameras"),
     ):
         result[f"{name}_reason"] = reason if result[key] is None else None
     return result
 
 
-def _scores(rendered: RenderedView, view: View, data: Dataset, first: dict[str, Any]) -> dict[str, Any]:
+def _masks(view: View, data: Dataset) -> dict[str, np.ndarray]:
+    """Return the pixels (H, W) of the whole view, of the region and of the object, by a score's ending."""
+    masks = {"": np.ones((view.height, view.width), bool)}
+    if data.region is not None:
+        masks["_region"] = region_pixels(view, data.region)
+    if view.has_alpha or view.normal is not None or view.depth is not None:
+        masks["_object"] = view.covered() > metrics.FOREGROUND_ALPHA
+    return {name: mask for name, mask in masks.items() if mask.any()}
+
+
+def _aligned_scores(
+    view: View, frame: Frame, render: Callable[[Camera], Frame], masks: dict[str, np.ndarray], data: Dataset
+) -> dict[str, Any]:
+    """Return the scores of a loaded view on half of a checkerboard, with the pose and the gain that fit the
+    other half best; `frame` is rendered with the pose that the view has."""
+    edge = math.ceil(max(view.width, view.height) / 16)  # as `scores.caption` says
+    fitted = (np.indices((view.height, view.width)) // edge).sum(axis=0) % 2 == 0
+    gain, _ = with_gain(frame, view, data, fitted)
+    block = math.ceil(math.sqrt(view.width * view.height / REGISTERED))
+    where = box_downscale(fitted[..., None].astype(np.float32), block)[..., 0] == 1
+
+    def image_of(moved: View) -> np.ndarray:
+        return displayed_image(render(moved.camera()), moved, data, gain)
+
+    coarse = registered(view.averaged(block), image_of, data.scene_extent, where)
+    moved = replace(view, to_world=coarse.to_world)
+    gain, image = with_gain(render(moved.camera()), moved, data, fitted)
+    scores: dict[str, Any] = {"gain": gain.round(4).tolist()}
+    for name, mask in masks.items():
+        if (scored := mask & ~fitted).any():
+            scores[f"psnr_aligned{name}"] = metrics.psnr(image, view.displayed, scored)
+    return scores
+
+
+def _scores(
+    rendered: RenderedView, view: View, masks: dict[str, np.ndarray], first: dict[str, Any]
+) -> dict[str, Any]:
     """Return the scores of one view, which has ground truth loaded; `first` are those of the first view."""
     image, truth = rendered.image, view.displayed
-    scores: dict[str, Any] = {"name": view.name}
-    scores |= {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth)}
+    scores: dict[str, Any] = {"name": view.name, "ssim": metrics.ssim(image, truth)}
+    scores |= {f"psnr{name}": metrics.psnr(image, truth, where) for name, where in masks.items()}
     reason = first.get("lpips_reason")  # a metric that is not installed stays so
     scores["lpips"], scores["lpips_reason"] = (None, reason) if reason else metrics.lpips(image, truth)
-    if data.region is not None and (where := region_pixels(view, data.region)).any():
-        scores["psnr_region"] = metrics.psnr(image, truth, where)
-        scores["ssim_region"] = metrics.ssim(image, truth, where)
-        scores["region_share"] = float(where.mean())
+    if (where := masks.get("_region")) is not None:
+        scores |= {"ssim_region": metrics.ssim(image, truth, where), "region_share": float(where.mean())}
     if view.normal is not None:
         scores |= metrics.normal_mae_deg(rendered.normal, view.normal, view.covered())
     return scores

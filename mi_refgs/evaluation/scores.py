@@ -19,12 +19,13 @@ class Score:
 
 SCORES = (
     Score("image_size", "image size", "{0[0]} × {0[1]}", " pixels"),
-    Score("downscale", "downscaled by", "{}"),
+    Score("psnr_aligned", "PSNR, aligned", "{:.2f}", " dB", compared=True),
+    Score("psnr_aligned_region", "PSNR, aligned, region", "{:.2f}", " dB", compared=True),
+    Score("psnr_aligned_object", "PSNR, aligned, object", "{:.2f}", " dB", compared=True),
     Score("psnr", "PSNR", "{:.2f}", " dB", compared=True, concave=True),
-    Score("psnr_gain", "PSNR, exposure fitted", "{:.2f}", " dB"),
-    Score("psnr_registered", "PSNR, cameras registered", "{:.2f}", " dB", "registered"),
-    Score("ssim", "SSIM", "{:.4f}", compared=True),
     Score("psnr_region", "PSNR, region of interest", "{:.2f}", " dB"),
+    Score("psnr_object", "PSNR, object", "{:.2f}", " dB", "object"),
+    Score("ssim", "SSIM", "{:.4f}", compared=True),
     Score("ssim_region", "SSIM, region of interest", "{:.4f}"),
     Score("lpips", "LPIPS", "{:.4f}", "", "lpips", compared=True),
     Score("normal_mae_deg", "normal error, foreground", "{:.2f}", "°", "normal", True, concave=True),
@@ -39,6 +40,7 @@ SCORES = (
     Score("train_seconds", "training", "{:.0f}", " s", compared=True),
     Score("surfels", "surfels", "{:.0f}", compared=True),
     Score("iterations", "iterations", "{}"),
+    Score("downscale", "downscaled for the fit by", "{}"),
     Score("samples", "samples per pixel", "{}"),
     Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True),
 )
@@ -57,7 +59,8 @@ PIXEL_CLASSES = {
 def caption(size: Sequence[int], relit: bool = False) -> dict[str, str]:
     """Return `scale`, `mask` and `frame` of a table of images with this width and height."""
     scale = "images unscaled; albedo and environment map by least squares per channel, one for all views"
-    mask = "whole images; normals and materials where ground-truth alpha > ½"
+    mask = "whole images; normals and materials where ground-truth alpha > ½; aligned: of a checkerboard of"
+    mask += " 16 fields along the longer side one half, to the other of which pose and gains are fitted"
     if relit:
         scale = "unscaled, and by least squares of displayed colours per channel, one for all images"
         mask = "whole images"

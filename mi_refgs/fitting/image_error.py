@@ -19,10 +19,12 @@ def displayed_image(frame: Frame, view: View, data: Dataset, gain: np.ndarray | 
     return image_array(planes, view.height, view.width)
 
 
-def with_gain(frame: Frame, view: View, data: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """The `fitted_gain` (3,) of a rendered view, and its image (H, W, 3) with that gain."""
+def with_gain(
+    frame: Frame, view: View, data: Dataset, where: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `fitted_gain` (3,) of a rendered view, `where` as there; its image (H, W, 3) with that gain."""
     rendered, alpha = (image_array(planes, view.height, view.width) for planes in composited(frame))
-    gain = fitted_gain(rendered, alpha, view, data.background)
+    gain = fitted_gain(rendered, alpha, view, data.background, where)
     return gain, displayed_image(frame, view, data, gain)
 
 

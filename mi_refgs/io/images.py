@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import exr_header
@@ -41,13 +42,26 @@ def straight_srgb(rgba: np.ndarray) -> np.ndarray:
     return np.concatenate([colour, alpha], axis=-1)
 
 
-def box_downscale(image: np.ndarray, factor: int) -> np.ndarray:
-    """Mean over the whole factor × factor blocks of an (H, W, C) image; what is left over is left out."""
+def whole_blocks(length: int, factor: float) -> int:
+    """Number of whole blocks of `factor` pixels along a side."""
+    return int(length / factor + 1e-6)  # of length / n pixels: n, in spite of rounding
+
+
+def box_downscale(image: np.ndarray, factor: float) -> np.ndarray:
+    """Mean over the whole factor × factor blocks of an (H, W, C) image; what is left over is left out. Of a
+    pixel that two blocks share, each counts its part."""
     if factor == 1:
         return image
-    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
-    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, channels)
-    return blocks.mean(axis=(1, 3), dtype=np.float64).astype(image.dtype)
+    (height, width), channels = (whole_blocks(side, factor) for side in image.shape[:2]), image.shape[2]
+    if (side := int(factor)) == factor:
+        blocks = image[: height * side, : width * side].reshape(height, side, width, side, channels)
+        return blocks.mean(axis=(1, 3), dtype=np.float64).astype(image.dtype)
+    for count in (height, width):  # averages rows, then columns
+        first, pixel = factor * np.arange(count)[:, None], np.arange(len(image))
+        shared = np.minimum(pixel + 1, first + factor) - np.maximum(pixel, first)
+        means = csr_array((np.maximum(shared, 0) / factor).astype(image.dtype))
+        image = (means @ image.reshape(len(image), -1)).reshape(count, -1, channels).swapaxes(0, 1)
+    return image
 
 
 def psnr_of(error: float) -> float:

@@ -309,9 +309,9 @@ class Method:
     def has_mesh(self) -> bool:
         return "mesh" in self.event
 
-    def downscaled(self, factor: int | None) -> Method:
-        """The method with this `data.downscale`."""
-        return replace(self, data=replace(self.data, downscale=factor))
+    def downscaled(self, factor: float) -> Method:
+        """The method with this `data.downscale`, a whole number."""
+        return replace(self, data=replace(self.data, downscale=int(factor)))
 
     def stages(self) -> list[tuple[str, Stage]]:
         """Stages in the order of their `until`."""

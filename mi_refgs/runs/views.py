@@ -16,6 +16,8 @@ from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.run import DATASET, Run
 
+MEASURED = 640  # pixels along the longer side of scored photographs: larger ones differ in noise and focus
+
 
 def sized(
     method: Method, path: Path | Dataset, tell: Callable[[str], None] = lambda _: None
@@ -35,37 +37,43 @@ def sized(
     return method.downscaled(views.downscale), views
 
 
-def read_views(
-    method: Method, path: Path | Dataset, split: str, truth: bool = True, pixels: int = sys.maxsize
-) -> Dataset:
-    """A split of a data set, read as a method says, or one in memory as it is; raises InputError as
-    `read_dataset` does, and for another split."""
+def read_views(method: Method, path: Path | Dataset, split: str, truth: bool = True, **size: Any) -> Dataset:
+    """A split of a data set, read as a method says, but for `size`, options of `read_dataset`; one in memory
+    as it is. Raises InputError as `read_dataset` does, and for another split."""
     if isinstance(path, Dataset):
         if path.split != split:
             raise InputError(f"it has {path.split} views", path.path, "split", f"give {split} views")
         return path
-    options = method.data
+    options, size = method.data, {"downscale": method.data.downscale} | size
     return read_dataset(
-        path,
-        split,
-        downscale=options.downscale,
-        pixels=pixels,
-        background=options.background,
-        images=options.images,
-        truth=truth,
+        path, split, background=options.background, images=options.images, truth=truth, **size
     )
 
 
-def views_of_run(run: Run, method: Method, split: str, path: Path | Dataset | None = None) -> Dataset:
-    """A split of the data set of a run (or at `path`), with the run's region of interest. Raises InputError
-    as `read_dataset` and `Run.region` do, and if the run records no data set or it is gone."""
+def measured_views(method: Method, path: Path | Dataset, truth: bool = True) -> Dataset:
+    """Test views as they are scored: images with alpha as the method reads them, others of equal size for
+    every method, with MEASURED pixels along the longer side or all of the file's."""
+    views = read_views(method, path, "test", truth)
+    sides = [max(view.file.width, view.file.height) for view in views.views if view.file is not None]
+    if views.has_alpha or not sides:
+        return views
+    return read_views(method, path, "test", truth, downscale=max(max(sides) / MEASURED, 1))
+
+
+def views_of_run(
+    run: Run, method: Method, split: str, path: Path | Dataset | None = None, measured: bool = False
+) -> Dataset:
+    """A split of the data set of a run (or at `path`), with the run's region of interest; test views may be
+    those of `measured_views`. Raises InputError as `read_dataset` and `Run.region` do, and if the run records
+    no data set or it is gone."""
     if path is None:
         record, path = run.path / DATASET, run.dataset()
         if path is None:
             raise InputError("the run records no data set", record, "path", "name one with --data")
         if not os.path.isdir(path):  # False for impossible names too
             raise InputError(f"{path} is gone", record, "path", "name the data set's folder with --data")
-    return with_region(read_views(method, path, split), run.region())
+    views = measured_views(method, path) if measured else read_views(method, path, split)
+    return with_region(views, run.region())
 
 
 def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:

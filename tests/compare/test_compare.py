@@ -22,7 +22,7 @@ from mi_refgs.fitting import decide
 from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.runs.run import DECISIONS, Run
 from tests.helpers import refused
-from tests.scenes.tiny import SETTINGS
+from tests.scenes.tiny import SETTINGS, write_open_data
 
 Paths = tuple[Path, Path]
 SIX = [setting for setting in SETTINGS if "preview" not in setting]
@@ -219,6 +219,8 @@ def test_different_sizes_are_refused(compared: Path, data: Path, variants: Paths
     for folder, chosen in ((tmp_path / "new", (variants[0], smaller)), (copy, (smaller,))):
         refused(command(data, folder, *chosen), "20 × 20", "10 × 10", "smaller")
         assert not (folder / "runs/ball/smaller").exists()
+    photographs = write_open_data(tmp_path / "open")  # are scored at one size
+    assert jobs.plan(tmp_path / "new", [photographs], [str(variants[0]), str(smaller)], [0], Shared("quick"))
     metrics = copy / "runs/ball/other/seed1/metrics.json"
     metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"image_size": [10, 10]}))
     refused(["compare", "-o", copy], "20 × 20", "10 × 10", "runs/ball/other/seed1")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from skimage.transform import resize_local_mean
 
 from mi_refgs.data.dataset import View, read_dataset
 from mi_refgs.data.images import BAND, ImageCache, ImageFile, ImageSource, Mask, Pixels, compose
@@ -30,7 +31,7 @@ def smooth(width: int, height: int, scale: float = 20.0) -> np.ndarray:
     return 0.5 + 0.4 * np.stack(waves, axis=-1)
 
 
-def read(path: Path, downscale: int, mask: Mask | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+def read(path: Path, downscale: float, mask: Mask | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     return compose(ImageFile.of(path, downscale, mask).decode(), 0.0)
 
 
@@ -53,24 +54,34 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return stems
 
 
-@pytest.mark.parametrize(("downscale", "factor"), [(1, 1), (2, 2), (3, 1), (6, 2), (8, 8), (12, 4), (16, 8)])
-def test_jpeg_decoder_shrinks_like_averaging(downscale: int, factor: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("downscale", "factor"), [(1, 1), (2, 2), (3, 1), (6.3, 2), (8, 8), (12, 4), (16, 8)]
+)
+def test_jpeg_decoder_shrinks_like_averaging(downscale: float, factor: int, tmp_path: Path) -> None:
     """Whatever the orientation in EXIF data."""
     exif = Image.Exif()
     exif[0x0112] = 6
     path = jpeg(tmp_path / "a.jpg", smooth(157, 101), exif=exif)
-    assert read_bytes(path, downscale)[1] == factor
+    assert read_bytes(path, int(downscale))[1] == factor
     image, alpha = read(path, downscale)
-    assert alpha is None and image.shape[:2] == (101 // downscale, 157 // downscale)
+    assert alpha is None and image.shape[:2] == (int(101 / downscale), int(157 / downscale))
     expected = box_downscale(read_png(path), downscale)
     assert np.abs(image - expected).mean() < 3e-3 and np.abs(image - expected).max() < 0.03
+
+
+@pytest.mark.parametrize("size", [(15, 25), (16, 26)])
+def test_blocks_share_pixels(size: tuple[int, int], rng: np.random.Generator) -> None:
+    """Each counts its part; what is left over is left out."""
+    image = rng.random((*size, 3)).astype(np.float32)
+    expected = resize_local_mean(image[:15, :25], (12, 20))
+    np.testing.assert_allclose(box_downscale(image, 25 / 20), expected, atol=1e-6)
 
 
 def test_image_of_many_bands_equals_whole_image(tmp_path: Path) -> None:
     write_png(tmp_path / "a.png", np.random.default_rng(0).random((3 * BAND + 5, 9, 4)))
     straight = read_png(tmp_path / "a.png")
     straight[..., :3] *= straight[..., 3:]
-    for downscale in (1, 2, 7):
+    for downscale in (1, 2, 2.6, 7):
         image, alpha = read(tmp_path / "a.png", downscale)
         assert alpha is not None
         np.testing.assert_array_equal(np.dstack([image, alpha]), box_downscale(straight, downscale))

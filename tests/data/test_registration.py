@@ -16,6 +16,7 @@ from tests.scenes.dots import dots
 POINTS = np.random.default_rng(3).uniform(-0.6, 0.6, (12, 3))
 SIZE, FOCAL, DISTANCE = 112, 150.0, 3.0
 POSE = look_at(DISTANCE * np.array([0.6, 0.7, 0.4]), np.zeros(3))
+HALF = (np.indices((SIZE, SIZE)) // 16).sum(axis=0) % 2 == 0
 
 
 def render(view: View) -> np.ndarray:
@@ -45,13 +46,13 @@ def test_disturbed_pose_is_found(view: View, rng: np.random.Generator) -> None:
     wrong = POSE.copy()
     wrong[:3, :3] = Rotation.from_rotvec(np.radians(1.0) * axis).as_matrix() @ POSE[:3, :3]
     wrong[:3, 3] += 0.01 * DISTANCE * shift
-    degrees, moved = errors(registered(replace(view, to_world=wrong), render, DISTANCE).to_world)
+    degrees, moved = errors(registered(replace(view, to_world=wrong), render, DISTANCE, HALF).to_world)
     assert degrees < 0.02 and moved < 5e-4
 
 
 def test_pose_stays_where_no_other_is_better(view: View) -> None:
     """For renders that do not depend on it."""
-    found = registered(view, lambda other: np.full((other.height, other.width, 3), 0.4), DISTANCE)
+    found = registered(view, lambda other: np.full((other.height, other.width, 3), 0.4), DISTANCE, HALF)
     np.testing.assert_array_equal(found.to_world, POSE)
 
 
@@ -61,5 +62,5 @@ def test_a_true_pose_stays_if_renders_lack_detail(view: View) -> None:
     def blurred(moved: View) -> np.ndarray:
         return box_downscale(render(moved), 2).repeat(2, axis=0).repeat(2, axis=1)
 
-    degrees, moved = errors(registered(view, blurred, DISTANCE).to_world)
+    degrees, moved = errors(registered(view, blurred, DISTANCE, np.ones_like(HALF)).to_world)
     assert degrees < 0.1 and moved < 2e-3

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from skimage.transform import resize_local_mean
 
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.images import Pixels
@@ -16,18 +17,21 @@ from mi_refgs.data.view import View
 from mi_refgs.evaluation import images, metrics
 from mi_refgs.evaluation.evaluate import evaluate, render_names
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.io.images import read_png
+from mi_refgs.io.images import read_png, write_png
 from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.methods import load_resolved
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.views import measured_views, read_views
 from mi_refgs.surfels.ply import write_ply
 from tests.scenes.open_pair import CASES, Pair
-from tests.scenes.tiny import SIZE
+from tests.scenes.tiny import SIZE, write_data, write_method, write_open_data
 
 KEYS = (
-    "psnr ssim lpips lpips_reason normal_mae_deg normal_mae_deg_full normal_reason "
+    "psnr psnr_aligned aligned_reason psnr_object ssim lpips lpips_reason "
+    "normal_mae_deg normal_mae_deg_full normal_reason "
     "albedo_psnr albedo_scale albedo_reason roughness_mae roughness_reason metallic_mae metallic_reason "
     "surface_distance surface_accuracy surface_completeness surface_reason concave_share concave_reason "
     "psnr_concave normal_mae_deg_concave albedo_psnr_concave surface_distance_concave "
@@ -91,17 +95,39 @@ def test_trainer_metrics(run: Run, trainer: Trainer, views: Dataset, monkeypatch
         assert missing == bool(result[f"{key}_reason"]), key
 
 
-def test_test_cameras_are_registered_if_fit_corrected_its_own(run: Run) -> None:
-    """Both scores are there: with the cameras as they are, and registered."""
-    result = evaluate(run)
-    assert result["psnr_registered"] is None and "did not correct" in result["registered_reason"]
-    assert result["cameras"] is False
+def test_one_half_of_a_view_is_aligned_and_the_other_scored(run: Run, data: Path, tmp_path: Path) -> None:
+    """Where the fit corrected its cameras. What is darker in the scored half has no influence on the gain."""
+    plain = evaluate(run)
+    assert plain["psnr_aligned"] is None and "did not correct" in plain["aligned_reason"]
     run.write_json(CAMERAS, {"to_world": {}})
-    registered = evaluate(run)
-    assert registered["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
-    assert registered["cameras"] is True and registered["registered_reason"] is None
-    assert all(view["psnr_registered"] >= view["psnr"] for view in registered["views"])
-    assert registered["psnr_registered"] > registered["psnr"]
+    whole = evaluate(run)
+    assert whole["psnr"] == pytest.approx(plain["psnr"], abs=1e-4) and whole["aligned_reason"] is None
+    assert whole["psnr_aligned"] > whole["psnr"] + 0.5
+    parts = [f"psnr_aligned{part}" for part in ("", "_object")]
+    found, board = [whole["views"][0]], (np.indices((SIZE, SIZE)) // 2).sum(axis=0) % 2
+    for half in (1, 0):
+        copy = shutil.copytree(data, tmp_path / f"{half}")
+        image = read_png(copy / "test/r_0.png")
+        image[board == half, :3] *= 0.5
+        write_png(copy / "test/r_0.png", image)
+        found.append(evaluate(run, copy)["views"][0])
+    assert found[1]["gain"] == found[0]["gain"] and max(found[2]["gain"]) < 0.8 * min(found[0]["gain"])
+    assert all(found[1][key] < found[0][key] - 1 for key in parts)
+
+
+def test_photographs_are_measured_at_one_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever size was fitted; cameras belong to it. Images with alpha have the fitted size."""
+    monkeypatch.setattr("mi_refgs.runs.views.MEASURED", 16)
+    method = load_resolved(write_method(tmp_path))
+    methods = [method.downscaled(factor) for factor in (1, 2)]
+    photographs, masked = write_open_data(tmp_path / "open"), write_data(tmp_path / "alpha")
+    first, second = (measured_views(one, photographs).views[0].load() for one in methods)
+    whole = read_views(method, photographs, "test").views[0].load()
+    np.testing.assert_array_equal(first.image, second.image)
+    np.testing.assert_allclose(first.image, resize_local_mean(whole.image, (16, 16)), atol=1e-5)
+    pixels, own = (np.array(view.project(np.array([[0.1, 0.2, 0.3]]))[:2]) for view in (first, whole))
+    np.testing.assert_allclose((pixels + 0.5) * SIZE / 16, own + 0.5)
+    assert [measured_views(one, masked).views[0].width for one in methods] == [SIZE, SIZE // 2]
 
 
 def test_evaluate_measures_the_scene_files(run: Run) -> None:
