@@ -25,8 +25,7 @@ from benchmarks import pages, plots
 from benchmarks.common.build import RESULTS, commit, recorded, write_result
 from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
-from benchmarks.fits.measure import Workplace, group
-from benchmarks.fits.plan import GROUPS, TIMED, Fit
+from benchmarks.fits import GROUPS, TIMED, Fit, Workplace, group
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 

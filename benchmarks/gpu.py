@@ -30,9 +30,9 @@ from benchmarks.common.build import recorded, write_result
 from benchmarks.common.report import Row, plain_parser
 from benchmarks.common.timing import milliseconds
 from benchmarks.common.view import ROOT
-from benchmarks.fits.measure import refgs
+from benchmarks.fits import refgs
+from benchmarks.splatting.__main__ import case, compare, step_times
 from benchmarks.splatting.cases import COLOUR, PAGE, Grid, Workload, sphere
-from benchmarks.splatting.measure import case, compare, step_times
 from benchmarks.splatting.renderers import FLATNESS, Ours, Volprim
 from benchmarks.stability.cases import catalogue
 from benchmarks.stability.measure import measure as measure_case

@@ -14,7 +14,7 @@ from benchmarks.common.build import RESULTS, read_result
 from benchmarks.common.errors import CLEAR
 from benchmarks.common.report import Row, plain_parser, where
 from benchmarks.common.view import ROOT
-from benchmarks.splatting.measure import FLOPS
+from benchmarks.splatting.__main__ import FLOPS
 from benchmarks.stability.measure import GRADIENT_LIMIT, IMAGE_LIMIT
 from benchmarks.tables import worst_gradient
 from mi_refgs.io.files import is_file

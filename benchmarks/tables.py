@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.common.errors import CLEAR
 from benchmarks.common.report import Row, number, percent, row_table, table, where
-from benchmarks.fits.plan import GROUPS, SOURCES
+from benchmarks.fits import GROUPS, SOURCES
 from mi_refgs.compare.table import Statistic
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.scores import PIXEL_CLASSES

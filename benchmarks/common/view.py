@@ -173,24 +173,6 @@ def make_sensor(look: Look, size: int) -> Any:
     return mi.load_dict({"type": SENSOR, "inner": camera, "film": film, "sampler": {"type": "independent"}})
 
 
-def perspective(
-    size: tuple[int, int], focal: float, centre: tuple[float, float], pose: Any
-) -> dict[str, Any]:
-    """Mitsuba's camera with square pixels: width, height, focal length and principal point in pixels."""
-    width, height = size
-    film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb"}
-    return {
-        "type": "perspective",
-        "fov": float(np.degrees(2 * np.arctan(0.5 * width / abs(focal)))),
-        "fov_axis": "x",
-        "principal_point_offset_x": centre[0] / width - 0.5,
-        "principal_point_offset_y": centre[1] / height - 0.5,
-        "near_clip": 1e-2,
-        "to_world": mi.ScalarTransform4f(pose.tolist()),
-        "film": film | {"component_format": "float32", "rfilter": {"type": "box"}},
-    }
-
-
 @dataclass(frozen=True)
 class Points:
     """The P pixels of a view that show the object from its front, and what is seen there."""

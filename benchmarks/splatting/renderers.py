@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.common.view import perspective
 from benchmarks.splatting.cases import COLOUR, Workload
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import listening
+from mi_refgs.render.scene_xml import sensors_of
 from mi_refgs.splat import Camera, Composited, list_by_tile, project, splat
 from mi_refgs.splat.lanes import advance
 from mi_refgs.surfels.table import Surfels
@@ -139,17 +139,17 @@ class Volprim:
             "sh_coeffs": _tensor((workload.features[:, :COLOUR] - 0.5) / SH_0),
         }
         self.scene = mi.load_dict({"type": "scene", "primitives": ellipsoids})
-        p = workload.pinhole
-        self.sensor = mi.load_dict(perspective((p.width, p.height), p.fx, (p.cx, p.cy), p.to_world))
+        [self.sensor] = sensors_of([workload.camera()])
         self.integrator = mi.load_dict({"type": "volprim_rf_basic", "srgb_primitives": False})
         self.params = mi.traverse(self.scene)
         self.keys = [f"primitives.{name}" for name in ("data", "opacities", "sh_coeffs")]
-        shape = (p.height, p.width, COLOUR)
-        self.weights = mi.TensorXf(workload.weights(COLOUR).T.reshape(shape))
+        weights = np.pad(workload.weights(COLOUR), ((0, 1), (0, 0)))  # none of alpha
+        shape = (workload.pinhole.height, workload.pinhole.width, COLOUR + 1)
+        self.weights = mi.TensorXf(weights.T.reshape(shape))
         dr.eval(self.weights)
 
     def forward(self) -> Any:
-        """The image (H, W, 3)."""
+        """The image (H, W, 4), with alpha."""
         return mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=1)
 
     def both(self) -> list[Any]:

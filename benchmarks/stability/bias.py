@@ -4,7 +4,7 @@ Everything here is float64: the same scene with one rule replaced by what it sta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -72,47 +72,33 @@ def measure() -> dict[str, Any]:
 
 def _rules(case: Case) -> Iterator[dict[str, Any]]:
     light = light_of(case.light) if case.reflectance == "split_sum" else None
-    base = _scene(case, light)
+    pixels, raw = np.arange(WIDTH * HEIGHT), {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
+    base = scene_of(case, pixels, sorted_rows([raw], case.camera, pixels), light)
     pixel_sorted = replace(base, order=_by_pixel(base))
     depth = camera_frame(base.raw, base.camera)[0][:, 2]
     by_centre = np.broadcast_to(np.argsort(depth, kind="stable")[:, None], base.order.shape)
-    exact = reference.render(pixel_sorted)
-    centred = replace(base, order=by_centre)
-    pairs: list[tuple[str, Callable[[], reference.Image], Callable[[], reference.Image]]] = [
-        ("sorted by tile → by pixel", lambda: reference.render(base), lambda: exact),
-        ("sorted by centre → by pixel", lambda: reference.render(centred), lambda: exact),
-    ]
-    for name, change in (
-        ("ALPHA_MIN 1/255 → 0", {"alpha_min": 0.0}),
-        ("ALPHA_MAX 0.99 → 1", {"alpha_max": NEARLY_ONE}),
-        ("TRANSMITTANCE_MIN 1e-4 → 0", {"transmittance_min": 0.0}),
-        ("EDGE_ON_COSINE 1e-4 → 0", {"edge_on": 0.0}),
+    exact, fine = _radiance(pixel_sorted), _supersampled(case, light)
+
+    def ruled(**rules: Any) -> Array:
+        return _radiance(replace(pixel_sorted, rules=replace(base.rules, **rules)))
+
+    for name, ours, truth in (
+        ("sorted by tile → by pixel", _radiance(base), exact),
+        ("sorted by centre → by pixel", _radiance(replace(base, order=by_centre)), exact),
+        ("ALPHA_MIN 1/255 → 0", exact, ruled(alpha_min=0.0)),
+        ("ALPHA_MAX 0.99 → 1", exact, ruled(alpha_max=NEARLY_ONE)),
+        ("TRANSMITTANCE_MIN 1e-4 → 0", exact, ruled(transmittance_min=0.0)),
+        ("EDGE_ON_COSINE 1e-4 → 0", exact, ruled(edge_on=0.0)),
+        ("low-pass → mean of the pixel", exact, fine),
+        ("no low-pass → mean of the pixel", ruled(low_pass=None), fine),
     ):
-        other = replace(pixel_sorted, rules=replace(base.rules, **change))
-        pairs.append((name, lambda: exact, lambda other=other: reference.render(other)))  # type: ignore[misc]
-    fine = _supersampled(case, light)
-    plain_rays = replace(pixel_sorted, rules=replace(base.rules, low_pass=None))
-    pairs.append(("low-pass → mean of the pixel", lambda: exact, lambda: fine))
-    pairs.append(("no low-pass → mean of the pixel", lambda: reference.render(plain_rays), lambda: fine))
-    for name, ours, truth in pairs:
-        yield {"scene": case.name, "rule": name} | _difference(ours(), truth())
+        scale = float(np.mean(np.abs(truth)))
+        errors = {"bias": np.mean(ours - truth) / scale, "mean": np.mean(np.abs(ours - truth)) / scale}
+        yield {"scene": case.name, "rule": name} | {key: float(x) for key, x in errors.items()}
 
 
-def _difference(ours: reference.Image, truth: reference.Image) -> dict[str, float]:
-    a, b = ours.maps["radiance"], truth.maps["radiance"]
-    mean = float(np.mean(np.abs(b)))
-    return {
-        "bias": float(np.mean(a - b)) / mean,
-        "mean": float(np.mean(np.abs(a - b))) / mean,
-        "max": float(np.max(np.abs(a - b))) / float(np.abs(b).max()),
-        "alpha": float(np.mean(ours.maps["alpha"] - truth.maps["alpha"])),
-    }
-
-
-def _scene(case: Case, light: reference.Light | None) -> reference.Scene:
-    pixels = np.arange(case.camera.width * case.camera.height)
-    raw = {n: np.asarray(x, np.float64) for n, x in case.raw.items()}
-    return scene_of(case, pixels, sorted_rows([raw], case.camera, pixels), light)
+def _radiance(scene: reference.Scene) -> Array:
+    return reference.render(scene).maps["radiance"]
 
 
 def _by_pixel(scene: reference.Scene) -> Array:
@@ -120,24 +106,21 @@ def _by_pixel(scene: reference.Scene) -> Array:
     return np.argsort(reference.sample_depth(scene), axis=0, kind="stable")
 
 
-def _supersampled(case: Case, light: reference.Light | None) -> reference.Image:
-    """Means over SAMPLES² rays per pixel, without the low-pass."""
+def _supersampled(case: Case, light: reference.Light | None) -> Array:
+    """Mean radiance over SAMPLES² rays per pixel, without the low-pass."""
     c = case.camera
     fine = replace(
         c, width=SAMPLES * c.width, height=SAMPLES * c.height, fx=SAMPLES * c.fx, fy=SAMPLES * c.fy,
         cx=SAMPLES * c.cx, cy=SAMPLES * c.cy,
     )  # fmt: skip
-    maps: dict[str, list[Array]] = {"radiance": [], "alpha": []}
+    found = []
     for row in range(c.height):  # a row of pixels at a time: memory
         pixels = np.arange(SAMPLES * fine.width) + row * SAMPLES * fine.width
         scene = scene_of(replace(case, camera=fine), pixels, np.empty((0, 0), int), light)
         scene = replace(scene, rules=reference.Rules(low_pass=None))
-        image = reference.render(replace(scene, order=_by_pixel(scene)))
-        for name, found in maps.items():
-            blocks = image.maps[name].reshape(SAMPLES, c.width, SAMPLES, -1)
-            found.append(blocks.mean((0, 2)))
-    joined = {name: np.concatenate(found) for name, found in maps.items()}
-    return reference.Image(joined, np.zeros(c.width * c.height, bool), np.empty((0, 0), bool))
+        image = _radiance(replace(scene, order=_by_pixel(scene)))
+        found.append(image.reshape(SAMPLES, c.width, SAMPLES, -1).mean((0, 2)))
+    return np.concatenate(found)
 
 
 def _cut(opacity: float) -> dict[str, float]:

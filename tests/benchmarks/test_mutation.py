@@ -3,7 +3,7 @@
 import ast
 from functools import cache
 
-from benchmarks.mutation import mutated, read_mutants
+from benchmarks.mutation.__main__ import mutated, read_mutants
 from tests.helpers import ROOT
 
 MUTANTS = read_mutants()

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import all as everything, pages, plots, tables
 from benchmarks.common.build import RESULTS, merged, read_result, recorded, write_result
-from benchmarks.fits.plan import GROUPS, RING, SOURCES, Fit
+from benchmarks.fits import GROUPS, RING, SOURCES, Fit
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.scores import PIXEL_CLASSES
 from tests.helpers import ROOT, run_process
@@ -42,7 +42,7 @@ def test_measured_numbers_have_a_data_file(page: str) -> None:
 
 
 def row(**values: Any) -> dict[str, Any]:
-    """The row of a fit as `benchmarks.fits.measure` leaves it."""
+    """The row of a fit as `benchmarks.fits` leaves it."""
     keys = (*tables.NUMBERS, "error_budget")
     found = {"source": RING.source, "method": "auto", "preset": "quick", "threads": 1, "decisions": []}
     found |= dict.fromkeys(keys, None) | {"psnr": 28.04, "train_seconds": 90.0, "build": "abc"}
