@@ -31,6 +31,12 @@ def gaussian_shader(_: Path) -> mi.Scene:
     return scenes.scene(raw=raw_channels() | more, reflectance="gaussian_shader")
 
 
+def surfels(folder: Path) -> mi.Scene:
+    curvature = np.random.default_rng(6).normal(size=(COUNT, 3)).astype(np.float32)
+    given = {"mesh": scenes.plane_mesh(folder), "aovs": "n:normal,d:depth"}
+    return scenes.open_scene(raw=raw_channels() | {"curvature": curvature}, **given)
+
+
 def emitters(_: Path) -> mi.Scene:
     turned = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 40)
     sky = {"type": "envmap", "bitmap": mi.Bitmap(scenes.sky()), "to_world": turned}
@@ -57,7 +63,7 @@ def path_traced(_: Path) -> mi.Scene:
 
 SCENES: dict[str, tuple[Callable[[Path], mi.Scene], str]] = {
     "refgs_bsdf": (path_traced, "ball.bsdf."),
-    "surfels": (lambda to: scenes.open_scene(mesh=scenes.plane_mesh(to), aovs="n:normal,d:depth"), ""),
+    "surfels": (surfels, ""),
     "Gaussian shader": (gaussian_shader, "integrator."),
     "emitters": (emitters, "s"),
     "constant": (lambda _: scenes.lit_scene({"type": "constant"}), "sky."),

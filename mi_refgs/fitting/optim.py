@@ -23,7 +23,7 @@ import numpy as np
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import phase
-from mi_refgs.surfels.table import gather_rows
+from mi_refgs.surfels.table import gather_rows, sigmoid
 from mi_refgs.types import Bool, Float, TensorXf, UInt32
 
 BETA_1, BETA_2 = 0.9, 0.999
@@ -44,6 +44,7 @@ class LearningRate:
     head: int = 0  # columns that learn at the rate; 0: all
     tail: float = 1.0  # factor of the rate of the other columns: SH beyond degree 0
     relative: bool = False  # values above 1 learn at the rate times themselves: lamps grow exponentially
+    mirrors: bool = False  # rows learn at the rate times metallic (1 - roughness)²: others reflect no normals
     unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
     centre: tuple[float, float, float] | None = None
     """Rows of positions learn at the rate times their distance from here, in units of the tensor."""
@@ -207,6 +208,8 @@ class Adam:
                     dr.gather(mi.Float, θ, row + k) - dr.opaque(mi.Float, group.centre[k]) for k in range(3)
                 )
                 η = η * dr.norm(mi.Vector3f(*offset)) / dr.opaque(mi.Float, group.unit)
+            if group.mirrors:
+                η = η * self._mirrored(name)
             updated[name] = (dr.select(good, θ - η * m / (dr.sqrt(v) + EPSILON), θ), shape)
             self._first[name] = dr.select(good, m, self._first[name])
             self._second[name] = dr.select(good, v, self._second[name])
@@ -217,6 +220,16 @@ class Adam:
         for name, (θ, shape) in updated.items():
             self.params[name] = mi.TensorXf(θ, shape=shape)
             self._make_leaf(name)
+
+    def _mirrored(self, name: str) -> Float:
+        """How much of a mirror the surfel of each entry is, metallic (1 - roughness)²; without these, 1."""
+        row = dr.arange(mi.UInt32, math.prod(self.params[name].shape)) // self.params[name].shape[-1]
+
+        def of(other: str, absent: float) -> Float:
+            values = self.params.get(name.removesuffix("curvature") + other)
+            return absent if values is None else sigmoid(dr.gather(mi.Float, dr.detach(values.array), row))
+
+        return of("metallic", 1) * dr.square(1 - of("roughness", 0))
 
     def _cut(self, name: str, g: Float, t: int, inverse: Float) -> Float:
         """The gradient of step t, without unit, cut, 0 where not finite; `inverse` is 1 / (1 - β₂ᵗ⁻¹)."""

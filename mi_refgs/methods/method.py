@@ -252,14 +252,15 @@ class Method:
     def check(self) -> None:
         """Raise InputError for an unknown name, and for a stage or an event without what it needs."""
         surfels = self.surfels
-        PRIMITIVES.find(surfels.primitive, "surfels.primitive")
+        primitive = PRIMITIVES.find(surfels.primitive, "surfels.primitive")
         if self.surroundings is not None:
             PRIMITIVES.find(self.surroundings.primitive, "surroundings.primitive")
         attributes = {*surfels.names}
         others = {LIGHT} if self.light is not None else set()
         harmonics = {name for name, one in ATTRIBUTES.items() if one.harmonics}
-        no_geometry = {name for name, one in ATTRIBUTES.items() if not one.geometry}
-        _require_known("surfels.attributes", surfels.attributes, no_geometry)
+        primitive.require_own(attributes)
+        allowed = {name for name, one in ATTRIBUTES.items() if not one.geometry} | {*primitive.optional}
+        _require_known("surfels.attributes", surfels.attributes, allowed)
         _require_known("surfels.initial", surfels.initial, attributes)
         _require_known("surfels.degree", surfels.degree, harmonics)
         _require_known("surfels.from_images", surfels.from_images, {*surfels.attributes})

@@ -14,7 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refgs import constants as c
-from mi_refgs.reference.camera import PinholeCamera, camera_frame, intrinsics, ray_slopes, sigmoid
+from mi_refgs.reference.camera import (
+    PinholeCamera,
+    camera_frame,
+    intrinsics,
+    ray_slopes,
+    rotation_axes,
+    sigmoid,
+)
 from mi_refgs.reference.light import clip
 
 Array = np.ndarray
@@ -42,6 +49,8 @@ class Sample:
     z: Array  # depth of the sample
     unclamped: Array  # real part of α before the clamp
     jump: Array  # relative distance of ρ to where depth jumps; infinite where it does not
+    u: Array  # standard deviations from the centre along two axes, 0 where the low-pass decides
+    v: Array
 
 
 class Surfel:
@@ -62,7 +71,8 @@ class Surfel:
         with np.errstate(all="ignore"):
             t = np.sum(p * axes[:, 2], axis=1)[:, None] / (axes[:, 2] @ ray)
             _, across = _from_centre(p, axes, ray)
-            plane = sum((t * across[i] / σ[:, i : i + 1]) ** 2 for i in range(2))
+            u, v = (t * across[i] / σ[:, i : i + 1] for i in range(2))
+            plane = u**2 + v**2
             middle = [f * p[:, i : i + 1] / p[:, 2:] + m for i, (f, m) in enumerate(intrinsics(camera))]
             screen = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
             screen = screen * rules.low_pass if rules.low_pass else np.full_like(screen, np.inf)
@@ -73,12 +83,24 @@ class Surfel:
         z = np.where(low_pass, p[:, 2:], t)
         with np.errstate(all="ignore"):
             jump = np.abs(screen.real - plane.real) / screen.real
-        return Sample(alpha, z, unclamped.real, jump)
+        u, v = np.where(low_pass | ~np.isfinite(t), 0, [u, v])
+        return Sample(alpha, z, unclamped.real, jump, u, v)
 
     @staticmethod
     def normal(raw: Raw) -> Array:
         """The third axis."""
         return np.full(len(raw["position"]), 2)
+
+    @staticmethod
+    def turns(raw: Raw) -> Array:
+        """What the normal gains per standard deviation (N, 6) along u, then along v, from `curvature`."""
+        axes, κ, σ = rotation_axes(raw["rotation"]), raw["curvature"], np.exp(raw["scale"])
+        turns = []
+        for i in range(2):
+            x, y = (σ[:, i] * κ[:, i + k] for k in range(2))
+            scale = 1 / np.sqrt(1 + (x**2 + y**2) / c.MAX_TURN**2)
+            turns.append((scale * x)[:, None] * axes[0] + (scale * y)[:, None] * axes[1])
+        return np.concatenate(turns, axis=1)
 
     @staticmethod
     def sort_key(raw: Raw, camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:
@@ -131,7 +153,9 @@ class Gaussian:
             unclamped = sigmoid(raw["opacity"]) * np.exp(-0.5 * rho)
         alpha = np.where(unclamped.real > rules.alpha_max, rules.alpha_max, unclamped)
         depth = np.broadcast_to(p[:, 2:], alpha.shape)
-        return Sample(alpha, depth, unclamped.real, np.full(alpha.shape, np.inf))
+        return Sample(
+            alpha, depth, unclamped.real, np.full(alpha.shape, np.inf), *np.zeros((2, *alpha.shape))
+        )
 
     @staticmethod
     def sort_key(raw: Raw, camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:

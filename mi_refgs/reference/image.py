@@ -64,10 +64,10 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     blend = Blend([raw, around] if around else [raw], camera, scene.order, x, y, scene.rules)
     features_of = Features(scene, raw)
     taps: Taps = []
-    features = features_of(features_of.columns, taps).real
+    features, turns = np.split(features_of(features_of.columns, taps).real, [features_of.width], axis=1)
     # Features and alpha are those of the object, the depth is that of everything.
     weight, depth = blend.weight[:count], np.sum(blend.weight * blend.z, 0)
-    sums = np.concatenate([weight.T @ features, depth[:, None], weight.sum(0)[:, None]], axis=1)
+    sums = np.concatenate([blend.sums(features, turns), depth[:, None], weight.sum(0)[:, None]], axis=1)
     resolve = Resolve(scene, features_of, x, y, sums)
     mean_depth = depth * inverse_alpha(blend.weight.sum(0))
     resolve.depth = mean_depth if around else None
@@ -90,7 +90,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
         [np.asarray(weights.get(n, np.zeros_like(maps[n])), np.float64).reshape(len(x), -1) for n in maps], 1
     )
     δsums = itemwise_adjoint(lambda v: resolve(v, []), sums, δout)
-    gradients, δfeatures = blend.adjoint(features, δsums)
+    gradients, δfeatures = blend.adjoint(features, turns, δsums)
     δraw = itemwise_adjoint(lambda v: features_of(v, []), features_of.columns, δfeatures)
     for name, values in features_of.split(δraw).items():
         gradients[name] = gradients.get(name, np.zeros_like(raw[name])) + values
@@ -124,11 +124,13 @@ def sample_depth(scene: Scene) -> Array:
 
 
 class Features:
-    """Features (N, K) of raw columns (N, D), by `layout`: normal, then what is blended besides."""
+    """Features (N, K) of raw columns (N, D), by `layout`: normal, then what is blended besides; then `turns`
+    (N, 6) of curved surfels that are shaded in pixels."""
 
     def __init__(self, scene: Scene, raw: Raw) -> None:
         self.scene, self.normal = scene, primitive_of(raw).normal(raw)
-        self.names = [name for name in raw if name not in ("scale", "opacity")]
+        self.turned = scene.at == "pixel" and "curvature" in raw
+        self.names = [name for name in raw if name != "opacity" and (self.turned or name != "scale")]
         self.columns = np.concatenate([raw[name] for name in self.names], axis=1)
         self.widths = [raw[name].shape[1] for name in self.names]
         self.has_indirect = scene.visibility is not None and "indirect_sh" in raw
@@ -142,6 +144,11 @@ class Features:
             self.layout = {"normal": 3, **self.materials}
             own = scene.reflectance != "split_sum" or scene.diffuse == "sh"
             self.layout |= ({"radiance": 3} if own else {}) | ({"indirect": 3} if self.has_indirect else {})
+
+    @property
+    def width(self) -> int:
+        """Number of features K."""
+        return sum(self.layout.values())
 
     def split(self, columns: Array) -> dict[str, Array]:
         return split(columns, dict(zip(self.names, self.widths, strict=True)))
@@ -167,6 +174,9 @@ class Features:
             terms = MODELS[scene.reflectance](points, scene.light, self.options, taps)
             values |= dict(zip(TERMS, terms, strict=True)) | {"radiance": sum(terms[1:], terms[0])}
         values["normal"] = normal
+        if self.turned:
+            turns = primitive_of(raw).turns(raw) * np.where(away, -1, 1)
+            return np.concatenate([*(values[name] for name in self.layout), turns], axis=1)
         return np.concatenate([values[name] for name in self.layout], axis=1)
 
 

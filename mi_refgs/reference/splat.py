@@ -48,6 +48,7 @@ class Blend:
         alpha, z = self.sample.alpha.real, self.sample.z.real
         hit = (alpha >= rules.alpha_min) & (z > camera.near) & ~self.culled[:, None]
         self.alpha, self.z = np.where(hit, alpha, 0), np.where(hit, z, 0)
+        self.u, self.v = (np.where(hit, place.real, 0) for place in (self.sample.u, self.sample.v))
         behind = np.take_along_axis(np.log1p(-self.alpha), order, 0).cumsum(0)
         before = np.exp(np.concatenate([np.zeros((1, len(x))), behind[:-1]]))
         ends = math.log(rules.transmittance_min) if rules.transmittance_min else -math.inf
@@ -71,11 +72,23 @@ class Blend:
             found |= np.any(where & (np.abs(values - limit) < width * limit), 0)
         return found
 
-    def adjoint(self, features: Array, δsums: Array) -> tuple[dict[str, Array], Array]:
-        """Derivatives of Σ δsums · sums by raw channels of the one table, and by features (N, K); sums
-        (P, K + 2): of features, depth, alpha."""
+    def sums(self, features: Array, turns: Array) -> Array:
+        """Blended features (P, K) of the first rows (N, K); the first T gain `turns` (N, 2 T) per standard
+        deviation along u, then along v."""
+        count, turned = len(features), turns.shape[1] // 2
+        sums = self.weight[:count].T @ features
+        for place, turn in zip((self.u, self.v), np.split(turns, 2, axis=1), strict=True):
+            sums[:, :turned] += (self.weight * place)[:count].T @ turn
+        return sums
+
+    def adjoint(self, features: Array, turns: Array, δsums: Array) -> tuple[dict[str, Array], Array]:
+        """Derivatives of Σ δsums · sums by raw channels of the one table, and by features (N, K) and turns;
+        sums (P, K + 2): of features, depth, alpha."""
         (raw,) = self.tables
+        δturned = δsums[:, : turns.shape[1] // 2]
+        by_u, by_v = (turn @ δturned.T for turn in np.split(turns, 2, axis=1))
         value = features @ δsums[:, :-2].T + self.z * δsums[:, -2] + δsums[:, -1]
+        value += self.u * by_u + self.v * by_v
         part = np.take_along_axis(self.weight * value, self.order, 0)
         behind = _unsort(np.cumsum(part[::-1], axis=0)[::-1] - part, self.order)
         δalpha = np.where(self.shown, self.before * value - behind / (1 - self.alpha), 0)
@@ -87,22 +100,33 @@ class Blend:
                 moved[name][:, d] += 1j * STEP
                 there = primitive.footprint(moved, self.camera, self.rules, self.x, self.y)
                 slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
-                slope = np.where(self.shown, δalpha * slope_alpha + δz * slope_z, 0)
+                slope_turn = by_u * there.u.imag / STEP + by_v * there.v.imag / STEP
+                slope = δalpha * slope_alpha + δz * slope_z + self.weight * slope_turn
+                slope = np.where(self.shown, slope, 0)
                 gradients[name][:, d] = np.sum(slope, 1)
-        return gradients, self.weight @ δsums[:, :-2]
+        by_turn = [self.weight * place @ δturned for place in (self.u, self.v)]
+        return gradients, np.concatenate([self.weight @ δsums[:, :-2], *by_turn], axis=1)
 
 
-def splat(raw: Raw, features: Array, camera: PinholeCamera, band: float = 1e-3) -> Maps:
-    """Render raw channels with features (N, K); `band` is the relative width of the declared band."""
+def splat(
+    raw: Raw, features: Array, camera: PinholeCamera, band: float = 1e-3, turns: Array | None = None
+) -> Maps:
+    """Render raw channels with features (N, K); `band` is the relative width of the declared band; `turns` as
+    in `Blend.sums`."""
+    turns = features[:, :0] if turns is None else turns
     blend, shape = _whole_image(raw, camera), (camera.height, camera.width)
     maps = np.sum(blend.weight * blend.z, 0), blend.weight.sum(0), blend.band(band)
     depth, alpha, near = (plane.reshape(shape) for plane in maps)
-    return Maps((blend.weight.T @ features).reshape(*shape, -1), depth, alpha, near)
+    return Maps(blend.sums(features, turns).reshape(*shape, -1), depth, alpha, near)
 
 
-def differentiate(raw: Raw, features: Array, camera: PinholeCamera, weights: Array) -> dict[str, Array]:
-    """Gradients of Σ weights · maps, for `weights` (K + 2, P): as the raw channels, and "features" (N, K)."""
-    gradients, δfeatures = _whole_image(raw, camera).adjoint(features, weights.T)
+def differentiate(
+    raw: Raw, features: Array, camera: PinholeCamera, weights: Array, turns: Array | None = None
+) -> dict[str, Array]:
+    """Gradients of Σ weights · maps, for `weights` (K + 2, P): as the raw channels, and "features", then
+    turns (N, K + 2 T)."""
+    turns = features[:, :0] if turns is None else turns
+    gradients, δfeatures = _whole_image(raw, camera).adjoint(features, turns, weights.T)
     return gradients | {"features": δfeatures}
 
 

@@ -6,9 +6,10 @@
 Both use the same splatter and the same `shade`. `mi_refgs.plugins.derivatives` lists what has no derivative.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import drjit as dr
@@ -31,6 +32,8 @@ from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, Float, Point3f, TensorXf, Vector3f
+
+NO_TURNS: Mapping[str, Vector3f] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -162,19 +165,24 @@ class _View:
     def asked(self) -> frozenset[str]:
         return frozenset(self.request.aovs)
 
-    def blend(self, slots: dict[str, Any], others: dict[str, Any]) -> GBuffer:
-        """Blend slots of the object's surfels together with those of the surroundings, in one sort."""
+    def blend(
+        self, slots: dict[str, Any], others: dict[str, Any], turns: Mapping[str, Vector3f] = NO_TURNS
+    ) -> GBuffer:
+        """Blend slots of the object's surfels together with those of the surroundings, in one sort; the first
+        slot varies over a surfel by its `turns`."""
         if self.others:
             own, beside = (table.count for table in self.geometry)
-            slots = joined_slots(slots, others, (own, beside))
+            first = dict.fromkeys([*slots][:1], mi.Vector3f(0)) if turns else {}
+            slots = joined_slots(slots, first | others, (own, beside))
+            turns = joined_slots(turns, {}, (own, beside))
         values = features(slots)
         if self.request.forward_only:
             depth = "depth" in self.asked or self.scene.near is not None
-            blended = splat_compact(self.geometry, values, self.camera, depth)
+            blended = splat_compact(self.geometry, values, self.camera, depth, features(turns))
         else:
             if self.request.attribution is not None:
                 values = [*values, self.request.attribution]
-            blended = splat(self.geometry, values, self.camera)
+            blended = splat(self.geometry, values, self.camera, features(turns))
         return GBuffer(blended, slots)
 
     def frame(self, buffer: GBuffer, **fields: Any) -> Frame:
@@ -237,7 +245,8 @@ def _shade_at_pixels(view: _View) -> Frame:
     slots = {"normal": view.points.normal} | view.points.attributes
     slots |= scene.surfels.values(view.asked - slots.keys())
     others = {SURROUNDINGS: view.others["radiance"]} if view.others else {}
-    buffer = view.blend(slots | view.presence, others)
+    turns = scene.surfels.primitive.turns(scene.surfels, view.points.normal)
+    buffer = view.blend(slots | view.presence, others, turns)
     values = {name: buffer.divided(name) for name in slots if name != "normal"}
     normal, alpha = buffer.slots["normal"], buffer.slots.get(OBJECT, buffer.alpha)
 

@@ -32,17 +32,20 @@ def project(surfels: Tables, camera: Camera) -> Footprints:
     return reduce(Footprints.followed_by, (table.primitive.project(table, camera) for table in tables))
 
 
-def splat(surfels: Tables, features: list[Float], camera: Camera) -> Composited:
-    """Splat features of surfels to maps of H·W pixels in raster order; derivatives as in `composite`."""
+def splat(surfels: Tables, features: list[Float], camera: Camera, turns: Sequence[Float] = ()) -> Composited:
+    """Splat features of surfels to maps of H·W pixels in raster order; derivatives as in `composite`. The
+    first T features gain `turns` (2 T of them) per standard deviation of a surfel, along u, then along v."""
     if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera)
     footprints = project(surfels, camera)
-    lists = list_by_tile(footprints, camera, features)
-    return composite(footprints, features, lists)
+    lists = list_by_tile(footprints, camera, features, turns)
+    return composite(footprints, features, lists, [*turns])
 
 
-def splat_compact(surfels: Tables, features: list[Float], camera: Camera, depth: bool) -> Composited:
+def splat_compact(
+    surfels: Tables, features: list[Float], camera: Camera, depth: bool, turns: Sequence[Float] = ()
+) -> Composited:
     """Splat as `composite_compact` does: only pixels near surfels, no derivatives."""
     if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera, depth)
-    return composite_compact(list_by_tile(project(surfels, camera), camera, features), depth)
+    return composite_compact(list_by_tile(project(surfels, camera), camera, features, turns), depth)

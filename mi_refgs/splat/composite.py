@@ -7,7 +7,8 @@ gᵢ = Σ_k δ_k f_ik, and S = Σ_k δ_k out_k less wᵢ gᵢ at each step, whic
 
     δf_ik = wᵢ δ_k,        δαᵢ = Tᵢ gᵢ - S_{j>i} / (1 - αᵢ)
 
-needs neither a reversed list nor storage per pair.
+needs neither a reversed list nor storage per pair. The first features may vary over their surfel, by what
+`turns` adds per standard deviation u and v: f + u f_u + v f_v, with u = v = 0 where the low-pass decides.
 
 No derivative, on purpose: the sort order, the tile lists, the α < 1/255 cut and the end at T < 1e-4, the near
 plane, the clamp at α_max (zero). The border of a footprint does not move: with ε = 1/255, mean gradients of
@@ -16,6 +17,7 @@ size and position fall short by the part ε ln(o/ε) / (o - ε), those of opacit
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,10 +50,12 @@ class Composited:
 
 
 @phase("splat forward", backward="splat backward")
-def composite(footprints: Footprints, features: list[Float], lists: TileLists) -> Composited:
-    """Maps of H·W pixels; differentiable in footprints and features (N,), whose values `lists` has."""
-    footprints, features = boundary((footprints, features), "surfels backward")
-    out = dr.custom(_Composite, footprints.columns + features, lists)
+def composite(
+    footprints: Footprints, features: list[Float], lists: TileLists, turns: list[Float] | None = None
+) -> Composited:
+    """Maps of H·W pixels; differentiable in footprints, features and turns (N,), whose values `lists` has."""
+    footprints, features, turns = boundary((footprints, features, turns or []), "surfels backward")
+    out = dr.custom(_Composite, [*footprints.columns, *features, *turns], lists)
     return Composited(out[: len(features)], *out[-2:])
 
 
@@ -70,9 +74,26 @@ def composite_compact(lists: TileLists, depth: bool) -> Composited:
     return Composited(maps[: lists.features], maps[-2] if depth else None, maps[-1], pixels)
 
 
-def _values(lists: TileLists, row: list[Float], z: Float) -> list[Float]:
+def _values(lists: TileLists, row: list[Float], sample: Any) -> list[Float]:
     """What a surfel adds to each map, times its weight: features, depth, and 1 for alpha."""
-    return [*row[lists.primitive.columns :][: lists.features], z, mi.Float(1)]
+    features = row[lists.primitive.columns :][: lists.features]
+    if lists.turned:
+        (u, v), (by_u, by_v) = _inside(sample), _turns(lists, row)
+        features[: lists.turned] = [
+            dr.fma(u, a, dr.fma(v, b, f)) for a, b, f in zip(by_u, by_v, features, strict=False)
+        ]
+    return [*features, sample.z, mi.Float(1)]
+
+
+def _turns(lists: TileLists, row: list[Float]) -> tuple[list[Float], list[Float]]:
+    """What the turned features gain per standard deviation along u and along v."""
+    first = lists.primitive.columns + lists.features
+    return row[first:][: lists.turned], row[first + lists.turned :][: lists.turned]
+
+
+def _inside(sample: Any) -> list[Float]:
+    """Standard deviations u and v of a sample from its surfel's centre, 0 where the low-pass decides."""
+    return [dr.select(sample.low_pass, 0, x) for x in (sample.u, sample.v)]
 
 
 def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], list[list[Float]]]:
@@ -84,7 +105,7 @@ def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], li
         for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
             sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-            values = _values(lists, row, sample.z)[:maps]
+            values = _values(lists, row, sample)[:maps]
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
             after.append((goes_on, transmittance_after, out))
         return after
@@ -104,18 +125,22 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
 
     def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row = lists.rows.fetch(surfel, some)
-        after, weights = [], []
+        after, weights, places = [], [], []
         geometry = lists.primitive.adjoint()
         # Adjoints of α and z per pixel, summed over the pixels of the lane.
         for pixel, _, _, active_here, transmittance, behind_here, δhere in lanes.each(active, *state, δ):
             sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             g = mi.Float(0)
-            for adjoint, value in zip(δhere, _values(lists, row, sample.z), strict=True):
+            for adjoint, value in zip(δhere, _values(lists, row, sample), strict=True):
                 g = dr.fma(adjoint, value, g)
             rest = dr.fma(-weight, g, behind_here)
             δalpha = dr.select(weight > 0, dr.fma(transmittance, g, -rest / (1 - sample.alpha)), 0)
-            geometry.add(sample, δalpha, weight * δhere[-2])
+            moved: list[Float] = []
+            if lists.turned:
+                places.append([weight * x for x in _inside(sample)])
+                moved = [weight * _dot(δhere, turn) for turn in _turns(lists, row)]  # adjoints of u and v
+            geometry.add(sample, δalpha, weight * δhere[-2], *moved)
             after.append((goes_on, transmittance_after, rest))
             weights.append(weight)
         # One addition per lane to the adjoint of the row.
@@ -125,6 +150,8 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
             for weight, δhere in zip(weights, δ, strict=True):
                 δfeature = dr.fma(weight, δhere[k], δfeature)
             δrow.append(δfeature)
+        for axis, k in itertools.product(range(2), range(lists.turned)):
+            δrow.append(_dot([of_pixel[axis] for of_pixel in places], [δhere[k] for δhere in δ]))
         δrows.add(surfel, δrow, any_of([weight > 0 for weight in weights]))
         return after
 
@@ -132,6 +159,11 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
     walk(lists, lanes, step, start, "composite_backward")
     dr.eval(δrows.data)
     return δrows
+
+
+def _dot(first: list[Float], second: list[Float]) -> Float:
+    """Sum of products, of as many as the shorter list has."""
+    return sum((a * b for a, b in zip(first, second, strict=False)), start=mi.Float(0))
 
 
 def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:
@@ -147,7 +179,7 @@ def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Flo
                 dr.set_grad(start, [*drow, dtransmittance])
                 sample = lists.primitive.evaluate(start, pixel, lists.camera.near)
                 weight, transmittance_after, goes_on = advance(sample, active_here, start[-1])
-                maps = [weight * value for value in _values(lists, start, sample.z)]
+                maps = [weight * value for value in _values(lists, start, sample)]
                 *dmaps, dafter = dr.forward_to([*maps, transmittance_after])
             dout = [total + dmap for total, dmap in zip(dout, dmaps, strict=True)]
             after.append((goes_on, dr.detach(transmittance_after), dafter, dout))
@@ -160,7 +192,7 @@ def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Flo
 
 
 class _Composite(dr.CustomOp):
-    """Columns (N,) of the footprints, then features, → [features…, depth, alpha] (H·W,)."""
+    """Columns (N,) of the footprints, then features and turns, → [features…, depth, alpha] (H·W,)."""
 
     def eval(self, columns: list[Any], lists: TileLists) -> list[Any]:
         self.lists = lists

@@ -25,10 +25,11 @@ class TileLists:
 
     camera: Camera
     primitive: Primitive
-    rows: PackedRows  # (N,): columns of the footprints, then features
+    rows: PackedRows  # (N,): columns of the footprints, then features, then turns
     surfel_from_pair: UInt32  # (M,)
     pair_begin: UInt32  # (tiles,): first pair of a tile
     pair_end: UInt32  # (tiles,): one past its last pair
+    turned: int = 0  # the first features that vary over their surfel, by two turns each
 
     @property
     def pairs(self) -> int:
@@ -38,16 +39,18 @@ class TileLists:
     @property
     def features(self) -> int:
         """Number of features K."""
-        return self.rows.width - self.primitive.columns
+        return self.rows.width - self.primitive.columns - 2 * self.turned
 
 
 @phase("tile lists")
-def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Float] = ()) -> TileLists:
-    """List every surfel, stably, in each tile that its footprint may touch, and pack footprints and features
-    (N,). Raises InputError for more than 2^MAX_PAIR_BITS pairs."""
+def list_by_tile(
+    footprints: Footprints, camera: Camera, features: Sequence[Float] = (), turns: Sequence[Float] = ()
+) -> TileLists:
+    """List every surfel, stably, in each tile that its footprint may touch, and pack footprints, features and
+    turns (N,). Raises InputError for more than 2^MAX_PAIR_BITS pairs."""
     tiles = camera.tiles[0] * camera.tiles[1]
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
-    rows = PackedRows.pack([*footprints.columns, *features])
+    rows, turned = PackedRows.pack([*footprints.columns, *features, *turns]), len(turns) // 2
     tile_size, primitive = mi.Vector2f(*camera.tile), footprints.primitive
     found: list[tuple[UInt64, Float]] = []
     count = 0
@@ -71,10 +74,10 @@ def list_by_tile(footprints: Footprints, camera: Camera, features: Sequence[Floa
             found.append((pairs, dr.gather(mi.Float, depth, kept)))
     if not found:
         none = dr.zeros(mi.UInt32, tiles)
-        return TileLists(camera, primitive, rows, mi.UInt32(), none, none)
+        return TileLists(camera, primitive, rows, mi.UInt32(), none, none, turned)
     pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
     tile, surfel = _sorted(pairs, depth, tiles)
-    return TileLists(camera, primitive, rows, surfel, *_runs(tile, tiles))
+    return TileLists(camera, primitive, rows, surfel, *_runs(tile, tiles), turned)
 
 
 @phase("sort")

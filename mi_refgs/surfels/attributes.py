@@ -34,12 +34,12 @@ class Attribute:
     name: str
     widths: tuple[int, ...]  # numbers of raw columns that it may have
     activation: Activation
-    rate: float  # Adam's learning rate, raw units per step; of positions, scene extents per step
+    rate: float  # Adam's, raw units per step; of positions, scene extents, of curvature 1/scene extent
     properties: tuple[str, ...]  # PLY properties per raw column; of spherical harmonics their prefix
     initial: float = 0.0  # activated; the points decide for geometry and the first colour
     jitter: float = 0.0  # half the width of uniform noise added to it, activated
     rest_rate: float = 1.0  # factor of the rate for spherical harmonics of degree 1 and above
-    geometry: bool = False  # position or size of a primitive; present if its primitive has it
+    geometry: bool = False  # position or shape of a primitive; present only if its primitive has it
     aov: str = ""  # suffixes of its AOV as Mitsuba names them: "RGB", "Y"; empty without an AOV
 
     @property
@@ -130,5 +130,6 @@ for _declared in (
     Attribute("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05),
     Attribute("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, aov="RGB"),
     Attribute("normal_offset", (3,), "identity", 1e-3, _numbered("offset")),
+    Attribute("curvature", (3,), "identity", 0.2, _numbered("curvature"), geometry=True),
 ):
     register(_declared)

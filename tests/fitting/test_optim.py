@@ -222,6 +222,24 @@ def test_rates_of_lamps_and_of_distant_positions_grow(
     np.testing.assert_allclose(params["x"].numpy() - start, 0.1 * np.array(factors), rtol=1e-3)
 
 
+def test_mirrors_learn_faster(rng: np.random.Generator) -> None:
+    """A row's step is that of Adam times metallic (1 - roughness)², of those that the surfels have."""
+    for names in ((), ("metallic",), ("metallic", "roughness")):
+        values = {f"refgs.{name}": rng.normal(size=(5, 1)) for name in names}
+        params = {name: tensor(x) for name, x in values.items()} | {
+            "refgs.curvature": tensor(np.zeros((5, 3)))
+        }
+        optimiser = Adam(params, {"refgs.curvature": LearningRate(0.1, mirrors=True)})
+        give(optimiser, "refgs.curvature", np.ones((5, 3)))
+        optimiser.step(0)
+        metallic, rough = (
+            1 / (1 + np.exp(-values.get(f"refgs.{name}", np.full((5, 1), at))))
+            for name, at in (("metallic", np.inf), ("roughness", -np.inf))
+        )
+        expected = np.broadcast_to(-0.1 * metallic * (1 - rough) ** 2, (5, 3))
+        np.testing.assert_allclose(params["refgs.curvature"].numpy(), expected, rtol=1e-4)
+
+
 def test_every_tensor_has_its_bit_however_many_there_are() -> None:
     """The first and the last of 40 tensors are distinguished, also where rows are wide."""
     sizes = {f"t{i}": (4, 2) for i in range(38)} | {"wide": (2, 100), "last": (4, 2)}

@@ -87,6 +87,8 @@ def values(case: Case, seed: int = 1) -> Values:
     raw = raw_channels(seed=seed)
     raw["tint"] = rng.normal(size=(len(raw["position"]), 3))
     raw["normal_offset"] = 0.2 * rng.normal(size=(len(raw["position"]), 3))
+    if case["primitive"] == "surfel":
+        raw["curvature"] = rng.normal(size=(len(raw["position"]), 3))
     found = dict(raw)
     direction = rng.normal(size=(OTHERS, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)

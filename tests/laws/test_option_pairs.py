@@ -30,6 +30,7 @@ STEP = 1e-6  # of central differences of the reference, in units of normal numbe
 KEPT = 0.75  # share of the pixels outside the reference's declared discontinuities, at least
 GROUPS = {
     "position": "shape", "rotation": "shape", "scale": "shape", "opacity": "shape",
+    "curvature": "curvature",
     "background": "background", "light": "light", "data": "light", "radiance": "light",
     "brightness": "the light's scale",
 }  # fmt: skip

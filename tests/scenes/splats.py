@@ -24,6 +24,7 @@ class Scene:
     raw: dict[str, np.ndarray]
     features: np.ndarray
     camera: reference.PinholeCamera
+    turns: np.ndarray | None = None  # (N, 6): the first three features vary over their surfels
 
     def fast_camera(self) -> Camera:
         c = self.camera
@@ -33,7 +34,15 @@ class Scene:
         return Surfels.from_numpy(self.raw)
 
     def columns(self) -> list:
-        return [upload(f) for f in self.features.T]
+        """Features, then turns."""
+        return [upload(f) for x in (self.features, self.turns) if x is not None for f in x.T]
+
+    def splat(self, surfels: Surfels, columns: list) -> Composited:
+        count = self.features.shape[1]
+        return splat(surfels, columns[:count], self.fast_camera(), columns[count:])
+
+    def exact(self, raw: dict[str, np.ndarray] | None = None) -> reference.Maps:
+        return reference.splat(raw or self.raw, self.features, self.camera, turns=self.turns)
 
 
 def make_scene(seed: int) -> Scene:
@@ -67,6 +76,13 @@ def make_scene(seed: int) -> Scene:
     # Round once, so that both sides see the same float32 numbers.
     raw = {name: values.astype(np.float32).astype(np.float64) for name, values in raw.items()}
     return Scene(raw, rng.uniform(size=(count, 4)).astype(np.float32).astype(np.float64), camera)
+
+
+def make_turned(seed: int) -> Scene:
+    """The surfels of `make_scene`, whose first three features vary over each of them, some steeply."""
+    scene, rng = make_scene(seed), np.random.default_rng(seed + 9)
+    turns = rng.normal(size=(len(scene.features), 6)) * rng.choice([0.1, 3], (len(scene.features), 1))
+    return replace(scene, turns=turns.astype(np.float32).astype(np.float64))
 
 
 def make_gaussians(seed: int) -> Scene:
@@ -105,12 +121,12 @@ def quaternion_to(normal: np.ndarray) -> np.ndarray:
 
 
 def fast_maps(scene: Scene) -> Composited:
-    return splat(scene.surfels(), scene.columns(), scene.fast_camera())
+    return scene.splat(scene.surfels(), scene.columns())
 
 
 def check_image(scene: Scene, tolerance: float) -> None:
     """Features, alpha and depth against the float64 reference."""
-    expected, got = reference.splat(scene.raw, scene.features, scene.camera), fast_maps(scene)
+    expected, got = scene.exact(), fast_maps(scene)
     keep = outside_band(expected)
     depth_scale = np.abs(scene.raw["position"]).max() + 5
     pairs = [*zip(got.features, np.moveaxis(expected.features, -1, 0), strict=True)]
@@ -128,13 +144,13 @@ def outside_band(maps: reference.Maps) -> np.ndarray:
 
 def loss_weights(scene: Scene, seed: int) -> np.ndarray:
     """Random weights (H, W, 6), zero in the declared band, where differences step across."""
-    keep = outside_band(reference.splat(scene.raw, scene.features, scene.camera))
+    keep = outside_band(scene.exact())
     weights = np.random.default_rng(seed + 100).normal(size=(*keep.shape, 6))
     return np.where(keep[..., None], weights, 0).astype(np.float32).astype(np.float64)
 
 
 def fast_loss(scene: Scene, surfels: Surfels, features: list, weights: np.ndarray) -> mi.Float:
-    maps = splat(surfels, features, scene.fast_camera())
+    maps = scene.splat(surfels, features)
     loss = mi.Float(0)
     for k, image in enumerate([*maps.features, maps.depth, maps.alpha]):
         loss += dr.sum(image * upload(weights[..., k]))
@@ -153,7 +169,7 @@ def fast_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
 def exact_gradients(scene: Scene, weights: np.ndarray) -> dict[str, np.ndarray]:
     """Derivatives of Σ weights · maps in float64."""
     adjoints = np.moveaxis(weights, 2, 0).reshape(6, -1)
-    return reference.differentiate(scene.raw, scene.features, scene.camera, adjoints)
+    return reference.differentiate(scene.raw, scene.features, scene.camera, adjoints, scene.turns)
 
 
 def check_gradients(scene: Scene, seed: int, tolerance: float) -> None:

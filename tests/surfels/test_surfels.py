@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mi_refgs.constants import MAX_TURN
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
@@ -71,12 +72,29 @@ def test_degenerate_rows_stay_finite() -> None:
     assert np.all(dr.grad(surfels.raw["rotation"]).numpy()[:2] == 0)
 
 
+def test_turns_are_bounded_however_curved_or_large_a_surfel_is() -> None:
+    rng, count = np.random.default_rng(0), 60
+    raw = raw_table(count, rng)
+    raw["curvature"] = np.outer(10.0 ** rng.uniform(-30, 17, count), [1, -1, 1]).astype(np.float32)
+    raw["scale"] = rng.uniform(-60, 60, (count, 2)).astype(np.float32)
+    surfels = Surfels.from_numpy(raw)
+    surfels.enable_grad()
+    turns = surfels.primitive.turns(surfels, -surfels.frame()[2])
+    length = np.array([np.array(dr.norm(turn)) for turn in turns.values()])
+    assert length.max() == pytest.approx(MAX_TURN, rel=1e-5) and length.min() < 1e-20
+    dr.backward(sum(dr.sum(turn.x + 2 * turn.y + 3 * turn.z) for turn in turns.values()))
+    for tensor in surfels.raw.values():
+        assert np.all(np.isfinite(dr.grad(tensor).numpy()))
+
+
 def everything(surfels: Surfels) -> object:
     """Every accessor of every channel, with a weight of its own per entry."""
     arrays = [*surfels.position(), *surfels.scale(), surfels.opacity()]
     arrays += [surfels.value("metallic"), surfels.value("roughness")]
     arrays += [entry for axis in surfels.frame() for entry in axis]
     arrays += [entry for name in ("albedo", "tint", "normal_offset") for entry in surfels.value(name)]
+    turns = surfels.primitive.turns(surfels, surfels.frame()[2])
+    arrays += [entry for turn in turns.values() for entry in turn]
     arrays += [x for name in ("radiance_sh", "indirect_sh") for colour in surfels.value(name) for x in colour]
     generator = np.random.default_rng(9)
     total = mi.Float(0)
@@ -139,6 +157,7 @@ def test_empty_table(rng: np.random.Generator) -> None:
     [
         ({"glitter": np.zeros((3, 1))}, "surfels: .*glitter.* is unknown; use"),
         ({"albedo": np.zeros((3, 2))}, "albedo: 2 columns, expected 3"),
+        ({"curvature": np.zeros((3, 3)), "scale": np.zeros((3, 3))}, "curvature: a gaussian has none"),
         ({"radiance_sh": np.zeros((3, 6))}, "radiance_sh: 6 columns, expected 3 or 12 or 27 or 48"),
         ({"opacity": np.zeros((4, 1))}, r"opacity: shape \(4, 1\), expected \(3, D\)"),
         ({"scale": np.array([[0, 1], [np.nan, 2], [np.inf, 0]])}, "scale: 2 values are NaN"),

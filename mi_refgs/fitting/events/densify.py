@@ -168,6 +168,7 @@ def densify_and_prune(
         along = np.take_along_axis(axes, longest[:, None, None], axis=1)[:, 0]
         side = np.repeat([SPLIT_OFFSET, -SPLIT_OFFSET], len(split)) * deviations.max(axis=1)
         table["position"][children] += (side[:, None] * along).astype(np.float32)
+        primitive.turn(table, children, longest, side / deviations.max(axis=1))
         primitive.shrink(table, children, longest, SPLIT_SCALE)
         table["opacity"][children, 0] = logit(split_opacity(opacity[parent[children]]))
     return TableEdit(Surfels.from_numpy(table), parent.astype(np.uint32), fresh)

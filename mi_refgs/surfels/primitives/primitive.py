@@ -4,7 +4,7 @@ widths (surfels have a `scale` of two columns, 3D Gaussians one of three), and i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -71,6 +71,7 @@ class Primitive(ABC):
 
     name: str  # in method files
     widths: Mapping[str, int]  # attributes that it requires, and their columns; with position and opacity
+    optional: tuple[str, ...] = ()  # further geometry that it may have
     columns: int  # of a row
     sizes: tuple[str, ...]  # attributes that are logarithms of standard deviations
     # By the name of another primitive whose rows express its footprints: its columns as such rows, under AD.
@@ -89,6 +90,18 @@ class Primitive(ABC):
     @abstractmethod
     def normal(self, surfels: Surfels) -> Vector3f:
         """Unit normals in the world, not yet turned towards a camera."""
+
+    def require_own(self, names: Collection[str]) -> None:
+        """Raise InputError for geometry among names of attributes that only another primitive may have."""
+        for other in PRIMITIVES.values():
+            if found := [name for name in other.optional if name in names and name not in self.optional]:
+                what = f"a {self.name} has none"
+                raise InputError(what, "surfels", found[0], f"leave it out; every {other.name} may have it")
+
+    def turns(self, surfels: Surfels, normal: Vector3f) -> dict[str, Vector3f]:
+        """What `normal`, that of `normal` or its opposite, gains per standard deviation u and v of a sample;
+        empty: it is the same on all of a primitive."""
+        return {}
 
     @abstractmethod
     def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
@@ -116,6 +129,11 @@ class Primitive(ABC):
         """Multiply the standard deviations of some primitives by a factor, in place."""
         for name in self.sizes:
             raw[name][rows] += np.float32(np.log(factor))
+
+    def turn(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, offset: np.ndarray) -> None:
+        """Turn some primitives, in place, to what their parents are at `offset` (n,), standard deviations,
+        along an axis (n,) each."""
+        return
 
     def shrink(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, factor: float) -> None:
         """Multiply the standard deviation along an axis (n,) per primitive by a factor, in place."""
@@ -182,6 +200,7 @@ def primitive_of(raw: Mapping[str, Any]) -> Primitive:
     """The primitive whose attributes are among raw ones (N, D); raises InputError that names missing ones."""
     nearest, missing = nearest_primitive(raw)
     if not missing:
+        nearest.require_own(raw)
         return nearest
     name = missing[0]
     if name in raw:

@@ -22,12 +22,14 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mi_refgs.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     EDGE_ON_COSINE,
     LOW_PASS_INV_VARIANCE,
+    MAX_TURN,
     NORM_FLOOR,
     SIZE_RANGE,
     SORT_DEPTH_RANGE,
@@ -54,7 +56,8 @@ class FootprintAdjoint:
         self.depth, self.opacity = mi.Float(0), mi.Float(0)
         self.screen = [mi.Float(0)] * 2
 
-    def add(self, sample: SurfelSample, δalpha: Float, δz: Float) -> None:
+    def add(self, sample: SurfelSample, δalpha: Float, δz: Float, δu: Float = None, δv: Float = None) -> None:
+        """With the adjoints of u and v where features vary over the surfel; the low-pass leaves these 0."""
         plane = ~sample.low_pass
         delta, u, v, ratio = sample.delta, sample.u, sample.v, sample.ratio
         # α = o gaussian, unless clamped;  gaussian = exp(-ρ/2)
@@ -66,6 +69,9 @@ class FootprintAdjoint:
         δa, δb = u * by_plane, v * by_plane  # of a·δ and b·δ
         self.depth = dr.fma(ratio, δz, self.depth)  # z = p_z / w, or p_z under the low-pass
         δw = -ratio * dr.fma(sample.z, δz, dr.fma(u, u, v * v) * -minus_2δrho)
+        if δu is not None:
+            δu, δv = (dr.select(plane, ratio * δ, 0) for δ in (δu, δv))
+            δa, δb, δw = δa + δu, δb + δv, δw - dr.fma(u, δu, v * δv)
         # In the low-pass, ρ is a multiple of δ·δ.
         by_screen = dr.select(plane, 0, minus_2δrho)
         self.screen = [dr.fma(by_screen, d, total) for d, total in zip(delta, self.screen, strict=True)]
@@ -92,6 +98,7 @@ class Surfel(base.Oriented):
 
     name = "surfel"
     widths = {"position": 3, "rotation": 4, "scale": 2, "opacity": 1}  # noqa: RUF012
+    optional = ("curvature",)
     adjoint = FootprintAdjoint
     columns = 10  # a.x a.y b.x b.y c.x c.y p.z centre.x centre.y opacity
 
@@ -145,6 +152,32 @@ class Surfel(base.Oriented):
 
     def normal(self, surfels: Surfels) -> Vector3f:
         return surfels.frame()[2]
+
+    def turns(self, surfels: Surfels, normal: Vector3f) -> dict[str, Vector3f]:
+        """n(u, v) = n + u s_u (κ₁ t_u + κ₂ t_v) + v s_v (κ₂ t_u + κ₃ t_v), with κ the `curvature`, the second
+        fundamental form in 1/scene unit; the turn per deviation tends to MAX_TURN."""
+        if not surfels.has("curvature"):
+            return {}
+        (t_u, t_v, n), s, κ = surfels.frame(), surfels.scale(), surfels.columns("curvature")
+        side = dr.select(dr.detach(dr.dot(n, normal)) < 0, -1, 1)
+        turns = []
+        for size, (first, second) in zip(s, (κ[:2], κ[1:]), strict=True):
+            x, y = (dr.clip(size / MAX_TURN * k, -SIZE_RANGE, SIZE_RANGE) for k in (first, second))
+            turns.append(side * MAX_TURN * dr.rsqrt(1 + x * x + y * y) * (x * t_u + y * t_v))
+        return dict(zip(("turn_u", "turn_v"), turns, strict=True))
+
+    def turn(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, offset: np.ndarray) -> None:
+        """By the `turns` there."""
+        if "curvature" not in raw:
+            return
+        κ = np.take_along_axis(raw["curvature"][rows], axis[:, None] + [0, 1], axis=1)  # κ₁ κ₂ or κ₂ κ₃
+        κ = np.exp(np.take_along_axis(raw["scale"][rows], axis[:, None], axis=1)) / MAX_TURN * κ
+        half = offset[:, None] / 2 * MAX_TURN * κ / np.hypot(1, np.linalg.norm(κ, axis=1, keepdims=True))
+        # The quaternion times (-half_v, half_u, 0, 1), the rotation about n × (half_u t_u + half_v t_v).
+        (x, y, z, w), (b, a) = raw["rotation"][rows].T, (-half).T
+        b = -b
+        x, y, z, w = x + w * a - z * b, y + w * b + z * a, z + x * b - y * a, w - x * a - y * b
+        raw["rotation"][rows] = np.stack([x, y, z, w], axis=1)
 
     def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
         """Whether u² + v² ≤ r², q(δ) = (a·δ)² + (b·δ)² - r² (1 + c·δ)² ≤ 0, at the rectangle's least q: at

@@ -42,6 +42,23 @@ def densify(
     return event.densify_and_prune(surfels, error, most, largest=largest, faint=faint, **given)
 
 
+def test_children_of_curved_surfels_turn_as_their_parents_do_there() -> None:
+    rng, flat = np.random.default_rng(1), table(200, 0.05)
+    raw = flat.to_numpy() | {"curvature": rng.normal(0, 5, (200, 3)).astype(np.float32)}
+    raw["scale"] = np.log(rng.uniform(0.01, 0.05, (200, 2))).astype(np.float32)
+    options = replace(OPTIONS, grow=1.0)
+    edit = densify(Surfels.from_numpy(raw), np.ones(200), 400, options=options)
+    parents, children = Surfels.from_numpy(raw).gather(mi.UInt32(edit.parent)), edit.surfels
+    normal, now, longest = (
+        np.array(x) for x in (parents.frame()[2], children.frame()[2], dr.detach(parents.scale()))
+    )
+    turns = [np.array(turn) for turn in parents.primitive.turns(parents, parents.frame()[2]).values()]
+    turn = event.SPLIT_OFFSET * np.where(longest[0] > longest[1], *turns) * np.repeat([1, -1], 200)
+    expected = normal + turn
+    assert np.linalg.norm(turn, axis=0).max() > 0.1
+    np.testing.assert_allclose(now, expected / np.linalg.norm(expected, axis=0), atol=2e-3)
+
+
 def test_surfels_with_the_largest_error_are_split() -> None:
     """As many as an event may add, or as there is room for; those without error stay as they are."""
     surfels, error = table(8), np.array([0, 3.0, 1, 0, 2, 0, 5, 4])
