@@ -174,8 +174,7 @@ class Surfel(base.Oriented):
         κ = np.exp(np.take_along_axis(raw["scale"][rows], axis[:, None], axis=1)) / MAX_TURN * κ
         half = offset[:, None] / 2 * MAX_TURN * κ / np.hypot(1, np.linalg.norm(κ, axis=1, keepdims=True))
         # The quaternion times (-half_v, half_u, 0, 1), the rotation about n × (half_u t_u + half_v t_v).
-        (x, y, z, w), (b, a) = raw["rotation"][rows].T, (-half).T
-        b = -b
+        (x, y, z, w), a, b = raw["rotation"][rows].T, -half[:, 1], half[:, 0]
         x, y, z, w = x + w * a - z * b, y + w * b + z * a, z + x * b - y * a, w - x * a - y * b
         raw["rotation"][rows] = np.stack([x, y, z, w], axis=1)
 
