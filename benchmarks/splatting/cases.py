@@ -60,9 +60,7 @@ OPACITY = 0.8
 DISTANCE = 4.0
 FIELD_OF_VIEW = 40.0  # degrees
 DIRECTION = (0.6, 0.8, 0.0)  # from the sphere's centre to the camera
-CHANNELS = {"normal": 3, "albedo": 3, "metallic": 1, "roughness": 1, "radiance": 3, "indirect light": 3}
-"""Features of the full G-buffer; with depth and alpha they are its 16 channels."""
-FEATURES = sum(CHANNELS.values())
+FEATURES = 14  # of the full G-buffer; with depth and alpha they are its 16 channels
 COLOUR = 3
 
 

@@ -18,12 +18,12 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import errors, timing
-from benchmarks.common.errors import CLEAR
+from benchmarks.common.errors import CLEAR, Step, decompose, noise_floor
 from benchmarks.common.report import Row, benchmark, where
 from benchmarks.common.setup import path_tracer
 from benchmarks.common.view import make_light, rows as image_values, view_bins
-from benchmarks.splitsum import budget
-from benchmarks.splitsum.setup import CONVEX, PAGE, SMALL, Exact, Settings, split_sum
+from benchmarks.splitsum.setup import CONVEX, PAGE, SMALL, Exact, Settings, diffuse, reflectance, split_sum
+from mi_refgs.shade.points import reflect
 
 METHOD = "split_sum"
 CASE = ("shape", "light", "roughness", "metallic")
@@ -92,7 +92,7 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     lights = [make_light(name, settings.truth_height) for name in settings.lights]
     rows: list[Row] = []
     scores: list[Row] = []
-    budgets: list[Row] = []
+    found_budgets: list[Row] = []
     times: Times = {}
     materials = [(r, m) for r in settings.roughness for m in settings.metallic]
     stages = [Exact(name, light, settings) for name in settings.shapes for light in lights]
@@ -122,14 +122,14 @@ def measure(settings: Settings, quiet: bool = False) -> dict[str, Any]:
     shared = {(setup.name, setup.light.name): setup for setup in stages}
     for name in tqdm(settings.budget_shapes, desc="error budget", disable=quiet):
         for light in lights:
-            budgets += budget.budgets(shared.get((name, light.name)) or Exact(name, light, settings))
+            found_budgets += budgets(shared.get((name, light.name)) or Exact(name, light, settings))
     return {
         "settings": vars(settings),
         "frequencies": {light.name: light.frequency() for light in lights},
         "rows": [row | {"ms_per_mpx": time_of(times, row)} for row in rows],
         "scores": scores,
         "speed_ups": speed_ups(rows, times),
-        "budgets": budgets,
+        "budgets": found_budgets,
     }
 
 
@@ -152,14 +152,64 @@ def _split_sums(
     rows: list[Row] = []
     calls: Calls = {}
     heights = setup.settings.heights
-    for height, option in [*((height, "") for height in heights), (heights[-1], "dominant")]:
-        light, method = filtered[setup.light.name, height], "_".join(filter(None, (METHOD, option)))
+    for height, dominant in [*((height, False) for height in heights), (heights[-1], True)]:
+        light, method = filtered[setup.light.name, height], METHOD + "_dominant" * dominant
         for roughness, metallic in materials:
-            radiance = split_sum(setup.points, setup.set_material(metallic, roughness), light, option)
+            radiance = split_sum(setup.points, setup.set_material(metallic, roughness), light, dominant)
             rows += _errors(setup, method, height, roughness, metallic, image_values(radiance))
-        shader = functools.partial(split_sum, material=setup.set_material(*TIMED), light=light, option=option)
+        material = setup.set_material(*TIMED)
+        shader = functools.partial(split_sum, material=material, light=light, dominant=dominant)
         calls[method, height] = setup.with_primary_rays(shader)
     return rows, calls
+
+
+# ---------------- error budgets: exact counterparts of one approximation after the other ----------------
+
+
+def budgets(setup: Exact) -> list[Row]:
+    """Budgets of every roughness and metal of a shape under a light, with the finest light."""
+    settings = setup.settings
+    light = setup.light.prefiltered(settings.heights[-1])
+    finest = setup.light.prefiltered(settings.truth_height)
+    found = []
+    for roughness in settings.roughness:
+        around = setup.prefiltered(roughness).mean
+        for metallic in settings.budget_metallic:
+            steps = _chain(setup, roughness, metallic, light, finest, around)
+            reference = setup.integrals(roughness).radiance(metallic)
+            row = setup.case(roughness, metallic)
+            row["floor"] = noise_floor(reference.error, reference.mean)
+            found.append(row | decompose(steps))
+    return found
+
+
+def _chain(
+    setup: Exact, roughness: float, metallic: float, light: Any, finest: Any, lobe: np.ndarray
+) -> list[Step]:
+    """From the product's own image to the exact one; `lobe`: the exact average around the mirror."""
+    points, f0 = setup.points, reflectance(metallic)
+    material = setup.set_material(metallic, roughness)
+    mirror = reflect(points.view, points.normal)
+    looked_up, resolved = (image_values(x.specular(mirror, material["roughness"])) for x in (light, finest))
+    integrals = setup.integrals(roughness)
+    a, b = integrals.table
+    base, table = diffuse(metallic, integrals.table), f0 * a + b
+    exact = base * integrals.irradiance.mean
+    around = (integrals.scale.mean + integrals.bias.mean) / (a + b)
+    steps = [
+        Step("", image_values(split_sum(points, material, light))),
+        Step("table lookup", looked_up * table + base * image_values(light.irradiance(points.normal))),
+        Step("irradiance lookup", looked_up * table + exact),
+        Step("light resolution", resolved * table + exact),
+        Step("level interpolation", lobe * table + exact),
+        Step("lobe with N = V = R", around * table + exact),
+        Step("Schlick in the table", integrals.radiance(metallic).mean),
+    ]
+    if setup.name not in CONVEX:  # the shape's own shadow, and light that it reflects onto itself
+        direct = setup.integrals(roughness, occluded=True).radiance(metallic).mean
+        bounced = direct + setup.bounces(roughness, metallic)
+        steps += [Step("no shadow", direct), Step("no inter-reflection", bounced)]
+    return steps
 
 
 if __name__ == "__main__":

@@ -84,16 +84,11 @@ SMALL = Settings(
 )
 FULL_DEPTH = 8
 
-OPTIONS = {
-    "": ShadingOptions(diffuse="irradiance"),
-    "dominant": ShadingOptions(diffuse="irradiance", dominant=True),
-}
-"""Settings of `shade` that concern a surface that nothing shadows."""
 
-
-def split_sum(points: Points, material: dict[str, Any], light: Any, option: str = "") -> Any:
+def split_sum(points: Points, material: dict[str, Any], light: Any, dominant: bool = False) -> Any:
     """Outgoing radiance (mi.Color3f) as the product shades it."""
-    return shade(ShadingPoints(points.normal, points.view, **material), light, OPTIONS[option]).total()
+    options = ShadingOptions(diffuse="irradiance", dominant=dominant)
+    return shade(ShadingPoints(points.normal, points.view, **material), light, options).total()
 
 
 @dataclass(frozen=True)
