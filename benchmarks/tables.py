@@ -354,7 +354,7 @@ def stability(result: Result) -> Values:
         "hold": sum(row["verdict"] == "within limits" for row in rows),
         "ill": len(ill),
         "failed": len(failed),
-        "non_finite": sum(row["non_finite"] for row in [*rows, *result["losses"], *result["fits"]]),
+        "non_finite": sum(row["non_finite"] for row in [*rows, *result["losses"]]),
         "ill_cases": row_table(
             ill,
             {
@@ -381,7 +381,6 @@ def stability(result: Result) -> Values:
         ),
         "curve_worst": f"{max(row[k] for row in result['curve'] for k in ('value', 'slope')):.0e}",
         "losses_worst": f"{max(row[k] for row in result['losses'] for k in ('value', 'slope')):.0e}",
-        "fits": len(result["fits"]),
     }
 
 

@@ -109,9 +109,7 @@ register_loss(Loss("normal", _normal, normals=True))
 register_loss(Loss("smooth", _smooth, normals=True))
 register_loss(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
 register_loss(Loss("materials", _materials, maps=True, attributes=MATERIALS))
-register_loss(
-    Loss("light_colour", lambda of: None if of.light is None else losses.light_colour(of.light), light=True)
-)
+register_loss(Loss("light_colour", lambda of: of.light and losses.light_colour(of.light), light=True))
 register_loss(Loss("photographed", _photographed, light=True))
 register_loss(
     Loss(

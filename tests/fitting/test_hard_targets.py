@@ -1,4 +1,4 @@
-"""Fits to images nobody would wish for: they run with finite numbers, or end with one sentence."""
+"""Fits to images and from lights nobody would wish for: numbers stay finite, or one sentence ends them."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,6 +11,8 @@ from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
+from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.methods.method import LIGHT
 from tests.helpers import with_pixels
 from tests.scenes.highlight import ball, small_method
 
@@ -57,10 +59,22 @@ CASES: dict[str, Callable[[], Dataset]] = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+LIGHTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "a texel of the light starts at 1e6": lambda raw: np.concatenate([[np.full_like(raw[0], 1e6)], raw[1:]]),
+    "the whole light starts at 1e6": lambda raw: np.full_like(raw, 1e6),
+    "the light starts black": lambda raw: np.full_like(raw, -80),
+}
+
+
+@pytest.mark.parametrize("name", [*CASES, *LIGHTS])
 def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
     method = replace(small_method(tmp_path), iterations=STEPS)
-    trainer = Trainer(method, CASES[name](), warn=pytest.fail)
+    trainer = Trainer(method, CASES.get(name, ball)(), warn=pytest.fail)
+    if name in LIGHTS:
+        raw = trainer.fit.params[LIGHT].numpy()
+        changed_raw = LIGHTS[name](raw.reshape(-1, 3)).reshape(raw.shape)
+        trainer.fit.params[LIGHT] = upload_tensor(changed_raw)
+        trainer.fit.optimiser.reset(LIGHT)
     trainer.train()
     assert trainer.iteration == STEPS and trainer.health.skipped == 0
     for key, values in trainer.state().items():

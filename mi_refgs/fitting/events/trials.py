@@ -34,13 +34,11 @@ class ColourAlone(Decision, Trial):
         plain = methods.plain(methods.load(self.method, preset))
         fitting = [text for text in method.assignments if _has_table(plain, text)]
         other = methods.load(self.method, preset, fitting)
-        kept = ("iterations", "seed", "checkpoint_every", "preview_every", "log_every")
-        own = ("about", "name", "file", "preset", "assignments")
+        kept = "iterations seed checkpoint_every preview_every log_every about name file preset assignments"
+        own = {name: getattr(method, name) for name in kept.split()}
         data = replace(other.data, downscale=method.data.downscale, images=method.data.images)
         surfels = replace(other.surfels, max_count=method.surfels.max_count)
-        return replace(
-            other, data=data, surfels=surfels, **{name: getattr(method, name) for name in (*kept, *own)}
-        )
+        return replace(other, data=data, surfels=surfels, **own)
 
 
 def _has_table(method: dict[str, object], assignment: str) -> bool:

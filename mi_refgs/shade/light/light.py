@@ -1,5 +1,6 @@
 """Lights: the protocol of three lookups that reflectance models use."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -31,17 +32,15 @@ class RotatedLight:
     motion: Float | None = None  # (3,) of `kernels.motion`, of the light in the world
     scale: Float | None = None  # (3,) factor per channel, under AD
 
-    def _inside(self, direction: Vector3f) -> Vector3f:
-        return self.light_from_world @ turned_by(self.motion, mi.Vector3f(direction), -1)
-
-    def _scaled(self, colour: Color3f) -> Color3f:
+    def _looked_up(self, lookup: Callable[..., Color3f], direction: Vector3f, *more: Float) -> Color3f:
+        colour = lookup(self.light_from_world @ turned_by(self.motion, mi.Vector3f(direction), -1), *more)
         return colour if self.scale is None else colour * mi.Color3f(part_of(self.scale, 0, colour))
 
     def specular(self, direction: Vector3f, roughness: Float) -> Color3f:
-        return self._scaled(self.light.specular(self._inside(direction), roughness))
+        return self._looked_up(self.light.specular, direction, roughness)
 
     def irradiance(self, normal: Vector3f) -> Color3f:
-        return self._scaled(self.light.irradiance(self._inside(normal)))
+        return self._looked_up(self.light.irradiance, normal)
 
     def radiance(self, direction: Vector3f) -> Color3f:
-        return self._scaled(self.light.radiance(self._inside(direction)))
+        return self._looked_up(self.light.radiance, direction)

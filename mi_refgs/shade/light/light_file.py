@@ -136,8 +136,7 @@ def _lat_long(
     def row(directions: np.ndarray) -> np.ndarray:
         picture, down, right = place(directions)
         at = picture, (n * (1 + down) - 1) / 2, (n * (1 + right) - 1) / 2
-        return np.stack(
-            [map_coordinates(pictures[..., c], at, order=1, mode="nearest") for c in range(3)], -1
-        )
+        planes = np.moveaxis(pictures, -1, 0)
+        return np.stack([map_coordinates(plane, at, order=1, mode="nearest") for plane in planes], -1)
 
     return resample(np.stack([row(directions) for directions in map_directions(2 * height)]), height)
