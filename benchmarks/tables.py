@@ -416,10 +416,12 @@ def _percent(value: float, sign: str = "") -> str:
 
 
 def corpus(result: Result) -> Values:
-    """Return the table of what became of files."""
-    rows = result["rows"]
-    cells = [[row["file"], row["result"], row["said"].split(";")[0]] for row in rows]
-    return {"table": table(["file", "result", "what is said first"], cells)}
+    """Return the table of what became of files, those of one outcome in a row."""
+    outcomes: dict[tuple[str, str], list[str]] = {}
+    for row in result["rows"]:
+        outcomes.setdefault((row["result"], row["said"].split(";")[0]), []).append(row["file"])
+    cells = [[", ".join(files), *outcome] for outcome, files in outcomes.items()]
+    return {"table": table(["files", "result", "what is said first"], cells)}
 
 
 def frames(result: Result) -> Values:
