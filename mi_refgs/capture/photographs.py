@@ -16,7 +16,7 @@ from scipy.ndimage import laplace
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted
-from mi_refgs.io.images import exif_tags, image_size, open_image, read_mask, to_8_bits
+from mi_refgs.io.images import exif_tags, image_size, open_image, positive, read_mask, to_8_bits
 
 VIDEOS = ".mp4 .mov .m4v .avi .mkv .webm .mts".split()
 FRAMES = 120  # of a video that are used, at most: with every pair matched, some minutes
@@ -146,20 +146,11 @@ def _photograph(path: Path) -> Photograph:
     said = exif.get(ORIENTATION, 1)
     orientation = int(said) if said in range(1, 9) else 1
     size = size[::-1] if orientation in SIDEWAYS else size
-    equivalent, own = _positive(detail.get(FOCAL_35MM)), _positive(detail.get(FOCAL))
+    equivalent, own = positive(detail.get(FOCAL_35MM)), positive(detail.get(FOCAL))
     device = f"{exif.get(MAKE, '')} {exif.get(MODEL, '')} {own or equivalent or ''}"
     focal = None if equivalent is None else equivalent / 43.2666  # mm, diagonal of 36 mm × 24 mm
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     return Photograph(path, path.name, digest, size, focal, device, plain, orientation)
-
-
-def _positive(value: object) -> float | None:
-    """A positive number in EXIF data, which may be a fraction with denominator 0, or anything; else None."""
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if 0 < number < np.inf else None
 
 
 def find_masks(folder: Path, photographs: Sequence[Photograph]) -> dict[str, Path]:

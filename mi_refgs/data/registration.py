@@ -1,11 +1,12 @@
-"""Registration of a camera: the rigid correction of its pose that fits renders to its image. Gauss-Newton
-from averaged images to whole ones, on differences as displayed; derivatives are differences of renders.
+"""Registration of a camera: the rigid correction of its pose that fits renders to its image, by Levenberg's
+and Marquardt's method from averaged images to whole ones; derivatives are differences of displayed renders.
 [Lucas and Kanade 1981; coarse to fine: Bergen et al. 1992]"""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.data.view import View
@@ -40,24 +41,15 @@ def _difference(view: View, render: Render, where: np.ndarray, block: int) -> np
 def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> View:
     """The view with its pose fitted to the image averaged over block × block pixels."""
     unit = np.repeat([1.0, distance], 3) * block / view.fx  # moves what the camera looks at by such a pixel
+
+    def error(motion: np.ndarray) -> np.ndarray:
+        return _difference(_moved(view, unit * motion), render, where, block)
+
     # Derivatives are those of the first pose: taken anew after every change, they cost most of the time.
-    now = _difference(view, render, where, block)
-    sides = [_moved(view, STEP * unit * axis) for axis in np.eye(6)]
-    shifts = [_difference(side, render, where, block) - now for side in sides]
-    slope = np.stack(shifts, axis=1) / STEP
-    normal = slope.T @ slope
-    normal += 1e-3 * np.diag(np.diag(normal))  # [Levenberg 1944]: flat scenes hardly tell turn from shift
-    for _ in range(5):
-        change, *_ = np.linalg.lstsq(normal, -slope.T @ now, rcond=None)
-        candidate = _moved(view, unit * change)
-        after = _difference(candidate, render, where, block)
-        before, now_squared = float(now @ now), float(after @ after)
-        if not now_squared < before:
-            break
-        view, now = candidate, after
-        if now_squared > (1 - 1e-3) * before:
-            break
-    return view
+    first = error(np.zeros(6))
+    slope = np.stack([(error(STEP * axis) - first) / STEP for axis in np.eye(6)], axis=1)
+    found = least_squares(error, np.zeros(6), lambda _: slope, method="lm", ftol=1e-3, max_nfev=6)
+    return _moved(view, unit * found.x)
 
 
 def _moved(view: View, motion: np.ndarray) -> View:

@@ -180,6 +180,15 @@ def exif_tags(image: Any) -> tuple[dict[int, Any], dict[int, Any]]:
     return tags, settings
 
 
+def positive(value: object) -> float | None:
+    """A positive number in EXIF data, which may be a fraction with denominator 0, or anything; else None."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if 0 < number < np.inf else None
+
+
 def to_8_bits(image: np.ndarray) -> np.ndarray:
     """Quantise values in [0, 1] (clipped; NaN is 0) to uint8."""
     return np.asarray(np.round(np.clip(np.nan_to_num(image), 0, 1) * 255), dtype=np.uint8)

@@ -20,7 +20,7 @@ from mi_refgs.capture.photographs import find_masks, find_photographs, folder_of
 from mi_refgs.capture.pipeline import require_placed
 from mi_refgs.cli import main
 from mi_refgs.data.lens import Lens, undistortion
-from mi_refgs.io.images import read_png
+from mi_refgs.io.images import exif_tags, read_png
 from tests.helpers import read_loaded, refused, slow
 from tests.scenes import photographed as scene
 
@@ -336,6 +336,23 @@ def test_exif_gives_orientation_and_focal_length(tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.asarray(photograph.load()), lying)
         assert photograph.up == ((-1, 0) if photograph.lying else (0, -1))
     assert len({photograph.kept_size for photograph in found}) == 1
+
+
+def test_exposure_in_exif_is_kept(tmp_path: Path) -> None:
+    exif, settings = Image.Exif(), {0x829A: 0.01, 0x829D: 1.8, 0x8827: 200}
+    exif[0x8769] = settings
+    exif[0x0112] = 3
+    (tmp_path / "photographs").mkdir()
+    for name in ("a.jpg", "b.jpg", "c.png"):
+        Image.new("RGB", (32, 24)).save(tmp_path / "photographs" / name, exif=exif)
+    found = find_photographs(tmp_path / "photographs")
+    undo = undistortion(Lens(False, (0.1,)), 32, 24, 30.0, 30.0, 16.0, 12.0)
+    straight = output.Straight((32, 24), (30.0, 30.0), (16.0, 12.0), undo)
+    output.write_images(found, {photograph.copy: straight for photograph in found}, {}, tmp_path)
+    for photograph in found:
+        with Image.open(tmp_path / "images" / photograph.name) as image:
+            tags, kept = exif_tags(image)
+        assert kept == {tag: pytest.approx(x) for tag, x in settings.items()} and 0x0112 not in tags
 
 
 def test_broken_exif_is_ignored(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Parameters with a row per training view (`fitting.per_view`) begin to learn, once the views are final.
 
-Exposure gains are fitted to renders first. What no image needs stays near 1: fitted gains within DEAD_ZONE of
-it count as 1, they learn slowly, and the loss has a prior on them. Corrections of cameras begin at 0, and
+Exposure gains are those that the photographs tell (`data.exposure.told_gains`), from the first step on, else
+fitted to renders. What no image needs stays near 1: fitted gains within DEAD_ZONE of it count as 1, they
+learn slowly, and the loss has a prior on them. Corrections of cameras begin at 0, and
 learn slowly, since true cameras hardly move (`schedule.LEARNT_BESIDE`).
 """
 
@@ -10,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from mi_refgs.data.exposure import told_gains
 from mi_refgs.fitting.decide import validates
 from mi_refgs.fitting.image_error import with_gain
 from mi_refgs.fitting.train import Trainer
@@ -29,15 +31,15 @@ class PerView(Event[Trainer]):
     after: int = field(default=1_200, metadata=ITERATIONS | at_least(0))  # iterations before they learn
 
     def due(self, trainer: Trainer) -> bool:
-        waits = trainer.iteration < self.after or validates(trainer)
+        waits = 0 < trainer.iteration < self.after or validates(trainer)
         return not waits and self.parameter not in trainer.fit.params
 
     def apply(self, trainer: Trainer) -> None:
-        rows = self.first(trainer).astype(np.float32)
-        trainer.fit.add(trainer.setup, self.parameter, upload_tensor(rows))
+        if (rows := self.first(trainer)) is not None:
+            trainer.fit.add(trainer.setup, self.parameter, upload_tensor(rows.astype(np.float32)))
 
-    def first(self, trainer: Trainer) -> np.ndarray:
-        """The initial values, a row per training view."""
+    def first(self, trainer: Trainer) -> np.ndarray | None:
+        """The initial values, a row per training view; None, before the first step, to wait for `after`."""
         raise NotImplementedError
 
 
@@ -49,8 +51,8 @@ class Cameras(PerView):
     name: ClassVar[str] = "cameras"
     parameter: ClassVar[str] = POSE
 
-    def first(self, trainer: Trainer) -> np.ndarray:
-        return np.zeros((len(trainer.data.views), 6))
+    def first(self, trainer: Trainer) -> np.ndarray | None:
+        return np.zeros((len(trainer.data.views), 6)) if trainer.iteration >= self.after else None
 
 
 @register_event
@@ -61,12 +63,15 @@ class Exposure(PerView):
     name: ClassVar[str] = "exposure"
     parameter: ClassVar[str] = GAIN
 
-    def first(self, trainer: Trainer) -> np.ndarray:
+    def first(self, trainer: Trainer) -> np.ndarray | None:
         data = trainer.data
-        frames = (trainer.view(trainer.camera(i), aovs=False) for i in range(len(data.views)))
-        fitted = [with_gain(frame, view, data)[0] for frame, view in zip(frames, data.views, strict=True)]
-        log = np.log(fitted) - np.log(fitted).mean(axis=0)
-        log = np.sign(log) * np.maximum(abs(log) - DEAD_ZONE, 0)
+        if trainer.iteration >= self.after:
+            frames = (trainer.view(trainer.camera(i), aovs=False) for i in range(len(data.views)))
+            fitted = [with_gain(frame, view, data)[0] for frame, view in zip(frames, data.views, strict=True)]
+            log = np.log(fitted) - np.log(fitted).mean(axis=0)
+            log = np.sign(log) * np.maximum(abs(log) - DEAD_ZONE, 0)
+        elif (log := told_gains(data.views)) is None:
+            return None
         least, most = np.exp([log.min(), log.max()])
         trainer.tell(f"exposure: gains of {least:.2f} to {most:.2f} per image")
-        return np.asarray(log)
+        return log

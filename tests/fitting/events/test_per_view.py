@@ -181,6 +181,17 @@ def test_gains_of_images(method: Method, rng: np.random.Generator, monkeypatch: 
     np.testing.assert_allclose([float(value[0]) for value in used], np.log(gains[3]), atol=1e-6)
 
 
+def test_told_gains_learn_from_the_first_step(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = np.linspace(-0.5, 0.5, 18).reshape(6, 3).astype(np.float32)
+    monkeypatch.setattr("mi_refgs.fitting.events.per_view.told_gains", lambda views: log)
+    trainer = Trainer(method, ball())
+    np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), log)
+    assert POSE not in trainer.fit.params
+    trainer.step()
+    moved = np.flatnonzero((trainer.fit.params[GAIN].numpy() != log).any(axis=1))
+    assert moved.tolist() == [trainer.setup.view(1)]
+
+
 def with_rows(trainer: Trainer, rows: np.ndarray) -> Trainer:
     """The trainer with corrections of these values (V, 6)."""
     trainer.fit.add(trainer.setup, POSE, upload_tensor(rows.astype(np.float32)))
