@@ -116,8 +116,9 @@ GROUPS: dict[str, list[Fit]] = {
     "photographs_relighting": [Fit(name, "photographs_relighting", "quick") for name in ROOMS],
 }
 
-SCORES = """psnr psnr_region normal_mae_deg normal_mae_deg_concave env_correlation surface_distance
-    albedo_psnr roughness_mae metallic_mae train_seconds surfels error_budget""".split()
+SCORES = """psnr_aligned psnr_aligned_region psnr psnr_region normal_mae_deg normal_mae_deg_concave
+    env_correlation surface_distance albedo_psnr roughness_mae metallic_mae train_seconds surfels
+    error_budget""".split()
 """Keys of metrics.json that a row has."""
 REHEARSAL = "100:1000"  # iterations and surfels of the fit that compiles kernels before a fit is timed
 SMALL_FITS, SMALL_PRESET = 1, "16:300"  # of a small instance: fits, and their iterations and surfels

@@ -29,16 +29,14 @@ def told_gains(views: Sequence[View]) -> np.ndarray | None:
 
 
 def _of_settings(views: Sequence[View]) -> np.ndarray | None:
-    log = []
-    for view in views:
+    log = np.zeros(len(views))
+    for i, view in enumerate(views):
         if view.file is None or view.is_linear_radiance:
             return None
         with open_image(view.file.path) as image:
             found = exif_tags(image)[1]
-        numbers = [positive(found.get(tag)) for tag in EXPOSURE]
-        log.append([np.log(x or np.nan) for x in numbers])
-    gains = np.array(log) @ [*EXPOSURE.values()]
-    return None if np.isnan(gains).any() else np.repeat(gains[:, None] - gains.mean(), 3, axis=1)
+        log[i] = sum(power * np.log(positive(found.get(tag)) or np.nan) for tag, power in EXPOSURE.items())
+    return None if np.isnan(log).any() else np.repeat(log[:, None] - log.mean(), 3, axis=1)
 
 
 def _of_points(views: Sequence[View]) -> np.ndarray | None:

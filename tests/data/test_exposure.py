@@ -20,12 +20,11 @@ VIEWS, POINTS, SIZE = 8, 150, 96
 def taken(log: np.ndarray, rng: np.random.Generator) -> list[View]:
     """Views of coloured points, with log gains (V, 3); each tenth glitters, and some hide others."""
     points, colours = rng.uniform(-0.5, 0.5, (POINTS, 3)), rng.uniform(0.05, 0.5, (POINTS, 3))
-    views = []
+    tracks, pinhole, views = np.pad(points, ((0, 0), (2, 0))), (115.0, 115.0, SIZE / 2, SIZE / 2), []
     for gain, origin in zip(np.exp(log), unit(rng.normal(size=(VIEWS, 3))), strict=True):
         image = np.full((SIZE, SIZE, 3), 0.5, np.float32)
-        pinhole = (1.2 * SIZE, 1.2 * SIZE, SIZE / 2, SIZE / 2)
         pose = look_at(3 * origin, np.zeros(3))
-        view = View("a", SIZE, SIZE, *pinhole, pose, Pixels(image), tracks=np.pad(points, ((0, 0), (2, 0))))
+        view = View("a", SIZE, SIZE, *pinhole, pose, Pixels(image), tracks=tracks)
         glitter = np.where(rng.random((POINTS, 1)) < 0.1, 3, 1)
         for row, column, colour in zip(*view.project(points)[:2], colours * glitter, strict=True):
             patch = slice(round(row) - 1, round(row) + 2), slice(round(column) - 1, round(column) + 2)

@@ -65,13 +65,13 @@ class Exposure(PerView):
 
     def first(self, trainer: Trainer) -> np.ndarray | None:
         data = trainer.data
-        if trainer.iteration >= self.after:
+        if (log := told_gains(data.views)) is None:
+            if trainer.iteration < self.after:
+                return None
             frames = (trainer.view(trainer.camera(i), aovs=False) for i in range(len(data.views)))
             fitted = [with_gain(frame, view, data)[0] for frame, view in zip(frames, data.views, strict=True)]
             log = np.log(fitted) - np.log(fitted).mean(axis=0)
             log = np.sign(log) * np.maximum(abs(log) - DEAD_ZONE, 0)
-        elif (log := told_gains(data.views)) is None:
-            return None
         least, most = np.exp([log.min(), log.max()])
         trainer.tell(f"exposure: gains of {least:.2f} to {most:.2f} per image")
         return log
