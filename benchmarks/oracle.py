@@ -30,6 +30,7 @@ from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.error_budget import CLASSES, ErrorBudget, classify
 from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.evaluation.surface import TrueSurface
+from mi_refgs.fitting.image_error import displayed_image
 from mi_refgs.io.files import read_json
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample, VertexSurfels
@@ -54,9 +55,11 @@ from mi_refgs.synthesis.ground_truth import Materials, materials_at
 from mi_refgs.synthesis.options import scene_hash
 from mi_refgs.synthesis.settings import load_scene
 
+SCENES = ROOT / "scenes"
 PARTS = ("normals", "materials", "hit normals", "hit materials", "light", "mesh")
 """What can be true: "hit …" are those where traced reflected rays end."""
 BOUNCES = 4  # traced, where everything is true
+GAUSS_NEWTON = 6  # steps, of the scale of a light
 BLURS = (0, 0.8, 1.5, 3, 6, 12)  # σ in pixels, of the errors of normals
 
 
@@ -89,7 +92,7 @@ class Truth:
     def __init__(self, data: Dataset) -> None:
         """Raises InputError unless `refgs dataset` made it of a scene in scenes/, with surface and light."""
         record = read_json(data.path / "dataset.json")
-        file = ROOT / "scenes" / record["scene"]
+        file, self.name = SCENES / record["scene"], Path(record["scene"]).stem
         surface = TrueSurface.read(data.path, data.offset)
         if data.environment is None or surface is None or scene_hash(file) != record["scene_sha256"]:
             raise InputError("no truth: its scene is not in scenes/", data.path, "scene", "make it again")
@@ -197,9 +200,10 @@ class TrueShading(Shading):
         return TruePoints(self.truth, self.true)
 
 
-def renderer(fitted: TrainedScene, truth: Truth, case: Case, samples: int) -> Callable[[Camera], Frame]:
-    """As `TrainedScene.renderer`. Light and the albedo of pixels share an unknown scale: where only one of
-    them is true, the light has that of the albedo (`metrics.environment`)."""
+def renderer(
+    fitted: TrainedScene, truth: Truth, case: Case, samples: int, scale: np.ndarray
+) -> Callable[[Camera], Frame]:
+    """As `TrainedScene.renderer`, with a light scaled per channel (3,)."""
     true, given = case.true, fitted.shading.settings()
     if case.bounces is not None:
         given["traced_bounces"] = case.bounces
@@ -207,13 +211,10 @@ def renderer(fitted: TrainedScene, truth: Truth, case: Case, samples: int) -> Ca
     hits = ShadingOptions(**lit if "hit materials" in true else given)
     shading = TrueShading(**lit if "materials" in true else given, truth=truth, true=true, hits=hits)
     assert fitted.light is not None and fitted.mesh is not None
-    ours, theirs = fitted.light.radiance().numpy(), truth.light.radiance().numpy()
-    scale = np.array(metrics.environment(ours, theirs)["env_scale"], np.float32)
-    radiance = theirs if "light" in true else ours * scale
-    light = EnvironmentLight.from_radiance(radiance if "materials" in true else radiance / scale)
+    light = truth.light if "light" in true else fitted.light
     mesh = truth.mesh(2 * fitted.mesh.voxel) if "mesh" in true else fitted.mesh
     with dr.suspend_grad():
-        filtered = shading.light_of(light)
+        filtered = shading.light_of(EnvironmentLight.from_radiance(scale * light.radiance().numpy()))
         occluder = TrueOccluder(mesh, fitted.mesh.voxel, truth, true)
         for options in (shading, hits):
             update_occluder_caches(occluder, fitted.surfels, filtered, options)
@@ -226,6 +227,18 @@ def renderer(fitted: TrainedScene, truth: Truth, case: Case, samples: int) -> Ca
             return in_passes(averaged, camera, samples_per_axis(samples), shading.neighbours, fitted.count)
 
     return draw
+
+
+def light_scale(images: Callable[[np.ndarray], np.ndarray], targets: np.ndarray) -> np.ndarray:
+    """The scale (3,) of a light with which images (…, 3) of it fit targets best, by Gauss-Newton steps. Light
+    and albedo share an unknown one; where only one of them is true, the other does not have it."""
+    scale, axes = np.ones(3), tuple(range(targets.ndim - 1))
+    for _ in range(GAUSS_NEWTON):
+        low, high = images(scale), images(1.1 * scale)
+        slope = (high - low) / 0.1
+        step = np.sum(slope * (targets - low), axes) / np.maximum(np.sum(slope**2, axes), 1e-30)
+        scale *= 1 + np.clip(step, -0.5, 1.0)
+    return scale
 
 
 def spectrum(errors: list[np.ndarray], smooth: list[np.ndarray]) -> dict[str, float]:
@@ -248,33 +261,46 @@ def measured(path: Path, samples: Sequence[int], quiet: bool) -> tuple[list[Row]
     data, fitted = views_of_run(run, run.method(), "test"), TrainedScene.read(path, run.method().plugins)
     if not fitted.shading.occlusion or not isinstance(fitted.shading.model, SplitSum):
         raise InputError("needs a mesh and the model split_sum", path, "shading", "leave it out")
-    truth, rows = Truth(data), []
+    truth, rows, found = Truth(data), [], {}
     views = [view.load() for view in data.views]
+    targets = np.stack([view.displayed for view in views])
     classes = [classify(view, truth.surface) for view in views]
-    for count in samples:
-        for name, case in tqdm(CASES.items(), f"{path.name}, {count} samples", disable=quiet):
-            draw, budget = renderer(fitted, truth, case, count), ErrorBudget()
-            shown = [RenderedView.of(draw(view.camera()), data, view) for view in views]
-            for image, view, of in zip(shown, views, classes, strict=True):
+
+    def frames(case: Case, count: int, scale: np.ndarray) -> list[Frame]:
+        draw = renderer(fitted, truth, case, count, scale)
+        return [draw(view.camera()) for view in views]
+
+    def lit(once: list[Frame], twice: list[Frame], scale: np.ndarray) -> np.ndarray:
+        """Images under a scaled light, in which radiance is linear."""
+        more = mi.Color3f(*map(float, scale - 1))
+        mixed = (a.radiance + more * (b.radiance - a.radiance) for a, b in zip(once, twice, strict=True))
+        scaled = zip(once, mixed, views, strict=True)
+        return np.stack([displayed_image(replace(f, radiance=x), view, data) for f, x, view in scaled])
+
+    for name, case in tqdm(CASES.items(), path.name, disable=quiet):
+        scale = np.ones(3)
+        if ("light" in case.true) != ("materials" in case.true):
+            scale = light_scale(partial(lit, *(frames(case, 1, k * scale) for k in (1, 2))), targets)
+        for count in samples:
+            drawn, budget = zip(frames(case, count, scale), views, strict=True), ErrorBudget()
+            images = [RenderedView.of(frame, data, view) for frame, view in drawn]
+            for image, view, of in zip(images, views, classes, strict=True):
                 budget.add(image, view, of)
-            pairs = zip(shown, views, strict=True)
-            psnr = np.mean([metrics.psnr(image.image, view.displayed) for image, view in pairs])
+            psnr = np.mean([metrics.psnr(image.image, of) for image, of in zip(images, targets, strict=True)])
             squared = 1e5 * budget.sums[1] / (3 * budget.sums[0].sum())
-            row = {"run": path.name, "scene": truth_name(data), "case": name, "samples": count}
-            rows.append(row | {"psnr": float(psnr), **dict(zip(CLASSES, map(float, squared), strict=True))})
+            row = {"run": path.name, "scene": truth.name, "case": name, "samples": count}
+            row |= {"psnr": float(psnr)} | dict(zip(CLASSES, map(float, squared), strict=True))
+            rows.append(row)
             if not quiet:
-                errors = ", ".join(f"{key} {rows[-1][key]:.1f}" for key in CLASSES if rows[-1][key])
-                tqdm.write(f"{name:26} {count:2} samples {psnr:6.2f} dB   squared error, 1e-5: {errors}")
-            if rows[-1]["case"] == "as fitted" and count == samples[0]:
-                found = spectrum(
-                    [image.normal - view.normal for image, view in zip(shown, views, strict=True)],
-                    [np.isin(of, [CLASSES.index(c) for c in CLASSES if "mirror" in c]) for of in classes],
+                errors = ", ".join(f"{key} {row[key]:.1f}" for key in CLASSES if row[key])
+                tqdm.write(
+                    f"{name:26} {count:2} samples {psnr:6.2f} dB   squared error, 1e-5: {errors} {scale}"
                 )
+            if case == Case() and count == samples[0]:
+                wrong = [image.normal - view.normal for image, view in zip(images, views, strict=True)]
+                smooth = [i for i, kind in enumerate(CLASSES) if kind.startswith("mirror")]
+                found = spectrum(wrong, [np.isin(of, smooth) for of in classes])
     return rows, found
-
-
-def truth_name(data: Dataset) -> str:
-    return Path(read_json(data.path / "dataset.json")["scene"]).stem
 
 
 def measure(runs: Sequence[Path], samples: Sequence[int], quiet: bool) -> dict[str, Any]:
