@@ -25,6 +25,7 @@ from tqdm import tqdm
 from benchmarks.common.report import Row, make_parser, write_measured
 from benchmarks.common.view import ROOT
 from mi_refgs.data.dataset import Dataset
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.error_budget import CLASSES, ErrorBudget, classify
@@ -48,7 +49,7 @@ from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.reflectance.split_sum import SplitSum
 from mi_refgs.shade.reflection import reflection
-from mi_refgs.shade.shading import RELIT_RAYS, Shading
+from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.synthesis.ground_truth import Materials, materials_at
@@ -59,6 +60,10 @@ SCENES = ROOT / "scenes"
 PARTS = ("normals", "materials", "hit normals", "hit materials", "light", "mesh")
 """What can be true: "hit …" are those where traced reflected rays end."""
 BOUNCES = 4  # traced, where everything is true
+EDGE = (
+    2  # voxels of the extracted mesh: longest edge of the true one, of whose vertices surfels are looked up
+)
+RAYS = 32  # per vertex, for diffuse light: a quarter of those of relit images, since the mesh is finer
 GAUSS_NEWTON = 6  # steps, of the scale of a light
 BLURS = (0, 0.8, 1.5, 3, 6, 12)  # σ in pixels, of the errors of normals
 
@@ -89,14 +94,17 @@ CASES = {
 class Truth:
     """The scene that a data set shows, in the frame of its views."""
 
-    def __init__(self, data: Dataset) -> None:
-        """Raises InputError unless `refgs dataset` made it of a scene in scenes/, with surface and light."""
+    def __init__(self, data: Dataset, edge: float) -> None:
+        """`mesh`: its surface in triangles of edges of at most this length, for attributes of surfels. Raises
+        InputError unless `refgs dataset` made it of a scene in scenes/, with surface and light."""
         record = read_json(data.path / "dataset.json")
         file, self.name = SCENES / record["scene"], Path(record["scene"]).stem
         surface = TrueSurface.read(data.path, data.offset)
         if data.environment is None or surface is None or scene_hash(file) != record["scene_sha256"]:
             raise InputError("no truth: its scene is not in scenes/", data.path, "scene", "make it again")
-        self.scene, self.surface = load_scene(file), surface
+        self.scene, self.surface, whole = load_scene(file), surface, surface.mesh
+        corners, faces = trimesh.remesh.subdivide_to_size(whole.vertices, whole.faces, edge, max_iter=20)
+        self.mesh = replace(whole, vertices=corners.astype(np.float32), faces=faces.astype(whole.faces.dtype))
         self.light = EnvironmentLight.from_file(data.environment)
         self.offset = mi.Vector3f(*map(float, data.offset))
         wanted = record["objects"]
@@ -117,12 +125,6 @@ class Truth:
             facing = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
             materials = Materials(*((x, known & found) for x, known in materials_at(self.scene, si)))
             return found, facing, materials
-
-    def mesh(self, edge: float) -> Mesh:
-        """The true surface in triangles with edges of at most this length, for attributes of surfels."""
-        mesh = self.surface.mesh
-        vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge, max_iter=20)
-        return Mesh(np.asarray(vertices, np.float32), np.asarray(faces, mesh.faces.dtype), mesh.voxel)
 
 
 class TrueHits:
@@ -207,17 +209,17 @@ def renderer(
     true, given = case.true, fitted.shading.settings()
     if case.bounces is not None:
         given["traced_bounces"] = case.bounces
-    lit = given | {"diffuse": "irradiance", "ambient_rays": RELIT_RAYS["ambient_rays"]}
+    lit = given | {"diffuse": "irradiance", "ambient_rays": RAYS}
     hits = ShadingOptions(**lit if "hit materials" in true else given)
     shading = TrueShading(**lit if "materials" in true else given, truth=truth, true=true, hits=hits)
     assert fitted.light is not None and fitted.mesh is not None
     light = truth.light if "light" in true else fitted.light
-    mesh = truth.mesh(2 * fitted.mesh.voxel) if "mesh" in true else fitted.mesh
+    mesh = truth.mesh if "mesh" in true else fitted.mesh
     with dr.suspend_grad():
         filtered = shading.light_of(EnvironmentLight.from_radiance(scale * light.radiance().numpy()))
         occluder = TrueOccluder(mesh, fitted.mesh.voxel, truth, true)
-        for options in (shading, hits):
-            update_occluder_caches(occluder, fitted.surfels, filtered, options)
+        used = hits if hits.ambient_rays else shading
+        update_occluder_caches(occluder, fitted.surfels, filtered, used)
     scene = SurfelScene(fitted.surfels, shading, filtered, occluder, fitted.surroundings, fitted.near)
     once = partial(render, scene, request=Request(("normal",), forward_only=True))
     averaged = partial(supersampled, once, samples=samples, details=False)
@@ -255,14 +257,15 @@ def spectrum(errors: list[np.ndarray], smooth: list[np.ndarray]) -> dict[str, fl
     return found
 
 
-def measured(path: Path, samples: Sequence[int], quiet: bool) -> tuple[list[Row], dict[str, float]]:
+def measured(options: Any, path: Path) -> tuple[list[Row], dict[str, float]]:
     """Rows of the cases of a run, and its `spectrum`; raises InputError for a run without truth or mesh."""
     run = Run(path)
     data, fitted = views_of_run(run, run.method(), "test"), TrainedScene.read(path, run.method().plugins)
-    if not fitted.shading.occlusion or not isinstance(fitted.shading.model, SplitSum):
+    if fitted.mesh is None or not isinstance(fitted.shading.model, SplitSum):
         raise InputError("needs a mesh and the model split_sum", path, "shading", "leave it out")
-    truth, rows, found = Truth(data), [], {}
-    views = [view.load() for view in data.views]
+    truth, rows, found = Truth(data, EDGE * fitted.mesh.voxel), [], {}
+    chosen = evenly_spread(len(data.views), options.views)
+    views = [data.views[i].load() for i in chosen]
     targets = np.stack([view.displayed for view in views])
     classes = [classify(view, truth.surface) for view in views]
 
@@ -277,11 +280,11 @@ def measured(path: Path, samples: Sequence[int], quiet: bool) -> tuple[list[Row]
         scaled = zip(once, mixed, views, strict=True)
         return np.stack([displayed_image(replace(f, radiance=x), view, data) for f, x, view in scaled])
 
-    for name, case in tqdm(CASES.items(), path.name, disable=quiet):
+    for name, case in tqdm(CASES.items(), path.name, disable=options.quiet):
         scale = np.ones(3)
         if ("light" in case.true) != ("materials" in case.true):
             scale = light_scale(partial(lit, *(frames(case, 1, k * scale) for k in (1, 2))), targets)
-        for count in samples:
+        for count in options.samples:
             drawn, budget = zip(frames(case, count, scale), views, strict=True), ErrorBudget()
             images = [RenderedView.of(frame, data, view) for frame, view in drawn]
             for image, view, of in zip(images, views, classes, strict=True):
@@ -291,25 +294,25 @@ def measured(path: Path, samples: Sequence[int], quiet: bool) -> tuple[list[Row]
             row = {"run": path.name, "scene": truth.name, "case": name, "samples": count}
             row |= {"psnr": float(psnr)} | dict(zip(CLASSES, map(float, squared), strict=True))
             rows.append(row)
-            if not quiet:
+            if not options.quiet:
                 errors = ", ".join(f"{key} {row[key]:.1f}" for key in CLASSES if row[key])
                 tqdm.write(
                     f"{name:26} {count:2} samples {psnr:6.2f} dB   squared error, 1e-5: {errors} {scale}"
                 )
-            if case == Case() and count == samples[0]:
+            if case == Case() and count == options.samples[0]:
                 wrong = [image.normal - view.normal for image, view in zip(images, views, strict=True)]
                 smooth = [i for i, kind in enumerate(CLASSES) if kind.startswith("mirror")]
                 found = spectrum(wrong, [np.isin(of, smooth) for of in classes])
     return rows, found
 
 
-def measure(runs: Sequence[Path], samples: Sequence[int], quiet: bool) -> dict[str, Any]:
+def measure(options: Any) -> dict[str, Any]:
     """The content of oracle.json; a run that does not fit is named and left out."""
     rows: list[Row] = []
     spectra = {}
-    for path in runs:
+    for path in options.runs:
         try:
-            own, spectra[path.name] = measured(path, samples, quiet)
+            own, spectra[path.name] = measured(options, path)
             rows += own
         except InputError as error:
             print(f"{path}: left out: {error}", file=sys.stderr)
@@ -319,6 +322,7 @@ def measure(runs: Sequence[Path], samples: Sequence[int], quiet: bool) -> dict[s
 if __name__ == "__main__":
     parser = make_parser("oracle", __doc__)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--samples", nargs="+", type=int, default=[1, 16], help="per pixel")
+    parser.add_argument("--samples", nargs="+", type=int, default=[1, 16], help="per pixel (default: 1 16)")
+    parser.add_argument("--views", type=int, default=4, help="of the test views, evenly spread (default: 4)")
     options = parser.parse_args()
-    sys.exit(write_measured("oracle", options, lambda: measure(options.runs, options.samples, options.quiet)))
+    sys.exit(write_measured("oracle", options, lambda: measure(options)))
