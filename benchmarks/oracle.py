@@ -173,7 +173,7 @@ class TrueOccluder(Occluder):
 class TruePoints(SplitSum):
     """The split sum, of points whose normals and materials are true before rays are traced from them."""
 
-    visibility = "own"
+    visibility = "own"  # type: ignore[assignment]
 
     def __init__(self, truth: Truth, true: Sequence[str]) -> None:
         self.truth, self.true = truth, true
@@ -267,7 +267,7 @@ def measured(options: Any, path: Path) -> tuple[list[Row], dict[str, float]]:
     chosen = evenly_spread(len(data.views), options.views)
     views = [data.views[i].load() for i in chosen]
     targets = np.stack([view.displayed for view in views])
-    classes = [classify(view, truth.surface) for view in views]
+    classes: list[Any] = [classify(view, truth.surface) for view in views]
 
     def frames(case: Case, count: int, scale: np.ndarray) -> list[Frame]:
         draw = renderer(fitted, truth, case, count, scale)
@@ -283,7 +283,8 @@ def measured(options: Any, path: Path) -> tuple[list[Row], dict[str, float]]:
     for name, case in tqdm(CASES.items(), path.name, disable=options.quiet):
         scale = np.ones(3)
         if ("light" in case.true) != ("materials" in case.true):
-            scale = light_scale(partial(lit, *(frames(case, 1, k * scale) for k in (1, 2))), targets)
+            once, twice = (frames(case, 1, k * scale) for k in (1, 2))
+            scale = light_scale(partial(lit, once, twice), targets)
         for count in options.samples:
             drawn, budget = zip(frames(case, count, scale), views, strict=True), ErrorBudget()
             images = [RenderedView.of(frame, data, view) for frame, view in drawn]
