@@ -1,6 +1,7 @@
 """What would mend what: parts of a fitted scene are replaced by ground truth, one at a time and together.
 
-    python -m benchmarks.oracle RUN [RUN ...] [--samples 1 16] [-o FOLDER]
+    python -m benchmarks.oracle --run RUN --run RUN ...
+    python -m benchmarks.oracle --small --run RUN -o out     two views, one sample per pixel: a minute
 
 A RUN is a fit, with a mesh and the model `split_sum`, of a data set that `refgs dataset` made of a scene in
 scenes/; others are left out. Its own renderer shades what is replaced. Writes oracle.json, of which
@@ -22,7 +23,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 from tqdm import tqdm
 
-from benchmarks.common.report import Row, make_parser, write_measured
+from benchmarks.common.report import Row, benchmark
 from benchmarks.common.view import ROOT
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import evenly_spread
@@ -89,6 +90,18 @@ CASES = {
     **{f"all but {part}": Case(all_but(part), BOUNCES) for part in PARTS},
     **{f"all true, {n} bounce{'s' * (n > 1)}": Case(PARTS, n) for n in (1, 2)},
 }
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The runs, samples per pixel, and test views, evenly spread."""
+
+    runs: tuple[str, ...] = ()
+    samples: tuple[int, ...] = (1, 16)
+    views: int = 4
+
+
+PAGE, SMALL = Settings(), Settings(samples=(1,), views=2)
 
 
 class Truth:
@@ -257,14 +270,13 @@ def spectrum(errors: list[np.ndarray], smooth: list[np.ndarray]) -> dict[str, fl
     return found
 
 
-def measured(options: Any, path: Path) -> tuple[list[Row], dict[str, float]]:
+def measured(run: Run, settings: Settings, quiet: bool) -> tuple[list[Row], dict[str, float]]:
     """Rows of the cases of a run, and its `spectrum`; raises InputError for a run without truth or mesh."""
-    run = Run(path)
-    data, fitted = views_of_run(run, run.method(), "test"), TrainedScene.read(path, run.method().plugins)
+    data, fitted = views_of_run(run, run.method(), "test"), TrainedScene.read(run.path, run.method().plugins)
     if fitted.mesh is None or not isinstance(fitted.shading.model, SplitSum):
-        raise InputError("needs a mesh and the model split_sum", path, "shading", "leave it out")
+        raise InputError("needs a mesh and the model split_sum", run.path, "shading", "leave it out")
     truth, rows, found = Truth(data, EDGE * fitted.mesh.voxel), [], {}
-    chosen = evenly_spread(len(data.views), options.views)
+    chosen = evenly_spread(len(data.views), settings.views)
     views = [data.views[i].load() for i in chosen]
     targets = np.stack([view.displayed for view in views])
     classes: list[Any] = [classify(view, truth.surface) for view in views]
@@ -280,50 +292,45 @@ def measured(options: Any, path: Path) -> tuple[list[Row], dict[str, float]]:
         scaled = zip(once, mixed, views, strict=True)
         return np.stack([displayed_image(replace(f, radiance=x), view, data) for f, x, view in scaled])
 
-    for name, case in tqdm(CASES.items(), path.name, disable=options.quiet):
+    for name, case in tqdm(CASES.items(), run.path.name, disable=quiet):
         scale = np.ones(3)
         if ("light" in case.true) != ("materials" in case.true):
             once, twice = (frames(case, 1, k * scale) for k in (1, 2))
             scale = light_scale(partial(lit, once, twice), targets)
-        for count in options.samples:
+        for count in settings.samples:
             drawn, budget = zip(frames(case, count, scale), views, strict=True), ErrorBudget()
             images = [RenderedView.of(frame, data, view) for frame, view in drawn]
             for image, view, of in zip(images, views, classes, strict=True):
                 budget.add(image, view, of)
             psnr = np.mean([metrics.psnr(image.image, of) for image, of in zip(images, targets, strict=True)])
             squared = 1e5 * budget.sums[1] / (3 * budget.sums[0].sum())
-            row = {"run": path.name, "scene": truth.name, "case": name, "samples": count}
+            row = {"run": run.path.name, "scene": truth.name, "case": name, "samples": count}
             row |= {"psnr": float(psnr)} | dict(zip(CLASSES, map(float, squared), strict=True))
             rows.append(row)
-            if not options.quiet:
+            if not quiet:
                 errors = ", ".join(f"{key} {row[key]:.1f}" for key in CLASSES if row[key])
                 tqdm.write(
                     f"{name:26} {count:2} samples {psnr:6.2f} dB   squared error, 1e-5: {errors} {scale}"
                 )
-            if case == Case() and count == options.samples[0]:
+            if case == Case() and count == settings.samples[0]:
                 wrong = [image.normal - view.normal for image, view in zip(images, views, strict=True)]
                 smooth = [i for i, kind in enumerate(CLASSES) if kind.startswith("mirror")]
                 found = spectrum(wrong, [np.isin(of, smooth) for of in classes])
     return rows, found
 
 
-def measure(options: Any) -> dict[str, Any]:
+def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
     """The content of oracle.json; a run that does not fit is named and left out."""
     rows: list[Row] = []
     spectra = {}
-    for path in options.runs:
+    for run in settings.runs:
         try:
-            own, spectra[path.name] = measured(options, path)
+            own, spectra[Path(run).name] = measured(Run(run), settings, quiet)
             rows += own
         except InputError as error:
-            print(f"{path}: left out: {error}", file=sys.stderr)
+            print(f"{run}: left out: {error}", file=sys.stderr)
     return {"spectra": spectra, "rows": rows}
 
 
 if __name__ == "__main__":
-    parser = make_parser("oracle", __doc__)
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--samples", nargs="+", type=int, default=[1, 16], help="per pixel (default: 1 16)")
-    parser.add_argument("--views", type=int, default=4, help="of the test views, evenly spread (default: 4)")
-    options = parser.parse_args()
-    sys.exit(write_measured("oracle", options, lambda: measure(options)))
+    sys.exit(benchmark("oracle", __doc__, measure, PAGE, SMALL, several=("--run", "runs")))
