@@ -6,8 +6,7 @@ Pixels      The centre of pixel (i, j) is (i + ½, j + ½); only `splat.camera.p
 Quaternions (x, y, z, w) everywhere but in PLY files, which store w first.
 Colour      Linear radiance everywhere; the sRGB curve is applied once, at the camera (`render.display`).
 Letters     N surfels, M surfel-tile pairs, P pixels, K channels, α opacity after the footprint,
-            T transmittance, w = αT, δx the adjoint of x, a_from_b an index map.
-"""
+            T transmittance, w = αT, δx the adjoint of x, a_from_b an index map."""
 
 import math
 

@@ -1,24 +1,23 @@
 """Exceptions for input that a user can fix, and values in their messages."""
 
+import contextlib
+import importlib
 import math
-from typing import Self
+from collections.abc import Iterator
+from typing import Any, Self
 
 
 class InputError(ValueError):
     """Bad input: what is wrong, the file and the field where it is, and a remedy.
 
-    `str` is the sentence "file: field: what; remedy", which the command line prints before exit code 2.
-    """
+    `str` is the sentence "file: field: what; remedy", which the command line prints before exit code 2."""
 
     def __init__(
         self, what: str, file: object = None, field: str | None = None, remedy: str | None = None
     ) -> None:
         """`file` is a path, or the name of what was given instead, such as an option or an object."""
         super().__init__(what)
-        self.what = what
-        self.file = file
-        self.field = field
-        self.remedy = remedy
+        self.what, self.file, self.field, self.remedy = what, file, field, remedy
 
     @property
     def advice(self) -> str:
@@ -44,6 +43,24 @@ class UnknownNameError(InputError):
 
 class SceneError(InputError):
     """A scene lacks what a request needs. Where a run is read, its folder precedes the message."""
+
+
+@contextlib.contextmanager
+def within(file: object = None, field: str | None = None) -> Iterator[None]:
+    """Let every InputError inside say that its place is in `file` and `field`."""
+    try:
+        yield
+    except InputError as error:
+        raise error.at(file, field) from error
+
+
+def require_package(name: str, extra: str, file: object) -> Any:
+    """Import a package that an extra installs; raises InputError that says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        remedy = f'pip install "mi_refgs[{extra}]"'
+        raise InputError(f"{name} is not installed", file, remedy=remedy) from None
 
 
 def require_between(value: float, option: str, least: float, most: float = math.inf) -> None:

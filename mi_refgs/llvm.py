@@ -1,8 +1,7 @@
 """Choice of a libLLVM that Dr.Jit can use, before Dr.Jit loads one by itself.
 
 LLVM 15 and 16 abort the process at the first kernel that takes a minimum. Only the standard library is
-imported at the top: the set-up script runs `python -P mi_refgs/llvm.py` before anything is installed.
-"""
+imported at the top: the set-up script runs `python -P mi_refgs/llvm.py` before anything is installed."""
 
 import ctypes
 import os

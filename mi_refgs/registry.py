@@ -12,19 +12,11 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from mi_refgs.errors import InputError, UnknownNameError, abbreviated
 
-
-class Named(Protocol):
-    """An item of a registry; its name is unique there."""
-
-    @property
-    def name(self) -> str: ...
-
-
-T = TypeVar("T", bound=Named)
+T = TypeVar("T")
 GROUP = "mi_refgs.plugins"  # entry points of installed packages: modules that register
 _loaded: set[str] = set()  # plugins of this process: files, and modules of entry points
 _files: dict[tuple[str, str], str] = {}  # kind and name of a user's item: the file that registered it
@@ -35,12 +27,11 @@ class Registry(Mapping[str, T], Generic[T]):
 
     Items are objects of a class, `of`, or `classes` of settings below it; `check(item)` raises InputError for
     an unusable one. With a `package`, the first look-up imports it and its modules, which register theirs: a
-    module can read a registry whose items are on a floor above it.
-    """
+    module can read a registry whose items are on a floor above it."""
 
     def __init__(
         self,
-        kind: str,
+        kind: str,  # such as "reflectance model", for messages
         check: Callable[[T], None] = lambda item: None,
         package: str | None = None,
         *,
@@ -48,9 +39,7 @@ class Registry(Mapping[str, T], Generic[T]):
         classes: bool = False,
         newest_first: bool = False,
     ) -> None:
-        self.kind = kind  # such as "reflectance model", for messages
-        self._check = check
-        self._package = package
+        self.kind, self._check, self._package = kind, check, package
         self._of, self._classes, self._newest_first = of, classes, newest_first
         self._registered: dict[str, T] = {}
 

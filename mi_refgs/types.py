@@ -3,8 +3,7 @@
 The types exist only once a variant is set. Shapes are comments on the line of the argument:
 
     weight: Float,  # (N,)
-    radiance: Color3f,  # (H*W,) linear, premultiplied
-"""
+    radiance: Color3f,  # (H*W,) linear, premultiplied"""
 
 from typing import Any
 

@@ -1,7 +1,6 @@
 """The errors that a user meets, one command per kind; `python -m tests.errors` writes them into errors.txt.
 
-Read the file as a list: each sentence names the file, the field and the remedy.
-"""
+Read the file as a list: each sentence names the file, the field and the remedy."""
 
 import contextlib
 import io

@@ -1,8 +1,7 @@
 """Derivatives of mi.render by every parameter; `python -m tests.gradients` writes the table of scripting.md.
 
 Errors are those against central differences of images, in both modes, with one and two threads; 5e-3 is what
-differences of float32 images resolve.
-"""
+differences of float32 images resolve."""
 
 from __future__ import annotations
 

@@ -35,8 +35,7 @@ def refused(
     """Require that a command (its arguments) or a call refuses its input; the message contains all `words`.
 
     A command exits with code 2, prints nothing on stdout, and names the remedy in one sentence. A call raises
-    `error`, or an error of Mitsuba that it caused.
-    """
+    `error`, or an error of Mitsuba that it caused."""
     if callable(action):
         with pytest.raises(Exception) as info:
             action()
@@ -184,8 +183,7 @@ def check_slopes(
 ) -> None:
     """Gradients (N, …) of an input against one-sided differences of `value(name, point, x)` at random steps.
 
-    Where the two sides disagree, a kink is near and the point is left out: at most a fifth of them.
-    """
+    Where the two sides disagree, a kink is near and the point is left out: at most a fifth of them."""
     ε, checked = 1e-6, 0
     for k, slopes in enumerate(gradient):
         x = values[k]

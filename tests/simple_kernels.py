@@ -1,7 +1,6 @@
 """Kernels of the tests are compiled without LLVM's optimisations, which take most of the time of the tests.
 
-Import before Dr.Jit. With REFGS_TESTS_OPTIMISED=1, LLVM compiles as it does for users.
-"""
+Import before Dr.Jit. With REFGS_TESTS_OPTIMISED=1, LLVM compiles as it does for users."""
 
 import ctypes
 import os

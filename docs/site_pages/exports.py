@@ -1,6 +1,6 @@
 """The page of the formats of other programs, from their declarations and docstrings."""
 
-from __future__ import annotations
+import inspect
 
 from mi_refgs.formats import FORMATS
 from mi_refgs.formats.format import Format
@@ -32,7 +32,7 @@ def page() -> str:
 
 def section(name: str, form: Format) -> str:
     """A format: its description and its options."""
-    text = [f"## {name}", form.description]
+    text = [f"## {name}", inspect.getdoc(form.writer) or form.summary]
     if form.options:
         rows = [
             [f"`--{o.name.replace('_', '-')}`", "off" if o.default is False else f"`{o.default}`", o.help]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
 from mi_refgs.data.colmap_model import MODELS
-from mi_refgs.errors import InputError
+from mi_refgs.errors import require_package
 from mi_refgs.io.progress import progress_bar
 
 SEED = 0  # seed of all random numbers; a second run gives the same result
@@ -31,12 +31,7 @@ Item = TypeVar("Item")
 
 def load() -> Any:
     """Import pycolmap; raises InputError that says how to install it."""
-    try:
-        import pycolmap
-    except ImportError:
-        remedy = 'pip install "mi_refgs[capture]"'
-        raise InputError("pycolmap is not installed", "capture", remedy=remedy) from None
-    return pycolmap
+    return require_package("pycolmap", "capture", "capture")
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from mi_refgs.data.colmap_model import MODELS, Camera
 from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.lens import Undistortion, undistortion
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import cannot_write, read_json, replace_file
+from mi_refgs.io.files import make_folder, read_json, replace_file
 from mi_refgs.io.images import exif_tags, open_image, positive
 from mi_refgs.io.progress import with_bar
 
@@ -85,10 +85,7 @@ def prepare(folder: Path, sources: Sequence[Path]) -> None:
     own = own or ((folder / REPORT).is_file() and "key" in read_json(folder / REPORT))
     if not own and folder.is_dir() and any(folder.iterdir()):
         raise InputError("not empty, and no capture", folder, "output", "choose another folder")
-    try:
-        (folder / WORK).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
+    make_folder(folder / WORK)
 
 
 def write_images(

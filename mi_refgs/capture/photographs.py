@@ -15,7 +15,7 @@ from scipy.ndimage import laplace
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
-from mi_refgs.errors import InputError, counted
+from mi_refgs.errors import InputError, counted, require_package
 from mi_refgs.io.images import exif_tags, image_size, open_image, positive, read_mask, to_8_bits
 
 VIDEOS = ".mp4 .mov .m4v .avi .mkv .webm .mts".split()
@@ -119,11 +119,7 @@ def folder_of(source: Path) -> Iterator[Path]:
     if source.suffix.lower() not in VIDEOS or not source.is_file():
         yield source
         return
-    try:
-        import av
-    except ImportError:
-        remedy = 'pip install "mi_refgs[video]", or take frames with ffmpeg and give their folder'
-        raise InputError("PyAV, which reads videos, is not installed", source, "video", remedy) from None
+    av = require_package("av", "video", source)
     with TemporaryDirectory(prefix=f"{source.stem}_") as folder:
         try:
             with av.open(str(source)) as count, av.open(str(source)) as opened:

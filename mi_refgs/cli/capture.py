@@ -15,8 +15,7 @@ class Capture:
     """Requires COLMAP: pip install "mi_refgs[capture]".
 
     example:
-      refgs capture holiday/vase -o data/vase
-    """
+      refgs capture holiday/vase -o data/vase"""
 
     photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
     """folder with JPEG or PNG files of one scene, or a video (pip install "mi_refgs[video]" reads it)"""

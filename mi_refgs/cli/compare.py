@@ -34,8 +34,7 @@ class Compare:
     """The same command continues an interrupted comparison. Without DATA, the table is made again.
 
     example:
-      refgs compare data/glossy --methods ref_gaussian base_2dgs --seeds 0 1 -o runs/compare
-    """
+      refgs compare data/glossy --methods ref_gaussian base_2dgs --seeds 0 1 -o runs/compare"""
 
     data: Annotated[Positional[tuple[Path, ...]], optional("DATA …")] = ()  # data sets
     output: Output  # folder of the comparison

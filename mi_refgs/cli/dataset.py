@@ -17,8 +17,7 @@ class Dataset:
     """Writes images, materials, normals, depth, environment map and cameras, all path-traced by Mitsuba.
 
     example:
-      refgs dataset scenes/glossy_demo.xml -o data/glossy --views 80 --size 160 --samples 128
-    """
+      refgs dataset scenes/glossy_demo.xml -o data/glossy --views 80 --size 160 --samples 128"""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE.xml")]
     """Mitsuba scene with an environment emitter, or lamps"""

@@ -18,8 +18,7 @@ class Demo:
     """An interrupted demo is continued by the same command.
 
     example:
-      refgs demo -o runs/demo
-    """
+      refgs demo -o runs/demo"""
 
     output: Output  # folder of the data set and the run
     preset: Preset = "quick"

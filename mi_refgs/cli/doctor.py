@@ -86,8 +86,7 @@ class Doctor:
     """Exit code 1 means that the installation is unusable, 2 that a fit refuses the data.
 
     example:
-      refgs doctor data/glossy
-    """
+      refgs doctor data/glossy"""
 
     data: Annotated[Positional[Path | None], optional("DATA")] = None
     """data set to examine instead of the installation"""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from mi_refgs.cli.command import Output, Rendering, Result, RunFolder, joined
 from mi_refgs.editing.options import Change, Selection
-from mi_refgs.errors import InputError
+from mi_refgs.errors import within
 from mi_refgs.io.progress import say
 
 
@@ -37,10 +37,8 @@ class Edit:
         if self.selection.where is not None:
             parse_condition(self.selection.where)
         before = load(self.run_folder, write=False)
-        try:
+        with within(self.run_folder):
             after = before.edit(**options)
-        except InputError as error:
-            raise error.at(self.run_folder) from None
         entry = after.provenance.edits[-1]
         for note in entry["notes"]:
             say(f"note: {note}")

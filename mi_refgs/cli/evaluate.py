@@ -12,8 +12,7 @@ class Eval:
     """Writes metrics.json, renders, and a contact sheet with the ground truth to the run folder.
 
     example:
-      refgs eval runs/glossy --json
-    """
+      refgs eval runs/glossy --json"""
 
     run_folder: RunFolder
     data: OtherData = None

@@ -22,8 +22,7 @@ class Import:
 
     example:
       refgs import point_cloud.ply -o runs/theirs
-      refgs import point_cloud.ply -o runs/vase --relightable --preset quick
-    """
+      refgs import point_cloud.ply -o runs/vase --relightable --preset quick"""
 
     file: Annotated[Positional[Path], arg(metavar="FILE.ply")]  # 3D Gaussians or surfels
     output: Output  # new run folder

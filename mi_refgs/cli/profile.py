@@ -14,8 +14,7 @@ class Profile:
     """A run is measured at its newest checkpoint; nothing is written.
 
     example:
-      refgs profile runs/glossy
-    """
+      refgs profile runs/glossy"""
 
     run_folder: RunFolder
     steps: Annotated[int, arg(metavar="N")] = 15  # steps to measure

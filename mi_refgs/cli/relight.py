@@ -16,8 +16,7 @@ class Relight:
     """Writes images, a contact sheet, scene.xml, and the score where ground truth is known.
 
     example:
-      refgs relight runs/glossy --envmap studio.hdr --azimuth 90 -o relit/studio
-    """
+      refgs relight runs/glossy --envmap studio.hdr --azimuth 90 -o relit/studio"""
 
     run_folder: RunFolder
     envmap: Annotated[Path, arg(metavar="FILE")]  # lat-long map (EXR, HDR), first row towards +z

@@ -17,8 +17,7 @@ class Render:
     """A run is rendered from the camera of its scene.xml.
 
     example:
-      refgs render runs/glossy -o glossy.exr --aov albedo normal
-    """
+      refgs render runs/glossy -o glossy.exr --aov albedo normal"""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|SCENE.xml")]  # run folder, or Mitsuba scene
     output: Output  # image: .exr (linear, premultiplied alpha) or .png (sRGB, straight alpha)

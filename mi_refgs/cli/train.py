@@ -27,8 +27,7 @@ class Train:
     """Writes checkpoints, previews, metrics.jsonl, and finally surfels.ply, envmap.exr, mesh.ply, scene.xml.
 
     example:
-      refgs train data/glossy -o runs/glossy --preset quick --set loss.alpha=0.1
-    """
+      refgs train data/glossy -o runs/glossy --preset quick --set loss.alpha=0.1"""
 
     data: Annotated[Positional[Path], arg(metavar="DATA")]  # data set: a folder of images with cameras
     output: Output  # run folder

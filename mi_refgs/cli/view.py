@@ -6,6 +6,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result, RunFolder
+from mi_refgs.errors import require_package
 from mi_refgs.io.progress import say
 
 
@@ -14,8 +15,7 @@ class View:
     """Requires the viewer: pip install "mi_refgs[view]".
 
     example:
-      refgs view runs/glossy --port 8080
-    """
+      refgs view runs/glossy --port 8080"""
 
     run_folder: RunFolder
     output: OptionalOutput = None  # folder of saved views (default: RUN/views)
@@ -28,10 +28,9 @@ class View:
     def run(self) -> Result:
         """Serve the page until it is interrupted."""
         from mi_refgs.runs.run import Run
-        from mi_refgs.viewer.page import require_viser
         from mi_refgs.viewer.serve import serve
 
-        require_viser()
+        require_package("viser", "view", "view")
         page = serve(Run(self.run_folder), (self.host, self.port), self.output, self.data)
         say(f"open {page.url} in a browser; Ctrl-C ends it")
         try:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.compare.worker import DONE, FAILURE, GRACE
-from mi_refgs.errors import InputError, require_between
+from mi_refgs.errors import InputError, require_between, require_package
 from mi_refgs.io.files import cannot_write, read_json
 from mi_refgs.runs.interrupt import held_interrupts
 
@@ -77,12 +77,7 @@ def execute_all(jobs: Sequence[Job], workers: int, report: Report, cluster: str 
 @contextlib.contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
     """The workers of a scheduler. A job whose worker died continues on another one, at most RETRIES times."""
-    try:
-        import dask
-        import distributed
-    except ImportError as error:
-        remedy = "pip install 'mi_refgs[cluster]'"
-        raise InputError("dask.distributed is not installed", "--cluster", remedy=remedy) from error
+    distributed, dask = (require_package(name, "cluster", "--cluster") for name in ("distributed", "dask"))
     limits = {"distributed.scheduler.allowed-failures": RETRIES, "distributed.comm.timeouts.connect": "20s"}
     with dask.config.set(limits):
         try:

@@ -15,7 +15,7 @@ from mi_refgs.data.images import ImageFile, find_image, image_files, image_folde
 from mi_refgs.data.poses import from_world_to_camera
 from mi_refgs.data.transforms import read_points as read_ply_points
 from mi_refgs.data.view import View
-from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.errors import InputError, abbreviated, within
 from mi_refgs.io.files import is_file
 from mi_refgs.io.images import linear_from_srgb
 
@@ -79,10 +79,8 @@ class Reconstruction:
             remedy = "export the model again"
             raise InputError(f"there is no camera {image.camera}", self.source, image.name, remedy)
         where = f"{self.source}: {image.name}: camera {image.camera}"
-        try:
+        with within(where):
             lens = camera.lens()
-        except InputError as error:
-            raise error.at(file=where) from None
         pose = from_world_to_camera(image.rotation, image.translation, f"{self.source}: {image.name}")
         path = self.files[image.name]
         file = ImageFile.of(path, self.options.downscale, mask_of(path, self.root))

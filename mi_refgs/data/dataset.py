@@ -18,7 +18,7 @@ from mi_refgs.data.images import MASKS, ImageCache, ImageFile, ImageSource, is_c
 from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import FileCamera, View, evenly_spread
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, within
 from mi_refgs.io.images import image_size
 from mi_refgs.registry import Registry
 
@@ -181,10 +181,8 @@ def make_view(
     fx, fy, cx, cy = (value / image.downscale for value in intrinsics)
     straight = None
     if lens is not None:
-        try:
+        with within(where, "k1 … p2"):
             straight = undistortion(lens, *image.size, fx, fy, cx, cy)
-        except InputError as error:
-            raise error.at(file=where, field="k1 … p2") from None
         fx, fy = fx * straight.zoom, fy * straight.zoom
         image = replace(image, undistortion=straight)
     source = ImageSource(image, options.background, options.cache, image.has_alpha())
@@ -218,8 +216,7 @@ class Dataset:
         object, or None for those of the scene. Images are linear radiance (H, W, 3) over white with alpha.
         options: split ("train", or "test" for other cameras and seeds), maps (True: normals, depth and
         materials at pixel centres), and those of `DatasetOptions`, of which a sensor has its own lens and
-        size. Raises InputError as `make_dataset` does, and for a sensor that is no pinhole.
-        """
+        size. Raises InputError as `make_dataset` does, and for a sensor that is no pinhole."""
         # By name, as registries import what is registered: `synthesis` imports this module.
         made: Dataset = import_module("mi_refgs.synthesis.in_memory").traced(scene, sensors, **options)
         return made

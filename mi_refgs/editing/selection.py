@@ -49,8 +49,7 @@ class SurfelValues:
     """The activated attributes of a scene's surfels, (N,) float64 by name, computed when they are read.
 
     Names: single columns, such as `roughness`, `albedo.r` or `x`; `colour.r` … `.b` (COLOUR); `size`, the
-    largest standard deviation (scene units); and `normal.x` … `.z`, outwards.
-    """
+    largest standard deviation (scene units); and `normal.x` … `.z`, outwards."""
 
     def __init__(self, scene: TrainedScene) -> None:
         self.scene, self.raw = scene, scene.surfels.to_numpy()

@@ -1,7 +1,6 @@
 """Decisions during a fit: it is continued both ways for some steps, and validation views choose.
 
-Only errors and counts decide, never a clock: the same command decides the same on every machine.
-"""
+Only errors and counts decide, never a clock: the same command decides the same on every machine."""
 
 import time
 from collections.abc import Mapping, Sequence

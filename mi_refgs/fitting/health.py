@@ -1,7 +1,6 @@
 """Steps whose loss or gradient is not finite: the surfels that cause them are removed, or the fit ends.
 
-The optimiser does not apply such steps, so the state is always the last good one.
-"""
+The optimiser does not apply such steps, so the state is always the last good one."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -2,8 +2,7 @@
 
 Letters: I rendered image, T target, A accumulated alpha, L linear radiance, N blended normal Σ w n (not
 unit). Every loss is of width 1, is zero for a perfect image, and has finite gradients for finite input.
-Targets, weights and masks have no derivative.
-"""
+Targets, weights and masks have no derivative."""
 
 from collections.abc import Iterable
 
@@ -71,8 +70,7 @@ def normal_consistency(
 
     This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A. normal: N, premultiplied; depth_normal: n_d,
     unit; gradients flow to both. `share` is a, the opacity of the surfels that have normals, with gradients;
-    by default it is A detached, as in the code of 2DGS.
-    """
+    by default it is A detached, as in the code of 2DGS."""
     weight = dr.select(valid, dr.detach(alpha), 0.0)
     covered = weight if share is None else share
     return _mean(weight * (covered - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
@@ -84,8 +82,7 @@ def smoothness(
     """Edge-aware smoothness ‖∇M‖ exp(-edge ‖∇I‖) of the maps M (`planes`): pixel mean, sum over axes.
 
     With the normals' planes and edge = 1 this is the smoothness of Ref-Gaussian (§3.3). ∇ is Sobel / 8 with
-    the border repeated; ‖·‖ is the mean absolute value over the planes. Gradients flow to M only.
-    """
+    the border repeated; ‖·‖ is the mean absolute value over the planes. Gradients flow to M only."""
     total = mi.Float(0)
     map_slopes = [sobel(plane, width, height) for plane in planes]
     image_slopes = [sobel(dr.detach(plane), width, height) for plane in image]
@@ -127,8 +124,7 @@ def light_difference(radiance: Color3f, photographed: Color3f, seen: Float, area
 
     Where P is above CLIPPED, a brighter L costs nothing. A direction counts by its `area` (they sum to 1)
     times `seen`, 0 … 1; the rest counts HUE times by its deviation from the mean d of the channels: what no
-    photograph shows is as bright as reflections say, in the colour of P.
-    """
+    photograph shows is as bright as reflections say, in the colour of P."""
     off = [dr.log(1 + own) - dr.log(1 + other) for own, other in zip(radiance, photographed, strict=True)]
     grey = (off[0] + off[1] + off[2]) / 3
     total = mi.Float(0)

@@ -7,8 +7,7 @@ Letters: θ parameter, g gradient, m v first and second moment, t step count of 
 Two guards. A step whose loss or gradient has a NaN or an infinity changes nothing: the device decides, and
 the host reads later (`Adam.report`) how many there were and which rows had such gradients. And |g| is cut to
 OUTLIER times what is usual for the entry, √(v / (1 - β₂ᵗ)), or for half of its tensor, whichever is more, and
-to RAW_LIMIT, whose square float32 can represent: else v would stop an entry after one huge gradient.
-"""
+to RAW_LIMIT, whose square float32 can represent: else v would stop an entry after one huge gradient."""
 
 import math
 import operator

@@ -89,8 +89,7 @@ def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, pro
     resume: continue the run in the folder; the choice has to be the run's own.
 
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
-    TerminatedError with a message that says how to continue.
-    """
+    TerminatedError with a message that says how to continue."""
     run = Run(output)
     if resume:
         if not run.exists():
@@ -180,8 +179,7 @@ def begin(
 
     `tell` is called with what is found and decided, `warn` with steps that failed and what `checks` find.
     Raises InputError for data that they refuse unless `force`, damaged checkpoints, and a folder that cannot
-    be written.
-    """
+    be written."""
     resumed = run.exists()
     views = with_region(views, run.region(), tell)
     state, found = run.load_checkpoint() if resumed else None, list[checks.Finding]()

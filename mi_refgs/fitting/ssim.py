@@ -3,8 +3,7 @@
 Letters: x, y the two images, μ = G x, q = G (x² + y²), p = G (x y) with G the Gaussian window;
     S = (2 μx μy + C1) (2 (p - μx μy) + C2) / ((μx² + μy² + C1) (q - μx² - μy² + C2))   [Wang 2004, (13)]
 G is symmetric and reads zeros outside the image, hence Gᵀ = G and the adjoint is three more blurs:
-    δx = G(∂S/∂μx) + 2x G(∂S/∂q) + y G(∂S/∂p).
-"""
+    δx = G(∂S/∂μx) + 2x G(∂S/∂q) + y G(∂S/∂p)."""
 
 import functools
 import math

@@ -6,8 +6,7 @@ A checkpoint contains named arrays (`runs.checkpoint` reads, checks and writes t
     error_sum                              per surfel, with the prefix "surroundings/" for the background
     mesh/PART                              the occluder, if there is one
     photographed/PART                      the background as the object's light, if it was rendered
-    iteration  seconds  held_until  decisions  region  light_gradient
-"""
+    iteration  seconds  held_until  decisions  region  light_gradient"""
 
 import json
 import sys

@@ -1,8 +1,7 @@
 """The optimisation loop: stages of the method, one view per step, and events.
 
 A step is a pure function of the state and the iteration number (view order and random draws are derived from
-the seed and the iteration), so a resumed run repeats a straight one: bit for bit with one thread.
-"""
+the seed and the iteration), so a resumed run repeats a straight one: bit for bit with one thread."""
 
 import time
 from collections.abc import Callable, Iterator

@@ -2,7 +2,6 @@
 views: of the blended surfels, averaged over the views that see a point of the mesh. Points that no view sees
 get those of the surfels around the mesh's vertices."""
 
-import importlib.util
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,7 +14,7 @@ import trimesh
 from scipy import ndimage
 
 from mi_refgs.data.view import evenly_spread
-from mi_refgs.errors import InputError, SceneError, require_between
+from mi_refgs.errors import SceneError, require_between, require_package
 from mi_refgs.formats.format import Shot
 from mi_refgs.io.progress import warn
 from mi_refgs.kernels.device import upload
@@ -32,7 +31,6 @@ from mi_refgs.shade.reflectance import Reflectance
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Array, Float, Point2f, Point3f, UInt32, Vector3f
 
-PACKAGES = "fast_simplification", "xatlas"  # of the extra; trimesh calls the former
 SMOOTHING = 30  # steps of the filter that removes stairs of voxels and keeps the volume [Taubin 1995]
 PADDING = 4  # texels between charts, so that two mip levels, and bilinear lookup in them, see no other chart
 FLAT = 1e-6  # voxel of the texture's plane as a mesh: its rays have length 1 and need next to no offset
@@ -67,10 +65,8 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
     require_between(texture, "--texture", 16, 8192)
     memory = BASE + PER_TEXEL * texture**2 + PER_SHOWN_SURFEL * trained.count
     require(memory, f"--texture: {texture} × {texture} texels", "bake a smaller texture")
-    for package in PACKAGES:
-        if importlib.util.find_spec(package) is None:
-            remedy = 'pip install "mi_refgs[export]"'
-            raise InputError(f"{package} is not installed", "--to", remedy=remedy)
+    for package in ("fast_simplification", "xatlas"):  # trimesh calls the former
+        require_package(package, "export", "--to")
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
         remedy = (

@@ -1,7 +1,6 @@
 """Interface of the formats of other programs, their registry, and the function that writes them."""
 
 import importlib
-import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,11 +57,6 @@ class Format:
             return self.write
         module, _, name = self.write.partition(":")
         return cast(Any, getattr(importlib.import_module(f"mi_refgs.formats.{module}"), name))
-
-    @property
-    def description(self) -> str:
-        """The docstring of `write`, which the documentation shows."""
-        return inspect.getdoc(self.writer) or self.summary
 
 
 FORMATS: Registry[Format] = Registry("format", of=Format)  # every format by name

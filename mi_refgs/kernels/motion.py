@@ -1,8 +1,7 @@
 """Derivatives with respect to rigid motions of what a whole image depends on: cameras and environments.
 
 A motion is an array of zeros under AD: a rotation (3,), radians about world axes, and more numbers. Scale and
-shear of a matrix have no derivative.
-"""
+shear of a matrix have no derivative."""
 
 from typing import Any
 

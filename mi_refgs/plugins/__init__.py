@@ -1,8 +1,7 @@
 """The Mitsuba plugins, and how they follow Mitsuba from variant to variant.
 
 Each variant has base classes of its own, so a plugin's module is imported or reloaded whenever it changes, by
-`load` (and Mitsuba 3.10's entry point). Never import it before a variant is set, nor classes from it.
-"""
+`load` (and Mitsuba 3.10's entry point). Never import it before a variant is set, nor classes from it."""
 
 import contextlib
 import ctypes

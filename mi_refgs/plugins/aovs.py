@@ -42,8 +42,7 @@ def aov_values(kind: str, frame: Frame, camera: Camera) -> list[Float]:
     Materials, the unit normal and the visibility are means of what is seen, 0 where nothing is. Depth is the
     distance along the ray from the near plane, as Mitsuba's `depth` is. The three terms are premultiplied by
     alpha and sum to the image of the object over black. A supersampled frame was averaged premultiplied and
-    divided by its mean alpha; `camera` is that of its pixels, not of the samples.
-    """
+    divided by its mean alpha; `camera` is that of its pixels, not of the samples."""
     return _finished(kind, *_weighted(kind, frame, camera))
 
 

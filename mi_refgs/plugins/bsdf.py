@@ -76,8 +76,7 @@ class RefGSBSDF(mi.BSDF):
     specular reflection, 1 the diffuse one. Load maps of metallic and roughness with ``raw = true``.
 
     `eval`, and the weight that `sample` returns, have derivatives with respect to the parameters and the
-    directions; samples, of the visible normals [Heitz 2018] or the cosine, and densities have none.
-    """
+    directions; samples, of the visible normals [Heitz 2018] or the cosine, and densities have none."""
 
     def __init__(self, props: Any) -> None:
         require_supported_variant("refgs_bsdf")
@@ -91,8 +90,6 @@ class RefGSBSDF(mi.BSDF):
     def traverse(self, cb: Any) -> None:
         for name, texture in self.textures.items():
             cb.put(name, texture, mi.ParamFlags.Differentiable)
-
-    # ---------------- the BSDF interface ----------------
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
         wi, active = _front(si.wi, active)

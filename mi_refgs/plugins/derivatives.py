@@ -6,8 +6,7 @@ derivative is 0 only by parameters that the shading does not use, and by those o
 
 No derivative, on purpose: scale and shear of `to_world`; a background colour; the mesh, and the visibility
 and radiance that rays find with it; the side to which a normal is turned; what `splat.composite` lists (sort
-order, tile lists, cuts, clamps).
-"""
+order, tile lists, cuts, clamps)."""
 
 from typing import Any
 

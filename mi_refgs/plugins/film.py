@@ -72,8 +72,6 @@ class FilmImage:
         joined = self._joined(DERIVATIVE_SAMPLES, lambda *of: forward(self._values(*of)))
         return self._through_film(dr.ADMode.Forward, joined)
 
-    # ---------------- passes ----------------
-
     @property
     def _size(self) -> tuple[int, int]:
         width, height = (int(x) for x in self.film.crop_size())
@@ -131,8 +129,6 @@ class FilmImage:
         made = [*rgb, *([coverage] if self._alpha else []), mi.Float(1), *more]
         pixels = dr.zeros(mi.Float, camera.width * camera.height)
         return dr.ravel(mi.ArrayXf([band.kept(channel + pixels) for channel in made]))
-
-    # ---------------- the film ----------------
 
     def _developed(self, values: Any) -> Any:
         height, width = self._size

@@ -87,8 +87,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     parameter with gradients raises InputError.
 
     A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 covers no
-    pixel and gets zero gradient; such a value of the light is black. One warning names the attribute.
-    """
+    pixel and gets zero gradient; such a value of the light is black. One warning names the attribute."""
 
     def __init__(self, props: Any) -> None:
         require_supported_variant("refgs")
@@ -142,8 +141,6 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         around = nothing_around(self.surfels) if self.around is None else self.around
         return Surroundings(Surfels(around.raw, screened=True), self._maps.get("background"))
 
-    # ---------------- parameters ----------------
-
     def traverse(self, cb: Any) -> None:
         own: dict[str, Any] = dict(self.surfels.raw)
         if self.light is not None:
@@ -166,8 +163,6 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def aov_names(self) -> list[str]:
         return [f"{name}.{suffix}" for name, kind in self.aovs.items() for suffix in suffixes()[kind]]
-
-    # ---------------- rendering ----------------
 
     def render(
         self,

@@ -19,7 +19,7 @@ from mi_refgs.data.view import View
 from mi_refgs.editing.change import apply, edit
 from mi_refgs.editing.options import EditOptions, Selection
 from mi_refgs.editing.selection import select
-from mi_refgs.errors import InputError, counted, require_between
+from mi_refgs.errors import InputError, counted, require_between, within
 from mi_refgs.evaluation import evaluate as evaluation
 from mi_refgs.formats.orbits import turntable_cameras
 from mi_refgs.formats.splat_import import method_of, read_splats
@@ -297,8 +297,6 @@ def import_splats(
     require_supported_variant("mi_refgs.import_splats")
     trained = read_splats(Path(path), linear, None if light is None else any_light(light, False, 0.0, 0.0))
     if box is not None:
-        try:
+        with within(path):
             trained = apply(trained, ~select(trained, Selection(box=box)), cut=True)
-        except InputError as error:
-            raise error.at(path) from None
     return Reconstruction(trained, Provenance(method_of(trained, Path(path).stem)))

@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from mi_refgs.data.dataset import BACKGROUNDS, Dataset, read_dataset
 from mi_refgs.data.view import evenly_spread
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, within
 from mi_refgs.evaluation import metrics
 from mi_refgs.evaluation.images import Maps, contact_sheet, displayed_over, encoded_over_black, light_image
 from mi_refgs.evaluation.scores import caption
@@ -73,10 +73,8 @@ def relight(
                 raise
             no_truth = f"its own images are no linear radiance ({error})"
     cameras = fitted.turntable(turntable) if turntable else fitted.cameras()
-    try:
+    with within(run.path):
         relit = fitted.relight(light)
-    except InputError as error:
-        raise error.at(run.path) from None
     name = light.path.stem if true_views is None else light.path.parent.name
     name += f"_r{light.rotate:g}" if light.rotate % 360 else ""
     name += f"_e{light.exposure:+g}" if light.exposure else ""

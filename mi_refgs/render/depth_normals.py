@@ -1,7 +1,6 @@
 """Normals of the surface that a depth map describes.
 
-Letters: z expected camera depth, A accumulated alpha, X(i, j) the point that pixel (i, j) sees at depth z.
-"""
+Letters: z expected camera depth, A accumulated alpha, X(i, j) the point that pixel (i, j) sees at depth z."""
 
 import drjit as dr
 import mitsuba as mi
@@ -19,8 +18,7 @@ def normals_from_depth(depth: Float, alpha: Float, camera: Camera) -> tuple[Vect
 
     depth: (H·W) camera depth z, raster order, scene units; alpha: (H·W), for validity only. Unit normals, or
     zero where invalid: at the image border, where a pixel or a neighbour has A < 1/255, and points in a line.
-    Gradients flow to depth. Source: 2DGS, Huang et al. 2024, eq. 15.
-    """
+    Gradients flow to depth. Source: 2DGS, Huang et al. 2024, eq. 15."""
     width, height = camera.width, camera.height
     steps = ((-1, 0), (1, 0), (0, -1), (0, 1))
     pixel = camera.pixel_centres()

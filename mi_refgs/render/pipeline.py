@@ -92,8 +92,7 @@ class Frame:
         terms      object                      times object_alpha       0
         maps       object                      divided by object_alpha  0
 
-    Without derivatives, AOVs that were not requested are None or absent.
-    """
+    Without derivatives, AOVs that were not requested are None or absent."""
 
     alpha: Float  # accumulated opacity
     depth: Float  # expected camera-z depth

@@ -14,7 +14,6 @@ from mi_refgs.methods.method import APART, AROUND, BACKGROUND, LIGHT, LIGHT_ROTA
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.kind import FittedLight, LightKind
-from mi_refgs.shade.light.near_field import NearField
 from mi_refgs.shade.light.placed import PlacedLight
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.table import Surfels
@@ -42,12 +41,6 @@ def surroundings_of(params: Mapping[str, Any]) -> Surroundings | None:
         return None
     behind = EnvironmentLight(params[BACKGROUND]) if BACKGROUND in params else None
     return Surroundings(Surfels(channels), behind)
-
-
-def near_field_of(state: Mapping[str, np.ndarray]) -> NearField | None:
-    """Distances of what the environment map shows, if it was compared with photographs."""
-    arrays = part(state, PHOTOGRAPHED)
-    return NearField(arrays["centre"], arrays["nearness"]) if arrays else None
 
 
 PARAMS, OPTIMISER, MESH, PHOTOGRAPHED = "params/", "optimiser/", "mesh/", "photographed/"

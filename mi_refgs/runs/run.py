@@ -2,8 +2,7 @@
 
 config.toml  dataset.json  checks.json  metrics.jsonl  checkpoints/  previews/  written during the fit
 surfels.ply  envmap.exr  mesh.ply  scene.xml  model.json                        by `runs.export`
-metrics.json  contact_sheet.png  eval/                                          by `evaluation`
-"""
+metrics.json  contact_sheet.png  eval/                                          by `evaluation`"""
 
 import json
 import math

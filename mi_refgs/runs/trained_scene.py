@@ -20,7 +20,15 @@ from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.checkpoint import PARAMS, channels_of, light_of, near_field_of, surroundings_of, tensors
+from mi_refgs.runs.checkpoint import (
+    PARAMS,
+    PHOTOGRAPHED,
+    channels_of,
+    light_of,
+    part,
+    surroundings_of,
+    tensors,
+)
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.near_field import NearField
@@ -58,7 +66,7 @@ class TrainedScene:
         if len(state.get("mesh/faces", ())):
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
         _, stage = method.stage_at(max(iteration, 1))
-        light = light_of(method.light, params)
+        light, near = light_of(method.light, params), part(state, PHOTOGRAPHED)
         return TrainedScene(
             Surfels(channels_of(params)),
             None if light is None else light.environment(),
@@ -67,7 +75,7 @@ class TrainedScene:
             iteration,
             float(state["seconds"]),
             surroundings=surroundings_of(params),
-            near=near_field_of(state),
+            near=NearField(near["centre"], near["nearness"]) if near else None,
             turntable=params.get(TURNTABLE),
         )
 

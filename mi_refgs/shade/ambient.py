@@ -7,8 +7,7 @@ per vertex of the occluding mesh give the ratio to it per colour,
 
 L being the light, in a lobe as wide as the part of the hemisphere per ray, and B the radiance of the mesh
 where it blocks the ray, shaded with the ratios of the previous round, 1 in the first. The diffuse term is
-albedo × irradiance × ratio; ratios are detached.
-"""
+albedo × irradiance × ratio; ratios are detached."""
 
 from typing import Any
 

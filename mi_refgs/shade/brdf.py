@@ -1,8 +1,7 @@
 """The split-sum table: reflectance F0·A + B of a GGX surface under constant light, over (N·V, roughness).
 
 α = roughness², height-correlated Smith shadowing, Schlick's Fresnel. [Karis 2013, "Real Shading in Unreal
-Engine 4"; Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]
-"""
+Engine 4"; Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99]"""
 
 import functools
 import os

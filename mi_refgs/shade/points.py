@@ -19,8 +19,7 @@ class ShadingPoints:
     `normal` and `view`, towards the camera (mi.Vector3f), are in the world frame and of any length. Further
     attributes are read as `points.roughness` (InputError without it), or by `get`. For every model,
     `visibility` (mi.Float, 0 … 1) is that of the light in the reflected direction, `indirect` (mi.Color3f)
-    the radiance from there where it is blocked, and `position` (mi.Point3f) where rays start in the world.
-    """
+    the radiance from there where it is blocked, and `position` (mi.Point3f) where rays start in the world."""
 
     normal: Any
     view: Any

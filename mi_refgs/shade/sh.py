@@ -1,8 +1,7 @@
 """Real spherical harmonics up to degree 3 in the sign convention of the 3DGS family.
 
 Y_00 = ½√(1/π) and, in degree 1, (-y, +z, -x)·½√(3/π): the Condon-Shortley phase (-1)^m is kept, so that files
-of other programs hold the same coefficients. [Ramamoorthi and Hanrahan 2001; Sloan 2013]
-"""
+of other programs hold the same coefficients. [Ramamoorthi and Hanrahan 2001; Sloan 2013]"""
 
 import math
 from collections.abc import Sequence

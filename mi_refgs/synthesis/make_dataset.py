@@ -1,8 +1,7 @@
 """Path tracing of a multi-view data set of a Mitsuba scene: the files that docs/formats.md lists.
 
 Of an object among other shapes, images are RGB without alpha, and maps and surface are those of the object.
-The transforms are written last. dataset.json has the settings, which decide whether a folder is continued.
-"""
+The transforms are written last. dataset.json has the settings, which decide whether a folder is continued."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -13,7 +12,7 @@ import numpy as np
 
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, pinhole
 from mi_refgs.data.region import Region, write_region
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, within
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
@@ -96,12 +95,10 @@ def around_object(
         remedy = f"give one of {', '.join(sorted(named)) or 'none'}"
         raise InputError(f"no shape has the id '{name}'", scene, "--object", remedy)
     about = [named[name] for name in dict.fromkeys(given.objects)]
-    try:
+    with within(scene):
         shapes, around = (about, []) if about else object_of(loaded.shapes(), given)
         centre, radius = bounding_sphere(shapes)
         farthest = reach(loaded.shapes(), centre)
-    except InputError as error:
-        raise error.at(file=scene) from error
     if tell and not about and len(shapes) < len(loaded.shapes()):
         what = f"the object is {_names(shapes)}; around it: {_names(around)}; lamps do not count"
         say(f"{scene.name}: {what}; `--object ID …` decides")

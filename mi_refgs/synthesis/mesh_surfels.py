@@ -22,8 +22,7 @@ def surfels_from_mesh(mesh: Any, count: int, *, seed: int = 0, **options: Any) -
     where their BSDFs and textures define them, are taken; or anything with `vertices` (V, 3) and `faces` (F,
     3), world, such as a `Mesh` or a trimesh. options: of `from_points`, such as attributes, opacity (default:
     0.99), or values in place of the BSDF's. Raises InputError for a shape that cannot be tessellated, a
-    surface without area, and as `from_points` does.
-    """
+    surface without area, and as `from_points` does."""
     rng = np.random.default_rng(seed)
     materials: dict[str, np.ndarray] = {}
     if hasattr(mesh, "faces") and hasattr(mesh, "vertices"):

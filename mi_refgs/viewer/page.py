@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, require_package
 from mi_refgs.formats.orbits import FIELD_OF_VIEW, shots_around
 from mi_refgs.viewer.loop import Client, RenderLoop
 from mi_refgs.viewer.pose import Pose, up_of
@@ -23,15 +23,6 @@ from mi_refgs.viewer.reconstruction_view import ReconstructionView
 from mi_refgs.viewer.resolution import COARSE, COARSEST, DONE
 
 STATUS_INTERVAL = 0.5  # seconds between updates of the status line
-
-
-def require_viser() -> Any:
-    """Import viser; raises InputError if it is not installed."""
-    try:
-        import viser
-    except ImportError:
-        raise InputError("viser is not installed", "view", remedy='pip install "mi_refgs[view]"') from None
-    return viser
 
 
 def require_free(host: str, port: int) -> None:
@@ -59,7 +50,7 @@ class Page:
         views_folder: Path,
     ) -> None:
         """Listen; raises InputError if the port is taken or viser is not installed."""
-        viser = require_viser()
+        viser = require_package("viser", "view", "view")
         from mi_refgs.viewer.guard import guarded  # needs what viser installs
 
         host, port = address
@@ -102,12 +93,8 @@ class Page:
             client.camera.fov = pose.fov
         client.flush()
 
-    def listen(self) -> None:
-        """Accept pages."""
-        self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self._left)
-
-    async def _connected(self, client: Any) -> None:
+    async def connected(self, client: Any) -> None:
+        """Display the scene on a page that has been opened."""
         new = Client(partial(self._deliver, client), side=self.moving_side)
         self.loop.clients[client.client_id] = new
         near = self.views[0].near if self.views else 0.0
@@ -118,9 +105,6 @@ class Page:
 
         client.camera.on_update(moved)
         await moved(client.camera)
-
-    async def _left(self, client: Any) -> None:
-        self.loop.clients.pop(client.client_id, None)
 
     def _deliver(self, client: Any, image: np.ndarray, progress: int, seconds: float) -> None:
         form, quality = "png" if progress == DONE else "jpeg", 70 if progress == COARSE else 92

@@ -35,7 +35,8 @@ def serve(run: Run, address: tuple[str, int], output: Path | None, data: Path | 
     if some is not None and some.region is not None:
         RegionPanel(page, some, some.region)
     add_saving(page, scene)
-    page.listen()
+    page.server.on_client_connect(page.connected)
+    page.server.on_client_disconnect(lambda client: page.loop.clients.pop(client.client_id, None))
     return page
 
 

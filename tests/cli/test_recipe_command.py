@@ -21,8 +21,7 @@ class Count:
     """Blank lines do not count.
 
     example:
-      refgs count notes.txt -o count.txt
-    """
+      refgs count notes.txt -o count.txt"""
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]  # text file
     output: Output  # file of the number

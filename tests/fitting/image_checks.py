@@ -67,8 +67,7 @@ def check(
     """Value, reverse-mode gradient and one forward-mode directional derivative of a loss of an image.
 
     share: of the entries that are compared one by one (slow definitions); the image's rim is always among
-    them. tolerance: relative L2.
-    """
+    them. tolerance: relative L2."""
     image = image.astype(np.float32).astype(np.float64)
     leaves = planes(image)
     dr.enable_grad(leaves)

@@ -129,8 +129,7 @@ def test_step_that_is_not_finite_changes_nothing_and_is_reported(bad: float, whe
 def test_one_huge_gradient_slows_its_entry_but_does_not_stop_it(huge: float, at: int) -> None:
     """From 100 steps after it, the entry moves a tenth as far as its neighbours; with a history, a quarter.
 
-    With plain Adam it would not move by a thousandth in a thousand steps.
-    """
+    With plain Adam it would not move by a thousandth in a thousand steps."""
     rng, rate, after = np.random.default_rng(1), 1e-3, 300
     params, optimiser = adam(np.zeros((300, 1)), LearningRate(rate))
     positions = {}

@@ -1,7 +1,6 @@
 """The gradient of a sum of losses is the sum of their gradients, for every order and parameter.
 
-Losses of the parameters read them as priors do: their adjoints write to the same leaves as the image's.
-"""
+Losses of the parameters read them as priors do: their adjoints write to the same leaves as the image's."""
 
 from collections.abc import Callable
 from functools import cached_property

@@ -1,7 +1,6 @@
 """Every reflectance model by every command: the result is the model's own, or one sentence refuses.
 
-The model of a plugin is fitted. Its run is then used without the loss, event and initialiser of the fit.
-"""
+The model of a plugin is fitted. Its run is then used without the loss, event and initialiser of the fit."""
 
 import contextlib
 import io

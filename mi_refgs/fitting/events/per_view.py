@@ -3,8 +3,7 @@
 Exposure gains are those that the photographs tell (`data.exposure.told_gains`), from the first step on, else
 fitted to renders. What no image needs stays near 1: fitted gains within DEAD_ZONE of it count as 1, they
 learn slowly, and the loss has a prior on them. Corrections of cameras begin at 0, and
-learn slowly, since true cameras hardly move (`schedule.LEARNT_BESIDE`).
-"""
+learn slowly, since true cameras hardly move (`schedule.LEARNT_BESIDE`)."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar

@@ -1,7 +1,6 @@
 """Normal propagation: surfels become opaque, and reflective ones grow over their neighbours.
 
-Reflections then follow normals that explain them. [3DGS-DR, Ye et al. 2024, §3.3; Ref-Gaussian §3.4]
-"""
+Reflections then follow normals that explain them. [3DGS-DR, Ye et al. 2024, §3.3; Ref-Gaussian §3.4]"""
 
 from dataclasses import dataclass, field
 from typing import ClassVar

@@ -4,8 +4,7 @@ Directions follow Mitsuba's `envmap`: up is +y, φ = atan2(x, -z) runs along a r
 column centres at half-integers, the first and the last row at the poles (`lobe_matrices`).
 
 Radiance is softplus(raw): positive without an upper bound, and with a slope of at most 1, so that an
-optimiser's step bounds the change of radiance.
-"""
+optimiser's step bounds the change of radiance."""
 
 import os
 from collections.abc import Callable

@@ -5,8 +5,7 @@ with rotations about the pole: it acts on each azimuthal frequency m separately,
 rows to output rows. Where a lobe is wide, all but the lowest frequencies vanish and cost nothing.
 
 Rows are at θ = πi/(h-1) from +y (first and last row are the poles), columns at φ = 2π(j+½)/w with
-φ = atan2(x, -z), as in Mitsuba's `envmap`. Radiance between texels is bilinear, as Mitsuba looks it up.
-"""
+φ = atan2(x, -z), as in Mitsuba's `envmap`. Radiance between texels is bilinear, as Mitsuba looks it up."""
 
 import numpy as np
 from scipy.sparse import csr_matrix

@@ -4,8 +4,7 @@
 
 `analyse` and `synthesise` are each other's transpose. All of it runs on the host, since a light is small, but
 for a GPU, which would wait for it: `prefilter_kernels`. The levels are one flat buffer, TEXEL floats per
-texel: RGBA, A unused; the map itself comes first.
-"""
+texel: RGBA, A unused; the map itself comes first."""
 
 import functools
 from dataclasses import dataclass

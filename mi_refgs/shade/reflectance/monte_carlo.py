@@ -31,8 +31,7 @@ class MonteCarlo(Reflectance):
     b = 0.03 + 0.77 albedo, roughness = 0.09 + 0.9 of the attribute. The directions are those of a Fibonacci
     hemisphere about the normal, J = `options.directions`; normal and position are detached. V is 0 where
     the mesh blocks the ray, if `options.occlusion`. The light of other surfaces, `indirect_sh`,
-    counts where the surfels have it.
-    """
+    counts where the surfels have it."""
 
     name = "monte_carlo"
     shaded_at = ("surfel",)

@@ -3,8 +3,7 @@
 Points have albedo (mi.Color3f, 0 … 1: diffuse reflectance, or F0 of a metal), metallic (mi.Float, 0 … 1) and
 roughness (mi.Float, 0 … 1, α = roughness²); for diffuse="sh" also radiance (mi.Color3f), as fitted.
 
-[Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]
-"""
+[Reflective Gaussian Splatting, §3.2-3.3; split sum: Karis 2013]"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -52,8 +51,7 @@ def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> Radia
     `shade.ambient`). A point seen from behind keeps its mirror direction, with the reflectance at grazing
     incidence. Under a constant light of 1 no more than 1 leaves with "irradiance".
 
-    Finite for every finite input. Raises InputError for "sh" without a radiance.
-    """
+    Finite for every finite input. Raises InputError for "sh" without a radiance."""
     # Directional reflectance, and the light in the specular lobe.
     normal, view = safe_normalize(points.normal), safe_normalize(points.view)
     f0 = base_reflectance(points)
