@@ -70,9 +70,8 @@ def find_library(folders: Iterable[Path] | None = None) -> Path | None:
         prefixes = [Path(p) for p in (os.environ.get("CONDA_PREFIX"), sys.prefix) if p]
         folders = [*(folder for pattern in FOLDERS for folder in Path("/").glob(pattern))]
         folders += [prefix / "lib" for prefix in prefixes]
-    found = [
-        path for folder in folders for end in ("so*", "dylib") for path in folder.glob(f"libLLVM*.{end}")
-    ]
+    names = "libLLVM*.so*", "libLLVM*.dylib"
+    found = [path for folder in folders for name in names for path in folder.glob(name)]
     versions = {Path(os.path.realpath(path)): named_version(path) for path in found}
     candidates = {path: version for path, version in versions.items() if version and _usable(version)}
     newest_first = sorted(candidates, key=lambda path: candidates[path], reverse=True)

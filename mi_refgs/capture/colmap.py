@@ -26,7 +26,7 @@ WORDS, WORD_SAMPLES, WORD_ROUNDS = 64, 400, 12  # words, features per image to f
 
 Reconstruction = Any  # pycolmap.Reconstruction
 Result = TypeVar("Result")
-Item = TypeVar("Item")
+T = TypeVar("T")
 
 
 def load() -> Any:
@@ -62,9 +62,7 @@ def _run(call: Callable[[Any], Result]) -> Result:
         return future.result()
 
 
-def _in_parts(
-    items: Sequence[Item], size: int, what: str, work: Callable[[Sequence[Item], Any], None]
-) -> None:
+def _in_parts(items: Sequence[T], size: int, what: str, work: Callable[[Sequence[T], Any], None]) -> None:
     """Call `work(items, token)` for `size` items at a time; nothing else may open the database meanwhile."""
     with progress_bar(len(items), what) as shown:
         for start in range(0, len(items), size):
@@ -147,11 +145,9 @@ def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[
         def one_more() -> None:
             shown.update(next(placed) <= count)
 
-        arguments = (database, folder, output, options)
+        given = (database, folder, output, options)
         calls = {"initial_image_pair_callback": one_more, "next_image_callback": one_more}
-        models = _run(
-            lambda token: pycolmap.incremental_mapping(*arguments, **calls, cancellation_token=token)
-        )
+        models = _run(lambda token: pycolmap.incremental_mapping(*given, **calls, cancellation_token=token))
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 

@@ -29,7 +29,6 @@ class Capture:
     common: Common = Common()
 
     def run(self) -> Result:
-        """Estimate the cameras."""
         from mi_refgs.capture.photographs import folder_of
         from mi_refgs.capture.pipeline import capture, report_text
         from mi_refgs.data.region import Region

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import os
 import sys
 import time
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from mi_refgs.cli.command import (
     separated,
 )
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, require_between
 from mi_refgs.io.progress import say
 
 if TYPE_CHECKING:
@@ -49,13 +50,15 @@ class Compare:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Run the missing jobs, then tabulate all runs in the folder."""
         from mi_refgs.compare import execute, jobs
         from mi_refgs.compare.table import TABLE, TABLE_TEXT, markdown, write
 
         if self.data:
             workers = 1 if self.workers is None else self.workers
-            planned = self._plan(workers, execute.threads_each(workers, self.common.threads))
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            require_between(workers, "--workers", 1, 4 * cores)
+            share = None if workers == 1 else max(cores // workers, 1)
+            planned = self._plan(workers, self.common.threads or share)
             wanted = [job for job in planned if not jobs.finished(job)]
             say(f"{self.output}: {len(wanted)} of {len(planned)} jobs to do, {workers} at once")
             begin, numbers = time.perf_counter(), itertools.count(1)

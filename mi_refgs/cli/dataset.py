@@ -30,7 +30,6 @@ class Dataset:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Trace the views."""
         from mi_refgs.synthesis.make_dataset import make_dataset
 
         size = [int(part) if part.isdecimal() else 0 for part in self.size.lower().split("x")]

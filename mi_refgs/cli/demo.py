@@ -26,7 +26,6 @@ class Demo:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Trace, fit and evaluate; finished steps are not repeated."""
         from mi_refgs.evaluation.evaluate import SHEET, read_metrics
         from mi_refgs.reconstruction.fit import fit
         from mi_refgs.runs.run import Run
@@ -34,20 +33,18 @@ class Demo:
 
         # Refuse a folder with a foreign or unreadable run before the data set is traced.
         data, output = self.output / "data", self.output / (self.preset or "quick")
-        folder = Run(output)
-        if folder.exists():
-            folder.method()
+        run = Run(output)
+        if run.exists():
+            run.method()
         else:
-            folder.require_none()
+            run.require_none()
         say(f"1 of 3: tracing {VIEWS + TEST_VIEWS} views of {SCENE} into {data}")
         images: dict[str, Any] = {"views": VIEWS, "test_views": TEST_VIEWS, "size": SIZE, "spp": SAMPLES}
         make_dataset(resource_dir("scenes") / SCENE, data, environment_height=64, **images)
         say(f"2 of 3: fitting into {output}")
-        found = fit(
-            data, preset=self.preset, settings=joined(self.set), output=output, resume=folder.exists()
-        )
+        found = fit(data, preset=self.preset, settings=joined(self.set), output=output, resume=run.exists())
         say("3 of 3: evaluating")
-        result, sheet = read_metrics(folder), output / SHEET
+        result, sheet = read_metrics(run), output / SHEET
         if result is None or result.get("iterations") != found.trained.iteration or not sheet.is_file():
             result = found.evaluate(progress=True)
         then = command_line("view", output) + plugin_options()

@@ -94,7 +94,6 @@ class Doctor:
     common: Common = Common()
 
     def run(self) -> Result:
-        """Examine the data set or the installation."""
         if self.data is not None:
             from mi_refgs.data import checks, survey
 

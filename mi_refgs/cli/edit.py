@@ -23,7 +23,6 @@ class Edit:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Edit the run."""
         from mi_refgs.editing.change import assignments
         from mi_refgs.editing.selection import parse_condition
         from mi_refgs.io.ownership import require_own

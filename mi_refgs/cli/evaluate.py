@@ -20,7 +20,6 @@ class Eval:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Evaluate the run."""
         from mi_refgs.evaluation.evaluate import SHEET, evaluate
         from mi_refgs.runs.run import Run
 

@@ -23,7 +23,6 @@ class Export:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Export the run."""
         from mi_refgs.formats import write
         from mi_refgs.io.ownership import own_folder
         from mi_refgs.reconstruction.provenance import Provenance

@@ -42,7 +42,6 @@ class Import:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Import the file."""
         given = {"--for": self.purpose, "--preset": self.preset}
         for option in (name for name, value in given.items() if value and not self.relightable):
             raise InputError("only a relightable import is fitted", option, remedy="add --relightable")

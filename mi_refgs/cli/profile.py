@@ -22,7 +22,6 @@ class Profile:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Measure."""
         from mi_refgs.evaluation.profile import phases_of, stepper
         from mi_refgs.fitting.train import Trainer
         from mi_refgs.runs.run import Run

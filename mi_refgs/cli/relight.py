@@ -33,7 +33,6 @@ class Relight:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Relight the run."""
         from mi_refgs.reconstruction.new_light import NewLight
         from mi_refgs.reconstruction.relight import relight
         from mi_refgs.runs.run import Run

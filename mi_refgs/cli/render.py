@@ -31,7 +31,6 @@ class Render:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Render the image."""
         from mi_refgs.data.dataset import require_no_data
         from mi_refgs.formats.cameras import read_cameras
         from mi_refgs.io.ownership import require_no_run

@@ -46,7 +46,6 @@ class Train:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Fit, from the start or from the newest checkpoint."""
         from mi_refgs.reconstruction.fit import ProgressBar, fit
 
         progress = ProgressBar()

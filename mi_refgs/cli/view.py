@@ -26,7 +26,6 @@ class View:
     common: Rendering = Rendering()
 
     def run(self) -> Result:
-        """Serve the page until it is interrupted."""
         from mi_refgs.runs.run import Run
         from mi_refgs.viewer.serve import serve
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.compare.worker import DONE, FAILURE, GRACE
-from mi_refgs.errors import InputError, require_between, require_package
+from mi_refgs.errors import InputError, require_package
 from mi_refgs.io.files import cannot_write, read_json
 from mi_refgs.runs.interrupt import held_interrupts
 
@@ -118,10 +118,3 @@ def _process(job: Job, stop: threading.Event | None) -> int:
         except subprocess.TimeoutExpired:
             process.kill()
             return process.wait()
-
-
-def threads_each(workers: int, threads: int | None) -> int | None:
-    """Return the threads per process: `threads`, or an equal share of the cores."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    require_between(workers, "--workers", 1, 4 * cores)
-    return threads if threads is not None or workers == 1 else max(cores // workers, 1)

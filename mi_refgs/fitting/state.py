@@ -152,9 +152,7 @@ class FitState:
         limits = {"": method.surfels.most}
         if setup.open_scene and method.surroundings is not None:
             limits[""], limits[AROUND] = method.surroundings.limits(limits[""])
-        tables = [
-            ParameterTable(params, optimiser, prefix, most, occluder) for prefix, most in limits.items()
-        ]
+        tables = [ParameterTable(params, optimiser, name, most, occluder) for name, most in limits.items()]
         return FitState(params, optimiser, tables, occluder, light_kind=method.light)
 
     def add(self, setup: FitSetup, name: str, tensor: TensorXf) -> None:

@@ -69,9 +69,7 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
         require_package(package, "export", "--to")
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
-        remedy = (
-            "fit one with occlusion, as `--for relighting` does; if it was, longer: no mesh was extracted"
-        )
+        remedy = "fit one with occlusion, as `--for relighting` does, or longer: no mesh was extracted"
         raise SceneError("the run has none", "mesh", remedy=remedy)
     model = scene.shading.model
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:

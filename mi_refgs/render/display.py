@@ -21,9 +21,7 @@ def srgb_from_linear(linear: Float) -> Float:
     return dr.select(straight, 12.92 * linear, curve)
 
 
-def display_image(
-    radiance: Iterable[Float], alpha: Float, background: Iterable[Float | float]
-) -> list[Float]:
+def display_image(radiance: Iterable[Float], alpha: Float, background: Iterable[Float]) -> list[Float]:
     """Composite as 8-bit RGBA: A srgb(L / A) + (1 - A) background per plane, L linear, premultiplied,
     `background` encoded; where A < 1e-6 the background alone."""
     seen = alpha >= ALPHA_EMPTY

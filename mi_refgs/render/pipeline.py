@@ -132,11 +132,9 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     return boundary(frame, "shade backward")
 
 
-def render_depth(
-    surfels: Surfels, camera: Camera, surroundings: Surfels | None = None
-) -> tuple[Float, Float]:
-    """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with their surroundings."""
-    blended = splat(surfels if surroundings is None else (surfels, surroundings), [], camera)
+def render_depth(surfels: Surfels, camera: Camera, around: Surfels | None = None) -> tuple[Float, Float]:
+    """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with those around them."""
+    blended = splat(surfels if around is None else (surfels, around), [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 
 

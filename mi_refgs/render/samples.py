@@ -23,17 +23,15 @@ def samples_per_axis(samples: int) -> int:
     return math.ceil(math.sqrt(samples))
 
 
-def supersampled(
-    view: Callable[[Camera], Frame], camera: Camera, samples: int, details: bool = True
-) -> Frame:
+def supersampled(view: Callable[[Camera], Frame], camera: Camera, samples: int, maps: bool = True) -> Frame:
     """Render a frame with k × k box-filtered samples per pixel (`samples_per_axis`), under AD; without
-    `details` neither terms nor maps. Compositing it equals the mean of composited samples."""
+    `maps` neither these nor terms. Compositing it equals the mean of composited samples."""
     factor = samples_per_axis(samples)
     fine_camera = camera.supersampled(factor)
     fine = view(fine_camera)
     if factor == 1:
         return fine
-    if not details:
+    if not maps:
         fine = replace(fine, terms=None, maps={})
 
     def mean(value: Arrays) -> Arrays:
@@ -52,7 +50,7 @@ def supersampled(
         return dr.select(through <= COVERAGE_FLOOR, mean(background), weighted)
 
     distance = None
-    if details and fine.depth is not None:
+    if maps and fine.depth is not None:
         distance = by_alpha(ray_distance(fine.depth, fine_camera))
     return replace(
         fine,

@@ -82,9 +82,7 @@ class Run:
         if not self.exists():
             remedy = "give the folder that `refgs train -o` wrote"
             if (self.path / RELIT).is_file():
-                remedy = (
-                    "it is a relit scene: give its run; in Python, load(RUN).relight(…).export(…) exports one"
-                )
+                remedy = "it is a relit scene: give its run; in Python, load(RUN).relight(…) exports one"
             raise InputError("missing", self.path, CONFIG, remedy)
         return load_resolved(self.path / CONFIG)
 

@@ -146,7 +146,7 @@ class TrainedScene:
         scene = SurfelScene(self.surfels, self.shading, *given)
         asked = aovs if not isinstance(aovs, bool) else scene.all_aovs if aovs else ()
         once = partial(render, scene, request=Request(asked, forward_only=True))
-        averaged = partial(supersampled, once, samples=samples, details=bool(aovs))
+        averaged = partial(supersampled, once, samples=samples, maps=bool(aovs))
 
         def draw(camera: Camera) -> Frame:
             with dr.suspend_grad():

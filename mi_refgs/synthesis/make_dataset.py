@@ -118,9 +118,7 @@ def _names(shapes: Sequence[Any]) -> str:
     return ", ".join(sorted({shape.id() or shape.class_name() for shape in shapes})) or "nothing"
 
 
-def write_views(
-    out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str, str], progress: bool
-) -> None:
+def write_views(out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str, str], tell: bool) -> None:
     """Write the environment map, the views with `maps`, and then the transforms of some splits."""
     cameras = tracer.cameras
     views = {s: [(f"{s}/r_{i:03d}", *job) for i, job in enumerate(cameras.of(s))] for s in splits}
@@ -131,7 +129,7 @@ def write_views(
     elif height and tracer.scene.environment() is not None and not light.exists():
         write_exr(light, environment_image(tracer.scene, height))
     jobs = [job for split in splits for job in views[split]]
-    for name, pose, seed in with_bar(jobs, f"dataset {out.name}", unit="view", disable=not progress):
+    for name, pose, seed in with_bar(jobs, f"dataset {out.name}", unit="view", disable=not tell):
         _trace_view(tracer, out / name, pose, seed, maps)
     intrinsics = pinhole(*cameras.options.resolution, cameras.options.focal)
     for split in splits:
