@@ -35,7 +35,7 @@ Samples = Annotated[int, arg(metavar="N", help=_SAMPLES_HELP)]
 Settings = Annotated[
     UseAppendAction[tuple[tuple[str, ...], ...]],
     optional("KEY=VALUE …", help="changes of the method, such as loss.ssim=0.1"),
-]
+]  # `sum(self.set, ())` joins the lists of a repeated option
 METHODS = ", ".join(sorted(path.stem for path in resource_dir("variants").glob("*.toml")))
 _METHOD_HELP = f"method (default: auto, what the scene needs of the full method): {METHODS}, or a file"
 MethodName = Annotated[str | None, optional("NAME|FILE.toml", help=_METHOD_HELP)]
@@ -46,11 +46,6 @@ Preset = Annotated[str | None, optional("{quick,standard,paper}|N:N", help=_PRES
 def separated(values: Iterable[str]) -> list[str]:
     """Split list items at commas."""
     return [part.strip() for value in values for part in value.split(",") if part.strip()]
-
-
-def joined(values: Iterable[tuple[str, ...]]) -> list[str]:
-    """Join the lists of a repeated option."""
-    return [text for some in values for text in some]
 
 
 @dataclass(frozen=True, kw_only=True)

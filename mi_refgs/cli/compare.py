@@ -11,17 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
-from mi_refgs.cli.command import (
-    METHODS,
-    Output,
-    Preset,
-    Rendering,
-    Result,
-    Settings,
-    joined,
-    optional,
-    separated,
-)
+from mi_refgs.cli.command import METHODS, Output, Preset, Rendering, Result, Settings, optional, separated
 from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, require_between
 from mi_refgs.io.progress import say
@@ -96,7 +86,7 @@ class Compare:
         except ValueError as error:
             what = f"{' '.join(self.seeds)}: not integers"
             raise InputError(what, "--seeds", remedy="write them as 0 1") from error
-        preset, settings = self.preset or DEFAULT_PRESET, tuple(joined(self.set))
+        preset, settings = self.preset or DEFAULT_PRESET, sum(self.set, ())
         plugins = tuple(str(file.absolute()) for file in self.common.plugin)
         shared = jobs.Shared(preset, settings, self.common.mitsuba_variant, threads, plugins)
         planned = jobs.plan(self.output, self.data, methods, seeds, shared)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from mi_refgs.cli.command import Output, Preset, Rendering, Result, Settings, joined
+from mi_refgs.cli.command import Output, Preset, Rendering, Result, Settings
 from mi_refgs.cli.evaluate import table
 from mi_refgs.io.files import resource_dir
 from mi_refgs.io.progress import command_line, say
@@ -42,7 +42,7 @@ class Demo:
         images: dict[str, Any] = {"views": VIEWS, "test_views": TEST_VIEWS, "size": SIZE, "spp": SAMPLES}
         make_dataset(resource_dir("scenes") / SCENE, data, environment_height=64, **images)
         say(f"2 of 3: fitting into {output}")
-        found = fit(data, preset=self.preset, settings=joined(self.set), output=output, resume=run.exists())
+        found = fit(data, preset=self.preset, settings=sum(self.set, ()), output=output, resume=run.exists())
         say("3 of 3: evaluating")
         result, sheet = read_metrics(run), output / SHEET
         if result is None or result.get("iterations") != found.trained.iteration or not sheet.is_file():

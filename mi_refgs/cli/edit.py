@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mi_refgs.cli.command import Output, Rendering, Result, RunFolder, joined
+from mi_refgs.cli.command import Output, Rendering, Result, RunFolder
 from mi_refgs.editing.options import Change, Selection
 from mi_refgs.errors import within
 from mi_refgs.io.progress import say
@@ -30,7 +30,7 @@ class Edit:
 
         require_own(self.output, "")
         options = vars(self.selection) | vars(self.change)
-        options["set"] = joined(options["set"])
+        options["set"] = sum(options["set"], ())
         # Both are checked before the run is read, which takes seconds.
         assignments(options["set"])
         if self.selection.where is not None:

@@ -7,17 +7,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mi_refgs.cli.command import (
-    Flag,
-    MethodName,
-    Output,
-    Preset,
-    Rendering,
-    Result,
-    Settings,
-    joined,
-    optional,
-)
+from mi_refgs.cli.command import Flag, MethodName, Output, Preset, Rendering, Result, Settings, optional
 from mi_refgs.io.progress import command_line
 from mi_refgs.registry import plugin_options
 
@@ -52,7 +42,7 @@ class Train:
         begin = time.monotonic()
         names = "preset", "output", "resume", "purpose", "light", "light_fixed", "force", "turntable"
         given: dict[str, Any] = {name: getattr(self, name) for name in names}
-        fit(self.data, self.method, settings=joined(self.set), progress=progress, **given)
+        fit(self.data, self.method, settings=sum(self.set, ()), progress=progress, **given)
         taken, trainer = time.monotonic() - begin, progress.trainer
         assert trainer is not None
         data: dict[str, Any] = {"run": str(self.output), "method": trainer.method.name}

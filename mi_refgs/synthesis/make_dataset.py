@@ -21,15 +21,7 @@ from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.shade.light.latlong import environment_image
 from mi_refgs.synthesis.ground_truth import surface_mesh
 from mi_refgs.synthesis.options import DatasetOptions, LightFile
-from mi_refgs.synthesis.pathtrace import (
-    MAPS,
-    Cameras,
-    Tracer,
-    bounding_sphere,
-    incident_image,
-    object_of,
-    reach,
-)
+from mi_refgs.synthesis.pathtrace import MAPS, Cameras, Tracer, bounding_sphere, incident, object_of, reach
 from mi_refgs.synthesis.settings import RELIGHT, SURFACE, load_scene, prepare_folder, under_light, without
 from mi_refgs.types import Scene
 
@@ -125,7 +117,7 @@ def write_views(out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str
     light, height = out / "environment.exr", cameras.options.environment_height
     if height and cameras.objects and not light.exists():
         room = without(tracer.scene, cameras.objects)
-        write_exr(light, incident_image(room, cameras.centre, cameras.options))
+        write_exr(light, incident(room, cameras.centre, cameras.options))
     elif height and tracer.scene.environment() is not None and not light.exists():
         write_exr(light, environment_image(tracer.scene, height))
     jobs = [job for split in splits for job in views[split]]

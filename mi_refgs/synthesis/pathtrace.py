@@ -92,7 +92,7 @@ def camera_poses(
     return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
 
 
-def incident_image(scene: Scene, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
+def incident(scene: Scene, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
     """Path-traced radiance that arrives at a point (3,), on the grid of `environment_image`."""
     integrator = mi.load_dict({"type": "path", "max_depth": options.max_depth})
     sampler = mi.load_dict({"type": "independent"})
