@@ -310,9 +310,7 @@ def test_sharpest_frames_of_a_video_are_written(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize(("module", "extra"), [("pycolmap", "capture"), ("av", "video")])
-def test_missing_library_is_named(
-    module: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_library(module: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, module, None)
     (tmp_path / "clip.MP4").write_bytes(b"0")
     source = tmp_path / ("clip.MP4" if module == "av" else "")

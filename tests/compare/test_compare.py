@@ -95,9 +95,7 @@ def test_numbers_are_means_over_the_runs(compared: Path) -> None:
     assert (other["numbers"]["lpips"] is None) == unmeasured
 
 
-def test_no_job_is_repeated(
-    compared: Path, data: Path, variants: Paths, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_run_once(compared: Path, data: Path, variants: Paths, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(execute, "_process", lambda *_: pytest.fail("a finished job was begun again"))
     assert main(command(data, compared, variants[1], more=("--seeds", "0,1"))) == 3
 

@@ -88,9 +88,7 @@ def test_points_are_compared_with_keypoints(
     assert found.numbers["median"] == pytest.approx(median, abs=0.01)
 
 
-def test_contradictory_cameras_are_refused_unless_forced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_contradictory_cameras_need_force(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, said = write_model(tmp_path / "data", turn=lambda i: 0.35 * (i % 2)), list[str]()
     command = train_command(data, tmp_path / "run", write_method(tmp_path))
     refused(command, "sparse/0/images.txt: keypoints: ", "another model's images file", "--force")

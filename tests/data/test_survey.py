@@ -45,9 +45,7 @@ def test_survey_reports_missing_images(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_cameras_in_one_place_are_refused(
-    count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_cameras_in_one_place(count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Named before anything is computed, with the exit code of bad input."""
     words = "in one place show no shape"
     data = write_data(tmp_path / "ball", views=count, truth=False)

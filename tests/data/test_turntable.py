@@ -40,9 +40,7 @@ def write_turntable(folder: Path, backdrop: np.ndarray, masks: bool = False) -> 
     ("backdrop", "masks", "plain", "stays"),
     [("plain", 0, True, True), ("room", 0, False, True), ("white", 0, True, False), ("room", 1, None, True)],
 )
-def test_what_is_said_of_backgrounds(
-    backdrop: str, masks: int, plain: Any, stays: bool, tmp_path: Path
-) -> None:
+def test_messages_on_backgrounds(backdrop: str, masks: int, plain: Any, stays: bool, tmp_path: Path) -> None:
     data = write_turntable(tmp_path / "turn", BACKDROPS[backdrop], bool(masks))
     found = {one.name: one.level for one in examine(read_dataset(data, "train"))}
     assert (found.get("background"), found["turntable"]) == (LEVEL[plain], LEVEL[stays])

@@ -85,9 +85,7 @@ def test_splats_of_others_are_read(
         ("train_flags antialiasing", True),
     ],
 )
-def test_antialiasing_is_said(
-    comment: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_antialiasing(comment: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     content = ply_bytes(BALL).replace(b"by hand", comment.encode())
     (tmp_path / "a.ply").write_bytes(content)
     read_splats(tmp_path / "a.ply")

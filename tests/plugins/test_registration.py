@@ -70,9 +70,7 @@ RGB, SCALAR, SPECTRAL = "llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral"
         slow(AFTER, False, [SPECTRAL, RGB]),
     ],
 )
-def test_every_switch_registers_again(
-    order: str, autoload: bool, variants: list[str], tmp_path: Path
-) -> None:
+def test_switches_register_again(order: str, autoload: bool, variants: list[str], tmp_path: Path) -> None:
     """Beside Mitsuba's own callback or without; registering twice is harmless, and so is another package."""
     (tmp_path / "stand_in.py").write_text(STAND_IN)
     (tmp_path / "other.py").write_text(OTHER)

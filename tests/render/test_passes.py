@@ -45,9 +45,7 @@ def renderer(shading: Shading, samples: int, folder: Path, around: bool = False)
 
 
 @pytest.mark.parametrize("case", range(len(SHADINGS)))
-def test_a_frame_in_passes_is_the_whole_frame(
-    case: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_passes_are_the_whole_frame(case: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each shading with one or 16 samples, and every other two of them with surroundings."""
     name, samples = [*SHADINGS][case], (16, 1)[case % 2]
     view = renderer(SHADINGS[name], samples, tmp_path, around=case % 4 < 2)

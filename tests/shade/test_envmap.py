@@ -113,9 +113,7 @@ def test_filtering_does_not_turn_light_negative() -> None:
     assert min(level.min() for level in levels) > 0.008
 
 
-def test_maps_finer_than_the_levels_are_averaged(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_finer_maps_are_averaged(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """With levels capped at 16 rows a map of 64 is filtered like its own average."""
     monkeypatch.setattr(lobe_matrices, "LEVEL_MAX_HEIGHT", (16,) * 7)
     monkeypatch.setattr(prefilter, "_operator", prefilter._operator.__wrapped__)

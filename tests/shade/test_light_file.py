@@ -211,9 +211,7 @@ def test_scenes_read_their_maps_so(tmp_path: Path, capsys: Captured) -> None:
 
 
 @pytest.mark.parametrize("kind", ["float.exr", "half.exr", "8_bits.png"])
-def test_a_map_that_is_finer_than_wanted_is_averaged(
-    kind: str, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_finer_map_is_averaged(kind: str, tmp_path: Path, rng: np.random.Generator) -> None:
     path, values = tmp_path / kind, rng.integers(0, 256, (37, 74, 3)).astype(np.float32) / 256
     if path.suffix == ".png":
         write_png(path, values)

@@ -75,9 +75,7 @@ def test_terms_match_reference(shading: Shading, names: tuple[str, ...], rng: np
 
 
 @EVERY
-def test_derivatives_of_each_attribute(
-    shading: Shading, names: tuple[str, ...], rng: np.random.Generator
-) -> None:
+def test_attribute_derivatives(shading: Shading, names: tuple[str, ...], rng: np.random.Generator) -> None:
     """With random weights per point, term and colour, against the slopes of the float64 reference; the
     tangent is the transpose of the adjoint."""
     light, values = EnvironmentLight.from_radiance(MAP), shading_values(rng, names)

@@ -153,9 +153,7 @@ def test_degenerate_rows_stay_finite(kind: Primitive, case: str) -> None:
 @pytest.mark.parametrize("thinness", [1.0, 1e-5])
 @pytest.mark.parametrize("seed", range(0, 20, 6))
 @BOTH
-def test_tile_lists_hold_what_contributes_and_little_else(
-    kind: Primitive, seed: int, thinness: float
-) -> None:
+def test_tile_lists_hold_what_contributes_and_little(kind: Primitive, seed: int, thinness: float) -> None:
     """Every pair with a pixel at α ≥ ALPHA_MIN is listed, needles' too, and few others."""
     scene = kind.make(seed)
     scene.raw["scale"][:, 0] += 2 * (thinness < 1)

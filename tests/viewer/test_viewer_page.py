@@ -42,9 +42,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 browser_path = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-pytestmark = pytest.mark.skipif(
-    browser_path is None, reason="no chromium is installed; apt-get install chromium"
-)
+pytestmark = pytest.mark.skipif(browser_path is None, reason="no chromium; apt-get install chromium")
 
 
 class Server:
