@@ -35,8 +35,7 @@ def examine() -> dict[str, Any]:
     problem = llvm.problem()
     if problem is None:
         if failure := _failure():
-            what = f"a trial kernel failed under LLVM {version[0]}: {failure}"
-            problem = llvm.Problem(what, llvm.REMEDY)
+            problem = llvm.Problem(f"a trial kernel failed under LLVM {version[0]}: {failure}", llvm.REMEDY)
     elif cuda:
         problem = None
     return {

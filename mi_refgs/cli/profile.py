@@ -31,8 +31,7 @@ class Profile:
         folder = Run(self.run_folder)
         method = folder.method()
         trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)
-        stage = trainer.method.stage_at(max(trainer.iteration, 1))[0]
-        rows = phases_of(stepper(trainer, stage), self.steps)
+        rows = phases_of(stepper(trainer, trainer.method.stage_at(max(trainer.iteration, 1))[0]), self.steps)
         lines = [f"{'phase':<20}{'ms':>10}{'launches':>10}{'share':>8}"]
         lines += [f"{row.phase:<20}{row.ms:>10.2f}{row.launches:>10}{row.share:>8.0%}" for row in rows]
         ms, launches = (sum(getattr(row, name) for row in rows) for name in ("ms", "launches"))

@@ -81,8 +81,7 @@ def write(folder: Path) -> Table:
     if not table.scenes:
         what = "none given, and the folder has no comparison"
         raise InputError(what, "DATA", remedy="name data sets to fit")
-    content = json.dumps(asdict(table), indent=1, ensure_ascii=False)
-    write_bytes(folder / TABLE, f"{content}\n".encode())
+    write_bytes(folder / TABLE, f"{json.dumps(asdict(table), indent=1, ensure_ascii=False)}\n".encode())
     write_bytes(folder / TABLE_TEXT, markdown(table).encode())
     return table
 

@@ -294,8 +294,7 @@ def read_dataset(
     if _opaque(views) and (split == "train" or _opaque(training)):
         which = f"{sum(map(_own_alpha, views))} of {len(views)} images have alpha"
         notes = (*notes, f"{which}, but no pixel is transparent: alpha is ignored")
-        ignored = (replace(v, pixels=v.pixels.without_alpha()) if _own_alpha(v) else v for v in views)
-        views = tuple(ignored)
+        views = tuple(replace(v, pixels=v.pixels.without_alpha()) if _own_alpha(v) else v for v in views)
     without = [view.name for view in views if not view.has_alpha]
     if 0 < len(without) < len(views):
         which = f"{len(without)} of {len(views)} images, such as '{without[0]}'"

@@ -122,8 +122,7 @@ def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> 
     name = _for_images(named, reads, views)
     if name != named:
         say(f"{views.path}: images without alpha: fitted with their background, by --method {name}")
-    method = load_method(name, choice.preset, choice.settings)
-    return method.downscaled(views.downscale), views
+    return load_method(name, choice.preset, choice.settings).downscaled(views.downscale), views
 
 
 def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:

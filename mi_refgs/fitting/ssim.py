@@ -101,8 +101,7 @@ def _similarity(blurred: list[Float], pixel: Float, inside: Float) -> list[Float
 @_replayed
 def _forward(x: list[Float], y: list[Float], width: int, height: int) -> list[Float]:
     """What `_similarity` gives at every pixel."""
-    rows = _blur([*x, *y], width, height, 0, derive=_moments)
-    return _blur(rows, width, height, 1, finish=_similarity)
+    return _blur(_blur([*x, *y], width, height, 0, derive=_moments), width, height, 1, finish=_similarity)
 
 
 @_replayed
@@ -118,8 +117,7 @@ def _gradient(x: list[Float], y: list[Float], slopes: list[Float], width: int, h
             for i in range(planes)
         ]
 
-    columns = _blur(slopes, width, height, 1)
-    return _blur(columns, width, height, 0, finish=combine)
+    return _blur(_blur(slopes, width, height, 1), width, height, 0, finish=combine)
 
 
 class _Ssim(dr.CustomOp):

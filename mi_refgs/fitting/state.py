@@ -142,8 +142,7 @@ class FitState:
     @staticmethod
     def start(setup: FitSetup) -> "FitState":
         """The state before the first step."""
-        draws = setup.rng(0, "start")
-        params = initial_parameters(setup.method, setup.data, draws, setup.open_scene)
+        params = initial_parameters(setup.method, setup.data, setup.rng(0, "start"), setup.open_scene)
         return FitState._assembled(setup, params, Occluder())
 
     @staticmethod

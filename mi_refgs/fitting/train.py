@@ -127,8 +127,7 @@ class Trainer:
     def camera(self, index: int) -> Camera:
         """The camera of a training view, with the correction that was fitted."""
         with dr.suspend_grad():
-            camera = self.data.views[index].camera()
-            return per_view.corrected(self.setup, self.fit.params, index, camera)
+            return per_view.corrected(self.setup, self.fit.params, index, self.data.views[index].camera())
 
     def view(self, camera: Camera, aovs: bool = True) -> Frame:
         """Render the present state as its export does, without derivatives."""

@@ -89,8 +89,7 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
         covered, triangle, barycentric = texels(cut_faces, uv, texture)
         # Materials and normals at vertices and texels.
         points, start = _points(mesh, scene, triangle, barycentric)
-        frames = map(renderer, views)
-        pairs = ((v, f, _columns(model, f.maps)) for v, f in zip(views, frames, strict=True))
+        pairs = ((v, f, _columns(model, f.maps)) for v, f in zip(views, map(renderer, views), strict=True))
         found = _mean_of_views(pairs, points, start, OFFSET_VOXELS * mesh.voxel)
     count = len(mesh.vertices)
     image = np.zeros((texture, texture, 5), np.float32)

@@ -24,8 +24,7 @@ def write(
     layer background, which R, G, B do not contain: add (1 - A) times it."""
     require_between(view, "--view", 0, len(shots) - 1)
     camera = shots[view].camera
-    shown = replace(trained, surroundings=None) if object else trained
-    frame = shown.renderer(samples=samples)(camera)
+    frame = (replace(trained, surroundings=None) if object else trained).renderer(samples=samples)(camera)
     layers = dict(zip("RGBA", [*frame.radiance, frame.alpha], strict=True))
     for name, letters in suffixes().items():
         if name == "alpha" or (name in ATTRIBUTES and name not in frame.maps):

@@ -27,8 +27,7 @@ def rotation_part(matrix: Any) -> Any:  # mi.Matrix4f → mi.Matrix3f, under AD
 def part_of(motion: Float, first: int, vector: Vector3f) -> Vector3f:
     """Three numbers of a motion per vector, gathered: the adjoint of a broadcast is a kernel per use."""
     index = dr.full(mi.UInt32, first, dr.width(vector))
-    mode = dr.ReduceMode.Expand
-    return mi.Vector3f(*(dr.gather(mi.Float, motion, index + i, mode=mode) for i in range(3)))
+    return mi.Vector3f(*(dr.gather(mi.Float, motion, index + i, mode=dr.ReduceMode.Expand) for i in range(3)))
 
 
 def turned_by(motion: Float | None, vector: Vector3f, sign: int = 1) -> Vector3f:

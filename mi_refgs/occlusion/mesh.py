@@ -77,8 +77,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = F
     label = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     area = np.bincount(label, weights=mesh.area_faces)
     corners = mesh.triangles - mesh.vertices.mean(axis=0)
-    volume = np.bincount(label, weights=np.linalg.det(corners))
-    solid = (volume > 0) | open_
+    solid = (np.bincount(label, weights=np.linalg.det(corners)) > 0) | open_
     keep = (area >= COMPONENT_KEEP * area[solid].max(initial=0)) & solid
     mesh.update_faces(keep[label])
     mesh.remove_unreferenced_vertices()

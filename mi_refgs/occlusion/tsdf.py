@@ -132,8 +132,7 @@ class _Grid:
         inside = (self.behind > 0) & (self.weight <= UNSEEN_VOTE * self.behind)
         observed = self.weight > 0
         mean = self.total / dr.select(observed, self.weight, 1)
-        value = dr.select(inside, -1, dr.select(observed, mean, 1))
-        return np.array(value, dtype=np.float32)
+        return np.array(dr.select(inside, -1, dr.select(observed, mean, 1)), dtype=np.float32)
 
 
 def _sample(

@@ -95,8 +95,7 @@ class RefGSBSDF(mi.BSDF):
         wi, active = _front(si.wi, active)
         material = self._material(si, active)
         with dr.suspend_grad():
-            choice = _specular_probability(ctx, material, wi.z)
-            specular = sample1 < choice
+            specular = sample1 < _specular_probability(ctx, material, wi.z)
             normal, _ = material.distribution().sample(wi, sample2)
             cosine = mi.warp.square_to_cosine_hemisphere(sample2)
             wo, above = _front(dr.select(specular, mi.reflect(wi, normal), cosine), active)

@@ -216,8 +216,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
             raise InputError(what, "refgs", "dr.freeze", "call mi.render outside of the frozen function")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         require_derivatives(params, scene, sensor, self)
-        request = Request({*self.aovs.values()}, forward_only)
-        view = partial(self.frame, scene, request)
+        view = partial(self.frame, scene, Request({*self.aovs.values()}, forward_only))
         names, count = self.aov_names(), sum(model.count for model in self._models.values())
         return FilmImage(sensor, spp, view, [*self.aovs.values()], names, self.shading.neighbours, count)
 

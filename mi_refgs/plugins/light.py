@@ -115,8 +115,7 @@ def warn_of_ignored(scene: Any, used: list[Any]) -> None:
         (scene.shapes(), "render the scene's shapes", "it renders surfels, which its `mesh` occludes"),
     ):
         if found:
-            message = f"refgs does not {what} {_named(found)}: {instead}"
-            warnings.warn(message, RuntimeWarning, stacklevel=3)
+            warnings.warn(f"refgs does not {what} {_named(found)}: {instead}", RuntimeWarning, stacklevel=3)
 
 
 def _named(objects: list[Any]) -> str:

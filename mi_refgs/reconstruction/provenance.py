@@ -67,8 +67,7 @@ class Provenance:
             data = read_views(self.method, self.data, split, truth=False)
             views, originals = with_poses(data, self.records.get(CAMERAS, {})).views, data.views
             if (self.method.data.downscale or 1) > 1:  # image files are those on disk
-                whole = self.method.downscaled(1)
-                originals = read_views(whole, self.data, split, truth=False).views
+                originals = read_views(self.method.downscaled(1), self.data, split, truth=False).views
             for view, original in zip(views, originals, strict=True):
                 file = original.file
                 if file is not None:  # paths are relative to the data set

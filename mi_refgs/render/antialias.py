@@ -45,8 +45,7 @@ def averaged(
 
 def _interpolated(plane: Float, camera: Camera, pixels: CompactedPixels | None) -> list[Float]:
     """Values (P,) at each of NODES of a plane (P,) given at pixel centres."""
-    beside = neighbours(plane, camera.width, camera.height, STEPS, pixels)
-    at = dict(zip(STEPS, beside, strict=True))
+    at = dict(zip(STEPS, neighbours(plane, camera.width, camera.height, STEPS, pixels), strict=True))
     side, corner = NODE * (1 - NODE), NODE**2
     centre = (1 - NODE) ** 2 * plane
     return [centre + side * (at[x, 0] + at[0, y]) + corner * at[x, y] for x, y in NODES]

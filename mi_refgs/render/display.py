@@ -58,5 +58,4 @@ def image_array(array: Array, height: int, width: int) -> np.ndarray:
     """Convert an array of H*W pixels to (H, W), one of colours or vectors to (H, W, 3), float32."""
     if isinstance(array, list) or dr.depth_v(array) > 1:
         return np.stack([image_array(part, height, width) for part in array], axis=-1)
-    values = np.array(array, dtype=np.float32).ravel()
-    return np.broadcast_to(values, height * width).reshape(height, width)
+    return np.broadcast_to(np.array(array, dtype=np.float32).ravel(), height * width).reshape(height, width)

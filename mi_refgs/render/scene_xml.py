@@ -48,8 +48,7 @@ def write_scene_xml(
         integrator.append(ElementTree.Comment(" without these two: the object alone, on transparency "))
     put(integrator, surroundings=surroundings, background=background)
     if envmap is not None:
-        light = ElementTree.SubElement(integrator, "emitter", type="envmap", name="light")
-        put(light, filename=envmap)
+        put(ElementTree.SubElement(integrator, "emitter", type="envmap", name="light"), filename=envmap)
     put(integrator, near_field=near_field)
     for index, camera in enumerate(cameras):
         add_sensor(scene, camera, f"sensor_{index}" if index else "sensor")

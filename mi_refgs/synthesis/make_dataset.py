@@ -59,8 +59,7 @@ def make_dataset(
     if region is not None:
         write_region(out, region)
     if not (out / SURFACE).exists():
-        voxel = 2 * cameras.radius / SURFACE_VOXELS
-        write_mesh(out / SURFACE, Mesh(vertices, faces, voxel))
+        write_mesh(out / SURFACE, Mesh(vertices, faces, 2 * cameras.radius / SURFACE_VOXELS))
     write_views(out, ("train", "test"), Tracer(loaded, cameras), MAPS, progress)
     for other, scene_there in zip(others, relit, strict=True):
         alone = Tracer(scene_there, replace(cameras, objects=()))

@@ -95,8 +95,7 @@ class Page:
 
     async def connected(self, client: Any) -> None:
         """Display the scene on a page that has been opened."""
-        new = Client(partial(self._deliver, client), side=self.moving_side)
-        self.loop.clients[client.client_id] = new
+        self.loop.clients[client.client_id] = Client(partial(self._deliver, client), side=self.moving_side)
         near = self.views[0].near if self.views else 0.0
 
         async def moved(camera: Any) -> None:

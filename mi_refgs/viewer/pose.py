@@ -49,8 +49,7 @@ class Pose:
     @property
     def page_rotation(self) -> np.ndarray:
         """Unit quaternion (4,), w first, of viser's axes, which are OpenCV's."""
-        rotation = Rotation.from_matrix((self.to_world @ MITSUBA_FROM_OPENCV)[:3, :3])
-        return np.roll(rotation.as_quat(), 1)
+        return np.roll(Rotation.from_matrix((self.to_world @ MITSUBA_FROM_OPENCV)[:3, :3]).as_quat(), 1)
 
     def look_at(self, centre: np.ndarray) -> np.ndarray:
         """Return the point (3,) of the viewing axis, in front of the camera, that is nearest to a centre."""

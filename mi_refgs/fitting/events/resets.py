@@ -43,8 +43,7 @@ class ResetOpacity(Event[Trainer]):
         raw["opacity"] = np.minimum(raw["opacity"], np.float32(logit(OPACITY)))
         for name in self.raise_to_start:
             raw[name] = np.maximum(raw[name], np.float32(logit(trainer.method.surfels.first(name))))
-        cleared = ("opacity", *self.raise_to_start)
-        trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=cleared)
+        trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("opacity", *self.raise_to_start))
 
     def grown(self, iteration: int, opacity: float, rate: float) -> bool:
         """Whether opacities had time since the last reset to grow back: Adam raises a logit by its rate."""

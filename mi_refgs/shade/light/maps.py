@@ -83,8 +83,7 @@ class Known(Map):
     def sized(self, pixels: int) -> Self:
         if self.height is not None or not self.fixed:
             return super().sized(pixels)
-        rows = len(read_radiance(self.file, FIXED_HEIGHT)) // 4 * 4
-        return replace(self, height=max(rows, MIN_HEIGHT))
+        return replace(self, height=max(len(read_radiance(self.file, FIXED_HEIGHT)) // 4 * 4, MIN_HEIGHT))
 
     def start(self) -> TensorXf:
         image = read_radiance(self.file, OVERSAMPLING * self.rows)

@@ -53,5 +53,4 @@ class PlacedLight(FittedLight):
 
     def environment(self) -> EnvironmentLight:
         """The map in the world, with twice the rows: with as many, it would be blurred."""
-        rows = 2 * self.map.height
-        return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, rows, 1))
+        return EnvironmentLight.from_radiance(lat_long(self.unfiltered().radiance, 2 * self.map.height, 1))
