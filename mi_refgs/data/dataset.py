@@ -218,7 +218,7 @@ class Dataset:
         materials at pixel centres), and those of `DatasetOptions`, of which a sensor has its own lens and
         size. Raises InputError as `make_dataset` does, and for a sensor that is no pinhole."""
         # By name, as registries import what is registered: `synthesis` imports this module.
-        made: Dataset = import_module("mi_refgs.synthesis.in_memory").traced(scene, sensors, **options)
+        made: Dataset = import_module("mi_refgs.synthesis.make_dataset").traced(scene, sensors, **options)
         return made
 
     @property

@@ -1,4 +1,4 @@
-"""Path tracing of a multi-view data set of a Mitsuba scene: the files that docs/formats.md lists.
+"""Path tracing of views of a Mitsuba scene: in memory, or the files of a data set, which docs/formats.md lists.
 
 Of an object among other shapes, images are RGB without alpha, and maps and surface are those of the object.
 The transforms are written last. dataset.json has the settings, which decide whether a folder is continued."""
@@ -10,8 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from mi_refgs.data.dataset import NEAR_EXTENTS, Dataset
+from mi_refgs.data.images import Pixels, compose
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, pinhole
 from mi_refgs.data.region import Region, write_region
+from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, within
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
@@ -19,6 +22,7 @@ from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
 from mi_refgs.io.progress import say, with_bar
 from mi_refgs.occlusion.mesh import Mesh, write_mesh
 from mi_refgs.shade.light.latlong import environment_image
+from mi_refgs.splat.camera import Camera
 from mi_refgs.synthesis.ground_truth import surface_mesh
 from mi_refgs.synthesis.options import DatasetOptions, LightFile
 from mi_refgs.synthesis.pathtrace import MAPS, Cameras, Tracer, bounding_sphere, incident, object_of, reach
@@ -27,6 +31,8 @@ from mi_refgs.types import Scene
 
 SURFACE_VOXELS = 2048  # along the diameter of surface.ply: rays start 2 off, ten times a sphere's error
 REGION_MARGIN = 1.2  # radius of the region over that of the object's bounding sphere: adjacent surfaces
+WHITE = 1.0  # behind images with alpha in memory, as `read_dataset` has it
+BLANK = Pixels(np.zeros((0, 0, 3), np.float32))
 
 
 def make_dataset(
@@ -145,3 +151,55 @@ def _trace_view(tracer: Tracer, stem: Path, pose: np.ndarray, seed: int, maps: d
         found = tracer.maps(pose, rgba)
         for name, file in files.items():
             write_exr(file, found[name], names=maps[name])
+
+
+def traced(
+    scene: Any,
+    sensors: int | Sequence[Any] | None = None,
+    *,
+    split: str = "train",
+    maps: bool = True,
+    progress: bool = False,
+    **options: Any,
+) -> Dataset:
+    """The views in memory; see `Dataset.from_mitsuba`."""
+    path = Path(scene) if isinstance(scene, str | Path) else Path("scene in memory")
+    given = options_of("from_mitsuba", path, options)
+    loaded = load_scene(path, given.define) if isinstance(scene, str | Path) else scene
+    cameras, _, region = around_object(loaded, given, path)
+    jobs: list[tuple[Tracer, View, int]] = []
+    if isinstance(sensors, int):
+        tracer, (width, height), focal = Tracer(loaded, cameras), given.resolution, given.focal
+        numbered = replace(cameras, options=replace(given, views=sensors, test_views=sensors))
+        for pose, seed in numbered.of(split):
+            view = View("", width, height, focal, focal, width / 2, height / 2, pose, BLANK)
+            jobs.append((tracer, view, seed))
+    else:
+        for index, sensor in enumerate(loaded.sensors() if sensors is None else sensors):
+            camera = sensor if isinstance(sensor, Camera) else Camera.from_sensor(sensor)
+            sized = replace(given, size=(camera.width, camera.height))
+            tracer = Tracer(loaded, replace(cameras, options=sized), camera)
+            jobs.append((tracer, _view_of(camera), given.seed + index))
+    views: list[View] = []
+    for tracer, view, seed in with_bar(jobs, "views", unit="view", disable=not progress):
+        image = tracer.image(view.to_world, seed).astype(np.float32)
+        found = tracer.maps(view.to_world, image) if maps else {}
+        found = {name: values.astype(np.float32) for name, values in found.items()}
+        normal, depth = found.pop("normal", None), found.pop("depth", None)
+        view = replace(view, name=f"r_{len(views):03d}", pixels=compose(image, WHITE), normal=normal)
+        depth = None if depth is None else depth[..., 0]
+        views.append(replace(view, depth=depth, materials=found, is_linear_radiance=True))
+    data = Dataset(path, split, tuple(views), np.full(3, WHITE, np.float32), True, None, region=region)
+    near = NEAR_EXTENTS * data.scene_extent
+    return replace(data, views=tuple(replace(view, near=near) for view in views))
+
+
+def _view_of(camera: Camera) -> View:
+    """A camera as a view, without its image; InputError unless Mitsuba has such a sensor."""
+    fx, fy, cx, cy = (float(x[0]) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    pose = camera.pose()
+    pose[:3, :2] *= -np.sign(fx)  # in Mitsuba's frame focal lengths are negative
+    if not np.isclose(fx, fy, rtol=1e-3) or np.linalg.det(pose[:3, :3]) < 0:
+        what = f"focal lengths {fx:g} and {fy:g} pixels, or a mirrored pose"
+        raise InputError(what, "from_mitsuba", "sensors", "give cameras of square pixels, not mirrored")
+    return View("", camera.width, camera.height, abs(fx), abs(fx), cx, cy, pose, BLANK)
