@@ -1,4 +1,4 @@
-"""Path tracing of views of a Mitsuba scene: in memory, or the files of a data set, which docs/formats.md lists.
+"""Path tracing of views of a Mitsuba scene: in memory, or the files of a data set (docs/formats.md).
 
 Of an object among other shapes, images are RGB without alpha, and maps and surface are those of the object.
 The transforms are written last. dataset.json has the settings, which decide whether a folder is continued."""
