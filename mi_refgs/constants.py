@@ -57,9 +57,7 @@ RAW_LIMIT = 1e18
 surfel covers no pixel and gets zero gradient; a texel is black."""
 
 NORM_FLOOR = 1e-20  # squared length below which a vector has no direction: callers have named fallbacks
-MAX_TURN = (
-    0.3  # of a normal per standard deviation of its surfel, rad; 99 % of a mirror's turn by less than 0.15
-)
+MAX_TURN = 0.3  # rad, of a normal per standard deviation of its surfel: 99 % of those of a mirror need 0.23
 COVERAGE_FLOOR = 1e-3  # alpha below which a pixel counts as empty: material maps are divided by alpha
 FACING_TOLERANCE = 0.25  # cosine by which a normal may point away before it is turned: 14°
 DEFAULT_PRESET = "standard"  # how long a fit takes where nothing is said

@@ -3,7 +3,8 @@
     forward shading:   attributes ─ shade ─► radiance ─ blend ─► image      (`Shading.shaded_at` is "surfel")
     deferred shading:  attributes ─ blend ─► G-buffer ─ shade ─► image      (`Shading.shaded_at` is "pixel")
 
-Both use the same splatter and the same `shade`. `mi_refgs.plugins.derivatives` lists what has no derivative.
+Both use the same splatter and the same `shade`; only deferred shading lets normals vary over a surfel
+(`curvature`). `mi_refgs.plugins.derivatives` lists what has no derivative.
 """
 
 from collections.abc import Collection, Mapping
