@@ -235,7 +235,7 @@ def renderer(
         update_occluder_caches(occluder, fitted.surfels, filtered, used)
     scene = SurfelScene(fitted.surfels, shading, filtered, occluder, fitted.surroundings, fitted.near)
     once = partial(render, scene, request=Request(("normal",), forward_only=True))
-    averaged = partial(supersampled, once, samples=samples, details=False)
+    averaged = partial(supersampled, once, samples=samples, maps=False)
 
     def draw(camera: Camera) -> Frame:
         with dr.suspend_grad():
