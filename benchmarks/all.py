@@ -25,7 +25,7 @@ from benchmarks import pages, plots
 from benchmarks.common.build import RESULTS, commit, recorded, write_result
 from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
-from benchmarks.fits import GROUPS, TIMED, Fit, Workplace, group
+from benchmarks.fits import DECIDED, GROUPS, TIMED, Fit, Workplace, group
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 
@@ -34,7 +34,7 @@ from mi_refgs.io.files import is_file, read_json
 class Part:
     """A data file, and what measures it: a group of fits, or the module of this name.
 
-    In its arguments, {data} is --data, {run} the run of TIMED."""
+    In its arguments, {data} is --data, {run} the run of TIMED, {runs} are those of DECIDED."""
 
     name: str
     minutes: float  # on an idle machine with two cores
@@ -60,8 +60,9 @@ PARTS = (
     Part("stability", 15),
     *_fits(),
     Part("frames", 2, "--run {run}"),
+    Part("oracle", 20, "{runs}"),
 )
-"""In this order: those with {run} need groups of fits."""
+"""In this order: those with {run} or {runs} need groups of fits."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -79,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
     mi.set_variant("llvm_ad_rgb")
     folder, build = (options.output or RESULTS).resolve(), commit()
     chosen = [part for part in PARTS if part.name in options.only]
-    chosen = [part for part in chosen if not (options.small and "{run}" in part.arguments)]
+    chosen = [part for part in chosen if not (options.small and "{run" in part.arguments)]
     left = [part for part in chosen if not is_done(folder / f"{part.name}.json", build)]
     for part in chosen:
         print(f"{part.name:<15}{part.minutes:>4} min  {'to do' if part in left else 'done'}")
@@ -101,7 +102,9 @@ def is_done(path: Path, build: str) -> bool:
 def run(part: Part, options: argparse.Namespace, folder: Path) -> bool:
     """Measure a part, and print how long it took; returns whether that succeeded."""
     begin, work = time.monotonic(), folder / "work" if options.small else Path("runs", "all")
-    arguments = part.arguments.format(data=options.data, run=work / commit() / TIMED.name / "run").split()
+    folders = {fit: work / commit() / fit.name / "run" for fit in DECIDED}
+    runs = " ".join(f"--run {path}" for path in folders.values())
+    arguments = part.arguments.format(data=options.data, run=folders[TIMED], runs=runs).split()
     words = [f"benchmarks.{part.name}", "--quiet", "-o", str(folder)]
     words += ["--small"] if options.small else arguments
     print(f"{part.name} …", flush=True)

@@ -61,9 +61,7 @@ SCENES = ROOT / "scenes"
 PARTS = ("normals", "materials", "hit normals", "hit materials", "light", "mesh")
 """What can be true: "hit …" are those where traced reflected rays end."""
 BOUNCES = 4  # traced, where everything is true
-EDGE = (
-    2  # voxels of the extracted mesh: longest edge of the true one, of whose vertices surfels are looked up
-)
+EDGE = 2  # longest edge of the true mesh, whose vertices get values of surfels, in voxels of the fitted one
 RAYS = 32  # per vertex, for diffuse light: a quarter of those of relit images, since the mesh is finer
 GAUSS_NEWTON = 6  # steps, of the scale of a light
 BLURS = (0, 0.8, 1.5, 3, 6, 12)  # σ in pixels, of the errors of normals
@@ -77,17 +75,13 @@ class Case:
     bounces: int | None = None
 
 
-def all_but(part: str = "") -> tuple[str, ...]:
-    return tuple(name for name in PARTS if name != part)
-
-
 CASES = {
     "as fitted": Case(),
     **{f"true {part}": Case((part,)) for part in PARTS if not part.startswith("hit")},
     **{f"{n} traced bounce{'s' * (n > 1)}": Case(bounces=n) for n in (1, 2, BOUNCES)},
     f"true hits, {BOUNCES} bounces": Case(PARTS[2:4], BOUNCES),
     f"all true, {BOUNCES} bounces": Case(PARTS, BOUNCES),
-    **{f"all but {part}": Case(all_but(part), BOUNCES) for part in PARTS},
+    **{f"all but {part}": Case(tuple(p for p in PARTS if p != part), BOUNCES) for part in PARTS},
     **{f"all true, {n} bounce{'s' * (n > 1)}": Case(PARTS, n) for n in (1, 2)},
 }
 
@@ -179,8 +173,7 @@ class TrueOccluder(Occluder):
         self.vertex_surfels = VertexSurfels.of(replace(self.mesh_now, voxel=self.voxel), surfels)
 
     def surface(self, surfels: Surfels, names: Sequence[str] = ()) -> Any:
-        fitted = super().surface(surfels, names)
-        return TrueHits(fitted, self.mesh_now, self.truth, self.true) if "hit" in str(self.true) else fitted
+        return TrueHits(super().surface(surfels, names), self.mesh_now, self.truth, self.true)
 
 
 class TruePoints(SplitSum):
@@ -231,8 +224,8 @@ def renderer(
     with dr.suspend_grad():
         filtered = shading.light_of(EnvironmentLight.from_radiance(scale * light.radiance().numpy()))
         occluder = TrueOccluder(mesh, fitted.mesh.voxel, truth, true)
-        used = hits if hits.ambient_rays else shading
-        update_occluder_caches(occluder, fitted.surfels, filtered, used)
+        lighted = hits if hits.ambient_rays else shading
+        update_occluder_caches(occluder, fitted.surfels, filtered, lighted)
     scene = SurfelScene(fitted.surfels, shading, filtered, occluder, fitted.surroundings, fitted.near)
     once = partial(render, scene, request=Request(("normal",), forward_only=True))
     averaged = partial(supersampled, once, samples=samples, maps=False)
@@ -276,8 +269,7 @@ def measured(run: Run, settings: Settings, quiet: bool) -> tuple[list[Row], dict
     if fitted.mesh is None or not isinstance(fitted.shading.model, SplitSum):
         raise InputError("needs a mesh and the model split_sum", run.path, "shading", "leave it out")
     truth, rows, found = Truth(data, EDGE * fitted.mesh.voxel), [], {}
-    chosen = evenly_spread(len(data.views), settings.views)
-    views = [data.views[i].load() for i in chosen]
+    views = [data.views[i].load() for i in evenly_spread(len(data.views), settings.views)]
     targets = np.stack([view.displayed for view in views])
     classes: list[Any] = [classify(view, truth.surface) for view in views]
 
@@ -287,10 +279,11 @@ def measured(run: Run, settings: Settings, quiet: bool) -> tuple[list[Row], dict
 
     def lit(once: list[Frame], twice: list[Frame], scale: np.ndarray) -> np.ndarray:
         """Images under a scaled light, in which radiance is linear."""
-        more = mi.Color3f(*map(float, scale - 1))
-        mixed = (a.radiance + more * (b.radiance - a.radiance) for a, b in zip(once, twice, strict=True))
-        scaled = zip(once, mixed, views, strict=True)
-        return np.stack([displayed_image(replace(f, radiance=x), view, data) for f, x, view in scaled])
+        found, more = [], mi.Color3f(*map(float, scale - 1))
+        for a, b, view in zip(once, twice, views, strict=True):
+            frame = replace(a, radiance=a.radiance + more * (b.radiance - a.radiance))
+            found.append(displayed_image(frame, view, data))
+        return np.stack(found)
 
     for name, case in tqdm(CASES.items(), run.path.name, disable=quiet):
         scale = np.ones(3)
@@ -309,9 +302,7 @@ def measured(run: Run, settings: Settings, quiet: bool) -> tuple[list[Row], dict
             rows.append(row)
             if not quiet:
                 errors = ", ".join(f"{key} {row[key]:.1f}" for key in CLASSES if row[key])
-                tqdm.write(
-                    f"{name:26} {count:2} samples {psnr:6.2f} dB   squared error, 1e-5: {errors} {scale}"
-                )
+                tqdm.write(f"{name:26} {count:2} samples {psnr:6.2f} dB; squared error, 1e-5: {errors}")
             if case == Case() and count == settings.samples[0]:
                 wrong = [image.normal - view.normal for image, view in zip(images, views, strict=True)]
                 smooth = [i for i, kind in enumerate(CLASSES) if kind.startswith("mirror")]

@@ -17,9 +17,11 @@ from benchmarks.common.view import ROOT
 from benchmarks.splatting.__main__ import FLOPS
 from benchmarks.stability.measure import GRADIENT_LIMIT, IMAGE_LIMIT
 from benchmarks.tables import worst_gradient
+from mi_refgs.evaluation.scores import PIXEL_CLASSES
 from mi_refgs.io.files import is_file
 
 Result = dict[str, Any]
+COLOURS = ("#bdbdbd", "#e6a04b", "#c0392b", "#4292c6", "#9ecae1", "#eeeeee")  # of PIXEL_CLASSES
 BLUES = ("#9ecae1", "#4292c6", "#2171b5", "#08306b")
 
 
@@ -130,7 +132,28 @@ def endtoend_frames(result: Result, path: Path) -> Path:
     return figures.save(figure, axes, path)
 
 
-DRAWN = (splatting_time, splitsum_pareto, visibility_time, stability_cases, endtoend_frames)
+def oracle_parts(result: Result, path: Path) -> Path:
+    """Squared error by class of pixels where parts of a fit are true, one panel per scene."""
+    most = max(row["samples"] for row in result["rows"])
+    scenes = list(dict.fromkeys(row["scene"] for row in result["rows"]))
+    figure, axes = figures.grid(
+        scenes, 2, 5.2, 3.8, f"mean squared error, 1e-5, {most} samples per pixel", ""
+    )
+    for ax, scene in zip(axes, scenes, strict=True):
+        rows = where(result["rows"], scene=scene, samples=most)
+        names, left = [row["case"] for row in rows], np.zeros(len(rows))
+        for (key, label), colour in zip(PIXEL_CLASSES.items(), COLOURS, strict=True):
+            if any(width := [row[key] for row in rows]):
+                ax.barh(names, width, left=left, label=label, color=colour)
+                left += width
+        for row, end in zip(rows, left, strict=True):
+            ax.text(end, row["case"], f" {row['psnr']:.1f} dB", fontsize=7, va="center")
+        ax.set_xlim(right=1.15 * left.max())
+    axes[0].invert_yaxis()  # shared
+    return figures.save(figure, axes, path, 3)
+
+
+DRAWN = (splatting_time, splitsum_pareto, visibility_time, stability_cases, endtoend_frames, oracle_parts)
 PLOTS: dict[str, Callable[[Result, Path], Path]] = {function.__name__: function for function in DRAWN}
 """Name of an image → what draws it; its first word is the data file."""
 

@@ -430,6 +430,24 @@ def frames(result: Result) -> Values:
     return {f"frames_{i}_frame_ms": number(row["frame_ms"]) for i, row in enumerate(result["frames"])}
 
 
+def oracle(result: Result) -> Values:
+    """PSNR with parts of fits that are true, and root mean square errors of normals after blurring."""
+    most, rows = max(row["samples"] for row in result["rows"]), result["rows"]
+    cases = dict.fromkeys(row["case"] for row in rows)
+    scenes = dict.fromkeys(row["scene"] for row in rows)
+
+    def line(case: str) -> list[str]:
+        found = (where(rows, case=case, scene=scene, samples=most) for scene in scenes)
+        return [case, *(f"{row['psnr']:.1f} dB" for of in found for row in of)]
+
+    def angles(spectrum: dict[str, float]) -> str:
+        return ", ".join(f"{angle:.1f}°" for angle in spectrum.values())
+
+    runs = dict(zip(scenes, result["spectra"].values(), strict=True))
+    spectra = {f"{scene}_spectrum": angles(spectrum) for scene, spectrum in runs.items()}
+    return spectra | {"table": table(["", *(f"`{scene}`" for scene in scenes)], map(line, cases))}
+
+
 PAGES: dict[str, Callable[[Result], Values]] = {
     "splatting": splatting,
     "splitsum": splitsum,
@@ -437,6 +455,7 @@ PAGES: dict[str, Callable[[Result], Values]] = {
     "stability": stability,
     "endtoend": endtoend,
     "corpus": corpus,
+    "oracle": oracle,
     "frames": frames,
 }
 """By benchmark."""
