@@ -81,7 +81,7 @@ def test_hooks_enclose_the_phases_of_their_names(trainer: Trainer) -> None:
     with timing.listening(notes):
         phases.stepper(trainer, "deferred")()
     assert sorted(notes.calls) == sorted([*phases.PHASES[:8], "optimiser"])
-    footprints, features = notes.boundaries.pop("surfels backward")
+    footprints, features, _ = notes.boundaries.pop("surfels backward")
     assert isinstance(footprints, Footprints) and dr.width(features[0]) == trainer.surfels.count
     kinds = {"splat backward": Composited, "shade backward": Frame, "prefilter backward": PrefilteredLight}
     assert {name: type(value) for name, value in notes.boundaries.items()} == kinds
