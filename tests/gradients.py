@@ -32,8 +32,8 @@ def gaussian_shader(_: Path) -> mi.Scene:
 
 def surfels(folder: Path) -> mi.Scene:
     curvature = np.random.default_rng(6).normal(size=(COUNT, 3)).astype(np.float32)
-    given = {"mesh": scenes.plane_mesh(folder), "aovs": "n:normal,d:depth"}
-    return scenes.open_scene(raw=raw_channels() | {"curvature": curvature}, **given)
+    raw, mesh = raw_channels() | {"curvature": curvature}, scenes.plane_mesh(folder)
+    return scenes.open_scene(raw=raw, mesh=mesh, aovs="n:normal,d:depth")
 
 
 def emitters(_: Path) -> mi.Scene:

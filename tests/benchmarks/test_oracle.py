@@ -29,11 +29,16 @@ def changed(name: str, by: float) -> Callable[[TrainedScene], TrainedScene]:
     return change
 
 
+def turned(scene: TrainedScene) -> TrainedScene:
+    assert scene.mesh is not None
+    return replace(scene, mesh=replace(scene.mesh, vertices=scene.mesh.vertices[:, ::-1]))
+
+
 SPOILT: dict[tuple[str, ...], Callable[[TrainedScene], TrainedScene]] = {
     ("normals",): changed("rotation", 0.2),
     ("materials", "hit materials"): changed("albedo", 2),
     ("light",): lambda scene: replace(scene, light=EnvironmentLight.constant(1, 32)),
-    ("mesh",): lambda scene: replace(scene, mesh=replace(scene.mesh, vertices=scene.mesh.vertices[:, ::-1])),
+    ("mesh",): turned,
 }
 
 

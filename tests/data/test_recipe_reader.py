@@ -38,7 +38,7 @@ class TableReader:
         points = np.loadtxt(folder / "points.txt", ndmin=2)
         return Recording(tuple(views), PointCloud(points), source=folder / "cameras.txt")
 
-    def _view(self, folder: Path, line: list[str], downscale: int) -> View:
+    def _view(self, folder: Path, line: list[str], downscale: float) -> View:
         image = np.ascontiguousarray(box_downscale(read_png(folder / line[0]), downscale)[..., :3])
         height, width = image.shape[:2]
         focal, *pose = map(float, line[1:])

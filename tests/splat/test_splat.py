@@ -141,7 +141,8 @@ def test_degenerate_rows_stay_finite(kind: Primitive, case: str) -> None:
     name, columns, value = DEGENERATE[case]
     raw = {key: values[: 0 if case == "none" else None].copy() for key, values in scene.raw.items()}
     raw[name][:, columns] = scene.camera.to_world[:3, 3] if value is None else value
-    features, turns = (x if x is None else x[: len(raw[name])] for x in (scene.features, scene.turns))
+    features = scene.features[: len(raw[name])]
+    turns = None if scene.turns is None else scene.turns[: len(raw[name])]
     scene = replace(scene, raw=raw, features=features, turns=turns)
     maps = scenes.fast_maps(scene)
     assert all(np.isfinite(x.numpy()).all() for x in [*maps.features, maps.depth, maps.alpha])
