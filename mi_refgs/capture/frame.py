@@ -1,6 +1,7 @@
 """World frame of a capture: +z against gravity, the region of interest is the unit ball around the origin.
 Rotation, position and scale are estimated from how cameras are held and where they look."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from mi_refgs.capture.colmap import Solved
 from mi_refgs.data.hull import axis_projectors
 from mi_refgs.data.object_region import object_region
-from mi_refgs.data.region import Region, region_radius, weighted_quantile
+from mi_refgs.data.region import CAMERA_SHARE, Region, region_radius, weighted_quantile
 from mi_refgs.errors import InputError
 
 ROUNDS = 50  # iterations of reweighted least squares, which converge to the least sum of absolute values
@@ -73,7 +74,10 @@ def region_of_interest(solved: Solved) -> Region:
         reach = weighted_quantile(offset[near], solved.length[near], 0.9)
         radius = max(reach, 0.5 * radius)  # points are only where the object has texture
     x, y, z = (float(c) for c in focus)
-    return object_region(Region((x, y, z), radius), solved.origin, solved.points, partial(seen_share, solved))
+    sphere, seen = Region((x, y, z), radius), partial(seen_share, solved)
+    found = object_region(sphere, solved.origin, solved.points, seen)
+    nearest = float(np.linalg.norm(solved.origin - np.array(found.centre), axis=1).min())
+    return replace(found, radius=min(found.radius, CAMERA_SHARE * nearest))  # a fit encloses what is outside
 
 
 def upright_unit(solved: Solved, up: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -1,7 +1,8 @@
-"""The region of interest of an object: a sphere above planes, which have all cameras on one side, around the
-group of close points that most views show. Before a fit, the sphere estimated from the cameras grows until it
-contains that group; during a fit, with points on all surfaces, a sphere and more planes enclose it."""
+"""The region of interest of an object: above planes that support it, around the group of close points that
+most views show. Before a fit, the sphere estimated from the cameras grows until it contains that group; in a
+fit, with points on all surfaces, the region encloses the group alone."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,29 +10,32 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
 
 from mi_refgs.data.region import CAMERA_SHARE, Plane, Region
-from mi_refgs.data.view import View, evenly_spread
+from mi_refgs.data.view import View
 
-# Support planes; lengths are in radii of the region.
-PLANE_REACH = 2.0  # distance from the centre up to which points determine them
-PLANE_MARGIN = 0.04  # height above at which the region begins; half leaves 4 % of the outline to the table
-PLANE_POINTS, PLANE_SHARE = 50, 0.05  # fewest points on one, and their share of those within PLANE_REACH
+# Lengths are in radii of the region.
+REACH = 2.0  # distance from the centre up to which points count
+FEWEST = 50  # points of a plane, or of an object: fewer are texture on a part of it
+MOST_POINTS = 5_000  # of the points on a plane, and twice as many of a group: time and memory grow with them
+WHOLE = 0.98  # fraction of the group in a region, or in an image, that contains it
+# Support planes.
+PLANE_MARGIN = 0.02  # height above at which the region begins: twice the width of sparse points
+PLANE_SHARE = 0.05  # least share of the points that are on one
 BELOW_SHARE = 0.5  # most points below over those on it: a table mirrors some, the face of an object has more
 ABOVE_SHARE = 0.9  # fraction of the cameras that are above
 PARALLEL = 0.9  # cosine of two normals from which the second is what the first has left
 # The group of points of the object.
-MOST_POINTS = 5_000  # of the points on a plane, and twice as many of a group: time and memory grow with them
 SEEN_SHARE = 0.4  # fraction of the views that show a point; close views leave some parts out
 LINK_COUNT = 5  # points within the distance of neighbours, itself included, of a point that is no stray one
-GROUP_POINTS = 50  # fewest points of an object: fewer are texture on a part of it
-WITHIN_SHARE = 0.95  # fraction inside of the region at which the region stays
-LEAST_WITHIN = 0.5  # the same of points on fitted surfaces, below which something connects it to the scene
-WHOLE = 0.95  # fraction in an image that shows the whole object
+LEAST_WITHIN = 0.5  # fraction in the region, below which something connects fitted surfaces to the scene
+MARGIN = 0.2  # around the group, in radii of its ball: thin or blurred parts may be missing
 FREE_SHARE = 0.15  # of the centre's depth, empty before a camera; a table seen from 5° above begins at 0.18
-# Balls around the group.
-ENCLOSED, FITTED_BALL = 1.05, 1.1  # radius over that of the smallest ball: of sparse points, of fitted ones
+
+# The directions (26, 3) to the corners, edges and faces of a cube, then their opposites: a region is a sphere
+# between planes with these normals. [k-DOP: Klosowski et al. 1998]
+NORMALS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if d > (0, 0, 0)])
+NORMALS = np.concatenate([NORMALS, -NORMALS]) / np.linalg.norm([*NORMALS, *NORMALS], axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,12 @@ class Scatter:
 
     width: float  # half the thickness of the points of a plane
     link: float  # distance of neighbours in a group
-    lift: float = 0.0  # height above a plane up to which inaccurate points of the plane may lie
+    lift: float  # height above the region's planes up to which inaccurate points of a plane may lie
 
 
-SPARSE = Scatter(0.01, 0.15)  # structure from motion: holds 98 % of the points on the cloth of *tabletop*
+SPARSE = Scatter(0.01, 0.15, 0.03)  # structure from motion: 98 % of the points on the cloth of *tabletop*
 DENSE = Scatter(0.02, 0.08, 0.1)  # stereo: widths from 0.015, links to 0.1, lifts to 0.15 find the same
-FITTED = Scatter(0.1, 0.08)  # halfway through a fit, a varnished table is off by 0.1; 0.06 to 0.15 find it
+FITTED = Scatter(0.1, 0.08, 0.03)  # a varnished table is off by 0.1; widths from 0.06 to 0.15 find it
 
 Seen = Callable[[np.ndarray], np.ndarray]  # fraction (N,) of the views that show points (N, 3)
 
@@ -60,9 +64,9 @@ def support_planes(
     """Planes PLANE_MARGIN above surfaces that support an object, with nearly all cameras above them."""
     rng = np.random.default_rng(0)
     radius, width = region.radius, width * region.radius
-    points = points[np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * radius]
+    points = points[np.linalg.norm(points - np.array(region.centre), axis=1) < REACH * radius]
     points = rng.permutation(points)[:MOST_POINTS]
-    least, found = max(PLANE_POINTS, PLANE_SHARE * len(points)), list[Plane]()
+    least, found = max(FEWEST, PLANE_SHARE * len(points)), list[Plane]()
     while len(points) >= least and len(found) < most:
         # Planes through three points, with the cameras above.
         corner = points[rng.integers(len(points), size=(2_000, 3))]  # 30 good ones if a quarter is on one
@@ -102,65 +106,53 @@ def object_region(
     """The region of an object, from the sphere that cameras (V, 3) suggest and points (N, 3) on surfaces."""
     region = replace(region, planes=support_planes(points, origins, region, scatter.width))
     group = object_points(region, points, seen, scatter)
-    if len(group) < GROUP_POINTS or np.mean(region.contains(group)) >= WITHIN_SHARE:
+    if not len(group) or np.mean(region.contains(group)) >= WHOLE:
         return region
-    # The ball around the group and the part of the sphere above the planes, with the cameras outside.
+    # The part of the sphere above the planes stays: untextured parts of the object have no points.
     offset = np.random.default_rng(0).normal(size=(2_000, 3))
     offset *= region.radius / np.linalg.norm(offset, axis=1, keepdims=True)
     sphere = np.array(region.centre) + offset
-    centre, radius = enclosing_ball(np.concatenate([group, sphere[region.above(sphere)]]))
-    return _with_ball(region, centre, ENCLOSED * radius, origins)
+    return enclosed(np.concatenate([group, sphere[region.above(sphere)]]), region, origins)
 
 
 def shown_whole(views: Sequence[View], region: Region, points: np.ndarray, scatter: Scatter = SPARSE) -> bool:
     """Whether an image shows the whole object, as far as points (N, 3) tell."""
     group = object_points(region, points, lambda chosen: np.ones(len(chosen)), scatter)
-    return len(group) < GROUP_POINTS or any(np.mean(view.project(group)[2]) >= WHOLE for view in views)
+    return not len(group) or any(np.mean(view.project(group)[2]) >= WHOLE for view in views)
 
 
 def fitted_region(region: Region, origins: np.ndarray, points: np.ndarray, seen: Seen) -> Region | None:
-    """The region of an object from points (N, 3) on all surfaces of a fit; None without a group of points: a
-    ball and a box around it, above the planes of `region`, or, if it has none, above one of these points."""
-    if not region.planes:
-        region = replace(region, planes=support_planes(points, origins, region, FITTED.width, most=1))
+    """The region of an object from points (N, 3) on all surfaces of a fit; None without a group of points. It
+    is above the planes that support `region`, or, if there are none, above one of these points."""
+    planes = region.supports or support_planes(points, origins, region, FITTED.width, most=1)
+    region = replace(region, planes=planes)
     group = object_points(region, points, seen, FITTED)
-    if len(group) < GROUP_POINTS or np.mean(region.contains(group)) < LEAST_WITHIN:
+    if not len(group) or np.mean(region.contains(group)) < LEAST_WITHIN:
         return None
-    centre, radius = enclosing_ball(group)
-    if FITTED_BALL * radius > _room(centre, origins):
-        centre, radius = _ball_beside_cameras(group, origins)
-    region = _with_ball(region, centre, FITTED_BALL * radius, origins)
-    axes = np.linalg.svd(group - group.mean(axis=0), full_matrices=False)[2]
-    normals = np.concatenate([axes, -axes])
-    offsets = np.min(group @ normals.T, axis=0) - 0.2 * region.radius  # thin parts may be missing
-    box = [(a, b, c, d) for a, b, c, d in np.column_stack([normals, offsets]).tolist()]
-    return replace(region, planes=(*region.planes, *box))
+    return enclosed(group, region, origins)
 
 
-def _ball_beside_cameras(group: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) in a group (N, 3) around which a ball free of cameras has most; radius for all of it."""
-    middle = group.mean(axis=0)
-    outwards = group[evenly_spread(len(group), 100)] - middle
-    centres = np.concatenate([middle + share * outwards for share in (0.0, 0.25, 0.5, 0.75)])
-    away = cdist(centres, group)
-    best = int(np.argmax(np.mean(away <= _room(centres, origins)[:, None], axis=1)))
-    return centres[best], float(away[best].max())
-
-
-def _with_ball(region: Region, centre: np.ndarray, radius: float, origins: np.ndarray) -> Region:
-    """The region with another sphere, which is smaller if a camera is near."""
+def enclosed(points: np.ndarray, region: Region, origins: np.ndarray) -> Region:
+    """The ball around points (N, 3) and planes beside them, all MARGIN away, above those of `region`. A plane
+    with a camera (V, 3) inside moves to the points, or, if it is among them, before it."""
+    centre, radius = enclosing_ball(points)
+    normals = NORMALS @ np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    nearest = np.min((points - centre) @ normals.T, axis=0)  # heights above planes through the centre
+    lowest = nearest - MARGIN * radius
+    for height in (origins - centre) @ normals.T:
+        if np.all(height >= lowest):
+            i = int(np.argmin(np.where(height < 0, height - lowest, np.inf)))
+            lowest[i] = CAMERA_SHARE * height[i] if height[i] >= nearest[i] else nearest[i]
     x, y, z = map(float, centre)
-    return replace(region, centre=(x, y, z), radius=min(radius, float(_room(centre, origins))))
-
-
-def _room(centres: np.ndarray, origins: np.ndarray) -> np.ndarray:
-    """Largest radius (...) of a region around centres (..., 3), with the cameras (V, 3) outside."""
-    return np.asarray(CAMERA_SHARE * np.linalg.norm(origins - centres[..., None, :], axis=-1).min(axis=-1))
+    offsets = normals @ centre + lowest
+    hull = [(a, b, c, d) for a, b, c, d in np.column_stack([normals, offsets]).tolist()]
+    return replace(region, centre=(x, y, z), radius=(1 + MARGIN) * radius, planes=(*region.planes, *hull))
 
 
 def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatter) -> np.ndarray:
-    """The group (M, 3) of points (N, 3) above the planes that most views show, with most in the sphere."""
-    near = np.linalg.norm(points - np.array(region.centre), axis=1) < PLANE_REACH * region.radius
+    """The group (M, 3) of points (N, 3) above the planes that most views show, with most in the region; empty
+    if these are fewer than FEWEST."""
+    near = np.linalg.norm(points - np.array(region.centre), axis=1) < REACH * region.radius
     points = points[near & region.above(points, scatter.lift * region.radius)]
     points = np.random.default_rng(0).permutation(points)[: 2 * MOST_POINTS]
     points, link = points[seen(points) >= SEEN_SHARE], scatter.link * region.radius
@@ -171,7 +163,8 @@ def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatt
     pairs = KDTree(points).query_pairs(link, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
     label = connected_components(graph, directed=False)[1]
-    return np.asarray(points[label == np.argmax(np.bincount(label, region.contains(points)))])
+    within = np.bincount(label, region.contains(points))
+    return np.asarray(points[(label == np.argmax(within)) & (within.max() >= FEWEST)])
 
 
 def enclosing_ball(points: np.ndarray) -> tuple[np.ndarray, float]:

@@ -62,6 +62,16 @@ class Region:
         found |= {"planes": [list(plane) for plane in self.planes]} if self.planes else {}
         return found | ({"estimated": True} if self.estimated else {})
 
+    @property
+    def supports(self) -> tuple[Plane, ...]:
+        """The planes without those around a fitted object: at the end, three opposite pairs or more."""
+        normals = np.array(self.planes).reshape(-1, 4)[:, :3]
+        for pairs in range(len(normals) // 2, 2, -1):
+            first, second = normals[-2 * pairs : -pairs], normals[-pairs:]
+            if np.abs(first + second).max() < SAME:
+                return self.planes[: -2 * pairs]
+        return self.planes
+
     def moved(self, offset: np.ndarray) -> Region:
         x, y, z = (float(c) for c in np.array(self.centre) + offset)
         planes = tuple((a, b, c, d + float(np.dot((a, b, c), offset))) for a, b, c, d in self.planes)

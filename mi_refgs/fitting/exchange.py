@@ -15,7 +15,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 
-REACH = 2.0  # deviations to which a surfel extends: one through the plane below the object is the table's
+REACH = 1.0  # deviations to which a surfel extends: one through the plane below the object is the table's
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
 
 

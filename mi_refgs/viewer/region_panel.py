@@ -8,14 +8,13 @@ import numpy as np
 import trimesh
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.region import REGION_FILE, Plane, Region
+from mi_refgs.data.region import REGION_FILE, Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_json
 from mi_refgs.io.progress import command_line
 from mi_refgs.viewer.page import Page
 
 RADII, STEPS = (0.1, 3.0), 100  # limits of the slider, in the first radius, and steps of a slider per radius
-OPPOSITE = 1e-6  # difference of unit normals up to which planes are opposite sides of a box
 
 
 class RegionPanel:
@@ -30,7 +29,7 @@ class RegionPanel:
             low, high = (factor * radius for factor in RADII)
             self.radius = gui.add_slider("Radius", low, high, radius / STEPS, radius, hint="Scene units.")
             hint = "Raises the plane that supports the object, scene units."
-            names = [f"Plane {i + 1}" for i in range(len(support_planes(region.planes)))]
+            names = [f"Plane {i + 1}" for i in range(len(region.supports))]
             bounds = (-radius, radius, radius / STEPS, 0.0)
             self.heights = [gui.add_slider(name, *bounds, hint=hint) for name in names]
             save = gui.add_button("Save region", hint=f"As {REGION_FILE} of the data set, for the next fit.")
@@ -79,13 +78,6 @@ def save_region(region: Region, data: Dataset, again: bool = False) -> str:
     moved = replace(region, estimated=False).moved(np.array(data.offset))
     write_json(data.path / REGION_FILE, moved.content)
     return f"saved `{data.path / REGION_FILE}`; next: `{command_line('train', data.path, '-o', 'RUN')}`"
-
-
-def support_planes(planes: Sequence[Plane]) -> Sequence[Plane]:
-    """Return the planes without the box around a fitted object: the last three pairs of `fitted_region`."""
-    normals = np.array(planes).reshape(-1, 4)[-2 * 3 :, :3]
-    is_box = len(normals) == 2 * 3 and np.abs(normals[:3] + normals[3:]).max() < OPPOSITE
-    return planes[: -2 * 3] if is_box else planes
 
 
 def adjusted(region: Region, centre: np.ndarray, radius: float, heights: Sequence[float]) -> Region:

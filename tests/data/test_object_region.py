@@ -1,11 +1,15 @@
 """The region of an object: what supports it is left out, what it consists of is inside."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
+import pytest
 
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.object_region import (
+    DENSE,
+    NORMALS,
     camera_positions,
     fitted_region,
     in_free_space,
@@ -21,13 +25,12 @@ from mi_refgs.reference.camera import look_at
 TABLE = -0.5  # height of the table in these scenes
 
 
-def views_around(target: tuple[float, float, float], focal: float = 120.0, count: int = 24) -> list[View]:
-    """Views of 100² pixels from above the table, at a distance of about 4."""
-    angle = np.arange(count) * 2.4
-    height = 1 + np.arange(count) % 5 / 3
-    origins = np.stack([4 * np.cos(angle), 4 * np.sin(angle), height], axis=1)
+def views_around(at: tuple[float, float, float], focal: float = 120.0, distance: float = 4.0) -> list[View]:
+    """24 views of 100² pixels from above the table."""
+    angle, height = np.arange(24) * 2.4, 1 / 4 + np.arange(24) % 5 / 12
+    origins = distance * np.stack([np.cos(angle), np.sin(angle), height], axis=1)
     pixels = Pixels(np.zeros((100, 100, 3), np.float32))
-    return [View("v", 100, 100, focal, focal, 50, 50, look_at(o, np.array(target)), pixels) for o in origins]
+    return [View("v", 100, 100, focal, focal, 50, 50, look_at(o, np.array(at)), pixels) for o in origins]
 
 
 def box(low: tuple[float, ...], high: tuple[float, ...], count: int, rng: np.random.Generator) -> np.ndarray:
@@ -103,19 +106,44 @@ def test_surfaces_of_fit_enclose_object_alone(rng: np.random.Generator) -> None:
     assert fitted_region(region, origins, table(rng), seen) is None
 
 
-def test_object_that_cameras_approach_is_whole(rng: np.random.Generator) -> None:
-    """A long object on a wall: around its middle, cameras near its end leave room for a part of it only."""
+BAR, DISH = ((-1.0, -0.25, TABLE), (1.0, 0.25, 0.0)), ((-0.7, -0.7, TABLE), (0.7, 0.7, TABLE + 0.12))
+L = ((-0.8, -0.8, TABLE), (0.8, -0.4, -0.2)), ((-0.8, -0.4, TABLE), (-0.4, 0.8, -0.2))
+
+
+@pytest.mark.parametrize("distance", [4.0, 1.5])  # of the cameras: next to the object, a sphere cuts it
+@pytest.mark.parametrize("boxes", [[BAR], L, [DISH]], ids=["bar", "L", "dish"])
+def test_object_of_any_shape_is_whole(boxes: list[Any], distance: float, rng: np.random.Generator) -> None:
+    """Before a fit and during it; without the table, what is beside the object, and the cameras."""
+    views = views_around((0, 0, -0.2), 80.0, distance)
+    cameras, seen, sphere = camera_positions(views), partial(seen_share, views), region_of(views)
+    item = np.concatenate([box(low, high, 4000, rng) for low, high in boxes])
+    beside, cloth = box((1.3, 1.3, TABLE), (1.6, 1.6, -0.2), 1000, rng), table(rng, 10_000)
+    points, above = np.concatenate([cloth, item, beside]), item[item[:, 2] > TABLE + 0.04]
+    before = object_region(sphere, cameras, points, seen, DENSE)
+    during = fitted_region(before, cameras, points, seen)
+    assert during is not None and len(during.planes) == len(before.supports) + len(NORMALS)
+    for region in (before, during):
+        assert region.contains(above).all() and not region.contains([*cameras, *cloth]).any()
+    assert not during.contains(beside).any() and sphere.contains(above).all() == (distance > 2)
+    # Lower than the points of a table are accurate: its neighbour must not become the object.
+    points = np.concatenate([cloth, item * [1, 1, 0] + [0, 0, TABLE + 0.03], beside])
+    low = object_region(sphere, cameras, points, seen, DENSE)
+    assert low.radius == sphere.radius and fitted_region(low, cameras, points, seen) is None
+
+
+def test_a_camera_next_to_the_object_stays_outside(rng: np.random.Generator) -> None:
+    """Right at the end of a long object on a wall, and in the hollow of an L."""
     wall = np.column_stack([np.zeros(2000), rng.uniform(-3, 3, (2000, 2))])
-    thing = box((0.1, -0.4, -0.4), (2.2, 0.4, 0.4), 3000, rng)
-    origins = np.array([[2.3, 0.5 * np.sin(t), 0.5 * np.cos(t)] for t in np.linspace(0, 6, 20)])
-    region = Region((1.0, 0, 0), 1.2, ((1.0, 0.0, 0.0, 0.05),))
-    found = fitted_region(region, origins, np.concatenate([wall, thing]), lambda points: np.ones(len(points)))
-    assert found is not None
-    assert found.radius <= 0.8 * np.linalg.norm(origins - np.array(found.centre), axis=1).min() + 1e-9
-    middle = np.array([1.15, 0, 0])
-    room = 0.8 * np.linalg.norm(origins - middle, axis=1).min()
-    around_middle = np.mean(np.linalg.norm(thing - middle, axis=1) <= room)
-    assert np.mean(found.contains(thing)) > around_middle + 0.05 and 0.1 < found.centre[0] < middle[0]
+    ring = np.array([[2.3, 0.5 * np.sin(t), 0.5 * np.cos(t)] for t in np.linspace(0, 6, 20)])
+    bar = box((0.1, -0.4, -0.4), (2.2, 0.4, 0.4), 3000, rng)
+    both = np.concatenate([bar, box((0.1, 0.4, -0.4), (0.7, 1.8, 0.4), 2000, rng)])
+    region, hollow = Region((1.0, 0.0, 0.0), 1.2, ((1.0, 0.0, 0.0, 0.05),)), np.array([[1.3, 0.8, 0.0]])
+    for thing, cameras, least in ((bar, ring, 0.99), (both, hollow, 0.75)):
+        found = fitted_region(
+            region, cameras, np.concatenate([wall, thing]), lambda points: np.ones(len(points))
+        )
+        assert found is not None and not found.contains(cameras).any()
+        assert np.mean(found.contains(thing)) >= least
 
 
 def test_free_space_is_right_in_front_of_a_camera() -> None:

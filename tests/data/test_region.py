@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.data.images import Pixels
+from mi_refgs.data.object_region import NORMALS
 from mi_refgs.data.region import (
     REGION_FILE,
     Plane,
@@ -124,3 +125,13 @@ def test_region_moves_with_its_planes() -> None:
 def test_broken_region_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / REGION_FILE).write_text(text)
     refused(lambda: read_region(tmp_path), REGION_FILE)
+
+
+def test_planes_around_an_object_are_told_from_its_supports() -> None:
+    """Three opposite pairs or more, at the end."""
+    table, faces = (0.0, 0.0, 1.0, -0.2), np.concatenate([NORMALS, np.eye(3), -np.eye(3)])
+    pairs = [tuple(row) for row in np.column_stack([faces, np.full(len(faces), -1.0)]).tolist()]
+    for planes in ((), (table,), (table, (0.0, 0.0, -1.0, -1.0)), (table, *pairs[:4])):
+        assert Region((0, 0, 0), 1, planes).supports == planes
+    for around in (pairs[:26], pairs[26:]):
+        assert Region((0, 0, 0), 1, (table, *around)).supports == (table,)

@@ -12,7 +12,7 @@ from mi_refgs.fitting.exchange import depth_outside
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.viewer.page import Page
 from mi_refgs.viewer.reconstruction_view import ReconstructionView
-from mi_refgs.viewer.region_panel import RegionPanel, adjusted, border, save_region, support_planes
+from mi_refgs.viewer.region_panel import RegionPanel, adjusted, border, save_region
 from tests.helpers import refused
 from tests.scenes.tiny import REGION, write_open_data
 
@@ -36,8 +36,6 @@ def test_the_border_is_that_of_the_region(planes: tuple[tuple[float, float, floa
 
 
 def test_a_box_follows_the_sphere_and_the_table_stays(rng: np.random.Generator) -> None:
-    assert support_planes(FITTED.planes) == (TABLE,) and support_planes(()) == ()
-    assert support_planes((TABLE, (0, 0, -1, -1))) == (TABLE, (0, 0, -1, -1))
     region = adjusted(FITTED, np.array([1.0, 0.5, 0.3]), 2.0, [0.05])
     assert region.centre == (1.0, 0.5, 0.3) and region.radius == 2.0
     assert region.planes[0] == pytest.approx((0, 0, 1, -0.15))
