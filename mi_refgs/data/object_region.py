@@ -141,7 +141,7 @@ def enclosed(points: np.ndarray, region: Region, origins: np.ndarray) -> Region:
     lowest = nearest - MARGIN * radius
     for height in (origins - centre) @ normals.T:
         if np.all(height >= lowest):
-            i = int(np.argmin(np.where(height < 0, height - lowest, np.inf)))
+            i = int(np.argmin(np.where(height < 0, height - nearest, np.inf)))
             lowest[i] = CAMERA_SHARE * height[i] if height[i] >= nearest[i] else nearest[i]
     x, y, z = map(float, centre)
     offsets = normals @ centre + lowest

@@ -123,7 +123,7 @@ def test_object_of_any_shape_is_whole(boxes: list[Any], distance: float, rng: np
     during = fitted_region(before, cameras, points, seen)
     assert during is not None and len(during.planes) == len(before.supports) + len(NORMALS)
     for region in (before, during):
-        assert region.contains(above).all() and not region.contains([*cameras, *cloth]).any()
+        assert region.contains(above).all() and not region.contains(np.concatenate([cameras, cloth])).any()
     assert not during.contains(beside).any() and sphere.contains(above).all() == (distance > 2)
     # Lower than the points of a table are accurate: its neighbour must not become the object.
     points = np.concatenate([cloth, item * [1, 1, 0] + [0, 0, TABLE + 0.03], beside])

@@ -198,7 +198,7 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     outside = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.105], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]]
     np.testing.assert_allclose(other, outside, atol=1e-6)
     # Tangents along x and y, deviations of 0.1: they extend through the second plane, not through the first.
-    wide = table(method.surfels.names, [[0, 0, 0.2], [-0.35, 0, 0.2]], 0.1)
+    wide = table(method.surfels.names, [[0, 0, 0.2], [-0.45, 0, 0.2]], 0.1)
     own, _ = (edit.surfels.to_numpy()["position"] for edit in exchanged(wide, outer, method, region, rng))
     np.testing.assert_allclose(own[:1], [[0, 0, 0.2]], atol=1e-6)
     assert not np.any(own[:, 0] < -0.1)
