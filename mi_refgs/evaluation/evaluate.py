@@ -41,7 +41,7 @@ SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
 ORANGE = np.array([0.75, 0.3, 0.0])  # of concave pixels
 MEANS = """psnr_aligned psnr_aligned_region psnr_aligned_object psnr psnr_region psnr_object ssim ssim_region
     region_share lpips normal_mae_deg normal_mae_deg_full""".split()  # scores whose means are reported
-REGISTERED = 256**2  # pixels of the averaged image to which a pose is fitted, at most: the renders take time
+REGISTERED = 128**2  # pixels of the averaged image to which a pose is fitted, at most: the renders take time
 
 
 def evaluate(
