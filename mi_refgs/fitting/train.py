@@ -129,14 +129,14 @@ class Trainer:
         with dr.suspend_grad():
             return per_view.corrected(self.setup, self.fit.params, index, self.data.views[index].camera())
 
-    def view(self, camera: Camera, aovs: bool = True) -> Frame:
-        """Render the present state as its export does, without derivatives."""
+    def view(self, camera: Camera, aovs: bool = True, surfels: Surfels | None = None) -> Frame:
+        """Render the present state, or other `surfels` in it, as its export does, without derivatives."""
         with dr.suspend_grad():
             shading = self.shading().antialiased()
             self.fit.update_missing_caches(shading)
             light, around = shading.light_of(self.fit.light), self.fit.surroundings
             given = (light, self.fit.occluder, around, self.fit.near, self.fit.turntable)
-            scene = SurfelScene(self.surfels, shading, *given)
+            scene = SurfelScene(surfels or self.surfels, shading, *given)
             degree = self.setup.sh_degree(self.iteration)
             return render(scene, camera, Request(scene.all_aovs if aovs else (), not aovs, sh_degree=degree))
 

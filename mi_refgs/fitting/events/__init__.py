@@ -3,7 +3,7 @@
 ORDER = (
     # After every step:
     *("densify", "reset_opacity", "propagate", "exposure", "cameras", "follow_object", "photograph_light"),
-    *("mesh", "restart"),
+    *("mesh", "metal_evidence", "restart"),
     # In `Trainer.train` only:
     *("hold_out", "metal", "colour_alone", "more_surfels"),
 )
