@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mi_refgs import methods
-from mi_refgs.errors import InputError
 from mi_refgs.fitting.events import metal_evidence as event
 from mi_refgs.fitting.image_error import displayed_image
 from mi_refgs.fitting.train import Trainer
@@ -63,11 +61,7 @@ def test_images_decide(tmp_path: Path, rng: np.random.Generator, monkeypatch: py
         shown = displayed_image(frame, view, data), image_array(frame.alpha, view.height, view.width)
         views.append(with_pixels(view, image=shown[0], alpha=shown[1]))
     trainer.use(replace(data, views=tuple(views)))
-    unknown = {
-        "metallic": np.zeros((COUNT, 1)),
-        "albedo": np.zeros((COUNT, 3)),
-        "radiance_sh": 0 * raw["radiance_sh"],
-    }
+    unknown = {name: 0 * raw[name] for name in ("metallic", "albedo", "radiance_sh")}
     trainer.fit.tables[0].replace(Surfels.from_numpy(raw | unknown))
 
     monkeypatch.setattr(event, "STEPS", 4)  # COUNT surfels are few
@@ -114,8 +108,3 @@ def test_neighbours_of_the_same_colour_decide(rng: np.random.Generator) -> None:
     learnt = Surfels.from_numpy(raw | {"metallic": logit(np.where(left, 0.9, 0.2))})
     gain = event.preferred(learnt, np.ones_like(errors), pixels, colour)
     np.testing.assert_allclose(gain, event.FITTED * np.where(left, 0.4, -0.3), rtol=1e-3)
-
-
-def test_it_needs_metallic() -> None:
-    with pytest.raises(InputError, match=r"event\.metal_evidence: there is no attribute 'albedo'"):
-        methods.load("base_2dgs", "quick", ["event.metal_evidence.when={start=0, until=9, every=3}"])
