@@ -1,7 +1,5 @@
 """Parts that are true do not depend on what was fitted there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

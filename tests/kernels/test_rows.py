@@ -1,7 +1,5 @@
 """Packed rows: values, additions and their memory; columns and joined arrays in both derivative modes."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

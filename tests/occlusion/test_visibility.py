@@ -1,7 +1,5 @@
 """Visibility through an extracted mesh against sphere tracing of the true shape."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import drjit as dr

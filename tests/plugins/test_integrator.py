@@ -1,7 +1,5 @@
 """The `refgs` plugin: scenes, lights, parameters, refusals, variants."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

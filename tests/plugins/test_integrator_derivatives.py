@@ -1,7 +1,5 @@
 """Derivatives of mi.render with the `refgs` plugin, in both modes, against its central differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
