@@ -3,6 +3,8 @@
 Errors are those against central differences of images, in both modes, with one and two threads; 5e-3 is what
 differences of float32 images resolve."""
 
+from __future__ import annotations
+
 import re
 import tempfile
 import warnings

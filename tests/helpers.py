@@ -1,5 +1,7 @@
 """Helpers of several tests: refused input, vectors, light levels, fresh processes, imports of a source."""
 
+from __future__ import annotations
+
 import ast
 import contextlib
 import io

@@ -1,5 +1,7 @@
 """Laws of images: what they do not depend on, what they may not exceed, and that derivatives are linear."""
 
+from __future__ import annotations
+
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory

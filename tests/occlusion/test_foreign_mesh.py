@@ -1,5 +1,7 @@
 """Meshes made elsewhere, of few triangles and of any size, as occluders."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Visibility through an extracted mesh against sphere tracing of the true shape."""
 
+from __future__ import annotations
+
 from types import SimpleNamespace
 
 import drjit as dr

@@ -1,5 +1,7 @@
 """Derivatives of mi.render with respect to a sensor's `to_world`, `x_fov` and principal point."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Reflections averaged over a pixel: the float64 reference, and the quadrature."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import drjit as dr

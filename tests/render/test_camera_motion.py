@@ -1,5 +1,7 @@
 """Cameras that are displaced: their numbers, and derivatives of images against float64."""
 
+from __future__ import annotations
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np

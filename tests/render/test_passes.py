@@ -1,5 +1,7 @@
 """Images in passes: the same as in one, with the same derivatives, kernels and less at a time."""
 
+from __future__ import annotations
+
 from collections import Counter
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """The scene.xml of a run shows what the run shows: camera, options and all."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

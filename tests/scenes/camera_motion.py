@@ -1,5 +1,7 @@
 """Rigid motions of a camera about a point, and a test of derivatives with respect to them."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import drjit as dr

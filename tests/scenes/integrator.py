@@ -1,5 +1,7 @@
 """Small scenes of overlapping discs for tests of the renderer and the `refgs` plugin."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Random surfels and a camera for tests of splatting against the float64 reference, and what they compare."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,5 +1,7 @@
 """The scene's environment as a light: turned and mirrored as Mitsuba shows it."""
 
+from __future__ import annotations
+
 import mitsuba as mi
 import numpy as np
 import pytest

@@ -1,5 +1,7 @@
 """Values that are NaN, infinite or huge: they end no process, spoil no image, and are named."""
 
+from __future__ import annotations
+
 import warnings
 from pathlib import Path
 from typing import Any
