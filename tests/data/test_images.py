@@ -5,6 +5,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, create_autospec
 
 import numpy as np
 import pytest
@@ -41,17 +42,11 @@ def jpeg(path: Path, pixels: np.ndarray, **options: Any) -> Path:
 
 
 @pytest.fixture
-def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Stems of the files that are decoded."""
-    stems: list[str] = []
-    decode = ImageFile.decode
-
-    def recorded(file: ImageFile) -> np.ndarray:
-        stems.append(file.path.stem)
-        return decode(file)
-
+def decode(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """Records the files that are decoded."""
+    recorded: Mock = create_autospec(ImageFile.decode, side_effect=ImageFile.decode)
     monkeypatch.setattr(ImageFile, "decode", recorded)
-    return stems
+    return recorded
 
 
 @pytest.mark.parametrize(
@@ -208,13 +203,14 @@ def test_cached_image_equals_decoded_image(budget: int, tmp_path: Path, rng: np.
     assert cache.bytes <= budget
 
 
-def test_cache_keeps_images_used_last(tmp_path: Path, rng: np.random.Generator, decoded: list[str]) -> None:
+def test_cache_keeps_images_used_last(tmp_path: Path, rng: np.random.Generator, decode: Mock) -> None:
     for name in "abc":
         write_png(tmp_path / f"{name}.png", rng.random((10, 10, 4)))
     cache = ImageCache(2 * 400)
     for name in "abacabc":
         cache.pixels(ImageFile.of(tmp_path / f"{name}.png", 1))
-    assert decoded == ["a", "b", "c", "b", "c"] and cache.bytes == 800
+    stems = [call.args[0].path.stem for call in decode.call_args_list]
+    assert stems == ["a", "b", "c", "b", "c"] and cache.bytes == 800
 
 
 def test_image_decoded_by_two_threads_counts_once(
@@ -240,22 +236,16 @@ def test_targets_are_uploaded_at_once_or_when_used(monkeypatch: pytest.MonkeyPat
     coarse = CoarseImages(until=3, block=2), CoarseImages(until=2, block=4, least=37)
     options = DataOptions(coarse=coarse)
     whole, one = Targets(data, options), PIXEL_BYTES * 24 * 24
-    made: list[int] = []
-    real = View.camera
-
-    def camera(view: View) -> Any:
-        made.append(int(view.name))
-        return real(view)
-
+    camera = create_autospec(View.camera, side_effect=View.camera)
     monkeypatch.setattr(View, "camera", camera)
     few = Targets(data, options, 2 * one)
-    assert not made
+    assert not camera.called
     for index in (0, 1, 0, 2, 0, 1):
         assert few.at(4, index).camera.width == 24
         assert np.array_equal(few.at(4, index).image[0], whole.at(4, index).image[0])
         assert whole.at(1, index).camera.width == whole.at(3, index).camera.width == 12
         assert whole.at(4, index) is whole.at(5, index)
-    assert made == [0, 1, 2, 1]
+    assert [call.args[0].name for call in camera.call_args_list] == ["0", "1", "2", "1"]
     lone = Targets(data, options, 1)
     assert lone.at(4, 3) is lone.at(4, 3) is not lone.at(4, 4)
 
@@ -277,7 +267,7 @@ def test_crop_of_a_target_is_that_part_of_its_view() -> None:
     assert linear.clipped is None and linear.alpha is None
 
 
-def test_view_is_decoded_only_by_load(tmp_path: Path, decoded: list[str]) -> None:
+def test_view_is_decoded_only_by_load(tmp_path: Path, decode: Mock) -> None:
     """`image` of a view that is not loaded raises; `has_alpha` is from the header."""
     frames = [{"file_path": "a.jpg", "transform_matrix": np.eye(4).tolist()}]
     data = write_transforms(tmp_path, frames, camera_angle_x=0.7)
@@ -286,12 +276,12 @@ def test_view_is_decoded_only_by_load(tmp_path: Path, decoded: list[str]) -> Non
     assert not view.has_alpha and view.alpha is None
     with pytest.raises(RuntimeError, match=r"view 'a' is not loaded; use view\.load\(\)\.image"):
         view.image  # noqa: B018
-    assert not decoded
+    assert not decode.called
     loaded = view.load()
     assert loaded.load() is loaded and loaded.alpha is None
-    assert np.array_equal(loaded.image, view.load().image) and decoded == ["a"]
+    assert np.array_equal(loaded.image, view.load().image) and decode.call_count == 1
     Target.of(view, np.ones(3))
-    assert decoded == ["a"]
+    assert decode.call_count == 1
 
 
 def test_pixels_of_another_shape_than_the_view_are_refused() -> None:

@@ -5,7 +5,7 @@ import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from mi_refgs.io.images import read_png, write_png
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods import load_resolved
 from mi_refgs.render.display import displayed
-from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
+from mi_refgs.render.pipeline import render
 from mi_refgs.runs.run import CAMERAS, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import measured_views, read_views
@@ -62,15 +62,11 @@ def trainer(run: Run, data: Path) -> Trainer:
 
 def test_trainer_metrics(run: Run, trainer: Trainer, views: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exported, read back and measured: every metric, view by view, of frames with AOVs and timed without."""
-    asked: list[bool] = []
-
-    def rendered(scene: SurfelScene, camera: Any, request: Request) -> Frame:
-        asked.append(bool(request.aovs))
-        return render(scene, camera, request)
-
+    rendered = Mock(wraps=render)
     with monkeypatch.context() as patch:
         patch.setattr("mi_refgs.runs.trained_scene.render", rendered)
         result = evaluate(run)
+    asked = [bool(call.kwargs["request"].aovs) for call in rendered.call_args_list]
     assert asked == [True] * 4 + [False] * (metrics.WARM_UP_FRAMES + metrics.TIMED_FRAMES)
     assert result["antialias"] and not trainer.shading().antialias
     scores = []

@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -236,23 +237,18 @@ def test_points_of_a_surface_are_where_depth_is_level_and_opaque() -> None:
 def test_region_follows_object_once(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a third of the fit, unless a user gave the region; a checkpoint has it, and edits use it."""
     found = replace(REGION, radius=0.5, planes=((0.0, 0.0, 1.0, 0.0),), estimated=True)
-    seen, said = list[int](), list[str]()
-
-    def fitted(region: Region, cameras: np.ndarray, points: np.ndarray, seen_share: object) -> Region | None:
-        seen.append(len(cameras))
-        return found
-
+    fitted, said = Mock(return_value=found), list[str]()
     monkeypatch.setattr(open_scene, "fitted_region", fitted)
     step_to(Trainer(method, data), STEPS // 2)
-    assert not seen  # region.json
+    assert not fitted.called  # region.json
     guessed = replace(data, region=replace(REGION, estimated=True))
     trainer = step_to(Trainer(method, guessed, tell=said.append), STEPS // 3 + 1)
-    assert len(seen) == len(said) == 1 and trainer.region == found and "0.5 units" in said[0]
+    assert fitted.call_count == len(said) == 1 and trainer.region == found and "0.5 units" in said[0]
     position = trainer.surfels.to_numpy()["position"]
     assert depth_outside(position, found).max() < 0.05
     resumed = Trainer(method, guessed, state=trainer.state())
     step_to(resumed, STEPS // 2)
-    assert resumed.region == found and len(seen) == 1
+    assert resumed.region == found and fitted.call_count == 1
     monkeypatch.setattr(open_scene, "fitted_region", lambda *_: None)
     same = step_to(Trainer(method, guessed, tell=said.append), STEPS // 3 + 1)
     assert same.region == REGION and "stays" in said[-1]
@@ -282,21 +278,17 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
     data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Transparent ones of the object and of the background have no weight in any view; others have."""
-    trainer, hidden, found = Trainer(method, data), (np.arange(5), np.arange(20, 32)), []
+    trainer, hidden = Trainer(method, data), (np.arange(5), np.arange(20, 32))
     for table, rows in zip(trainer.fit.tables, hidden, strict=True):
         raw = table.surfels.to_numpy()
         raw["opacity"][rows] = -10
         table.replace(Surfels.from_numpy(raw))
-
-    def edited(*given: Any, faint: np.ndarray, **options: Any) -> Any:
-        found.append(faint)
-        return densify(*given, faint=faint, **options)
-
-    densify = densify_event.densify_and_prune
-    monkeypatch.setattr(densify_event, "densify_and_prune", edited)
+    edit = Mock(wraps=densify_event.densify_and_prune)
+    monkeypatch.setattr(densify_event, "densify_and_prune", edit)
     trainer.fit.iteration = 4
     trainer.method.event["densify"].apply(trainer)
-    for faint, count, rows in zip(found, (80, 60), hidden, strict=True):
+    for call, count, rows in zip(edit.call_args_list, (80, 60), hidden, strict=True):
+        faint = call.kwargs["faint"]
         assert np.isin(rows, faint).all() and len(faint) < count / 2
 
 
@@ -465,16 +457,11 @@ def test_images_without_alpha_have_a_method_of_their_own(
     """It is chosen from one reading, without decoding an image, and fits a background."""
     said: list[str] = []
     monkeypatch.setattr(ImageFile, "decode", lambda _: pytest.fail("an image was decoded"))
-    reads, read = list[str](), READERS.values
-
-    def counted() -> object:
-        reads.append("")
-        return read()
-
-    monkeypatch.setattr(READERS, "values", counted)
+    read = Mock(wraps=READERS.values)
+    monkeypatch.setattr(READERS, "values", read)
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
     assert method.name == without and any(without in text for text in said) == (without != purpose)
-    assert len(reads) == 1 and views.split == "train"
+    assert read.call_count == 1 and views.split == "train"
     monkeypatch.undo()
     objects = write_data(tmp_path, views=3, truth=False)
     assert chosen(objects, Choice(purpose=purpose))[0].name == alpha

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import mitsuba as mi
 import numpy as np
@@ -95,17 +96,13 @@ def test_cameras_are_all_around_and_test_views_are_others(imported: Path) -> Non
 def test_preset_chooses_the_size_of_the_views(
     preset: str, side: int, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = []
-
-    def stop(made: object, shots: list[mi_refgs.formats.Shot], path: Path) -> None:
-        seen.append({(shot.camera.width, shot.camera.height) for shot in shots})
-        raise KeyboardInterrupt
-
+    stop = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr(relightable_import, "PRESETS", PRESETS)
     monkeypatch.setattr(relightable_import, "_require_object", stop)
     with pytest.raises(KeyboardInterrupt):
         mi_refgs.import_relightable(ball, tmp_path / "run", preset=preset)
-    assert seen == [{(side, side)}] and not (tmp_path / "run").exists()
+    sizes = {(shot.camera.width, shot.camera.height) for shot in stop.call_args.args[1]}
+    assert sizes == {(side, side)} and not (tmp_path / "run").exists()
 
 
 def test_given_cameras(ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,18 +136,12 @@ def test_import_is_fitted_measured_and_relit(imported: Path, tmp_path: Path) -> 
 def test_command_writes_the_same_views_and_fits_the_method_for_relighting(
     imported: Path, ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
-    run = tmp_path / "run"
-
-    def for_purpose(purpose: str) -> str:
-        asked.append(purpose)
-        return str(method)
-
+    run, for_purpose = tmp_path / "run", Mock(return_value=str(method))
     monkeypatch.setattr(methods, "for_purpose", for_purpose)
     argv = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET]
     assert main(argv) == 0
     assert tree(run / "data") == tree(imported / "data")
-    assert asked == ["relighting"]
+    for_purpose.assert_called_once_with("relighting")
 
 
 def test_an_interrupted_import_is_an_interrupted_fit(

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -82,12 +83,7 @@ def test_finite_outside_the_table() -> None:
 
 def test_cache_is_written_read_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     computed = brdf.table()
-    calls: list[int] = []
-
-    def compute() -> np.ndarray:
-        calls.append(1)
-        return computed
-
+    compute = Mock(return_value=computed)
     monkeypatch.setattr(brdf, "compute_table", compute)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     path, fresh = tmp_path / "mi_refgs" / brdf.CACHE_NAME, brdf.table.__wrapped__
@@ -99,7 +95,7 @@ def test_cache_is_written_read_and_survives_damage(tmp_path: Path, monkeypatch: 
         if change is not None:
             change()
         np.testing.assert_array_equal(fresh(), computed)
-        assert len(calls) == count and [*path.parent.iterdir()] == [path]
+        assert compute.call_count == count and [*path.parent.iterdir()] == [path]
 
 
 def test_the_cached_table_is_the_one_that_this_code_computes() -> None:

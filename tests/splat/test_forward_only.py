@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -95,13 +96,8 @@ def test_nothing_in_view_is_black() -> None:
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
 @pytest.mark.parametrize("name", ["", *sorted(ALL)])
 def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    composite, blended = splat.composite_compact, []
-
-    def counted(lists: splat.TileLists, depth: bool) -> Any:
-        blended.append(lists.features + depth)
-        return composite(lists, depth)
-
-    monkeypatch.setattr(splat, "composite_compact", counted)
+    composite = Mock(wraps=splat.composite_compact)
+    monkeypatch.setattr(splat, "composite_compact", composite)
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
     scene = SurfelScene(things(), shading, shading.light_of(light), Occluder(two_balls()))
@@ -112,6 +108,7 @@ def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pyt
     assert {*found} == {"radiance", "alpha"} | (has - nothing)
     more = {"albedo": 3, "normal": 3, "diffuse": 3, "specular": 3, "metallic": 1, "roughness": 1}
     deferred = 14 + (name == "depth")
+    blended = [lists.features + depth for (lists, depth), _ in composite.call_args_list]
     assert blended == [deferred if at == "pixel" else 3 + (more | {"depth": 1}).get(name, 0)]
 
 

@@ -6,6 +6,7 @@ import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, create_autospec
 
 import drjit as dr
 import mitsuba as mi
@@ -114,26 +115,20 @@ def test_camera_poses_are_seeded_and_evenly_spread() -> None:
 
 
 @pytest.fixture
-def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Seeds of the images that are path-traced from now on."""
-    seeds: list[int] = []
-    image = pathtrace.Tracer.image
-
-    def counted(self: pathtrace.Tracer, pose: np.ndarray, seed: int) -> np.ndarray:
-        seeds.append(seed)
-        return image(self, pose, seed)
-
-    monkeypatch.setattr(pathtrace.Tracer, "image", counted)
-    return seeds
+def trace(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """Records the images that are path-traced from now on."""
+    recorded: Mock = create_autospec(pathtrace.Tracer.image, side_effect=pathtrace.Tracer.image)
+    monkeypatch.setattr(pathtrace.Tracer, "image", recorded)
+    return recorded
 
 
-def test_unfinished_folder_is_continued(made: Path, traced: list[int]) -> None:
+def test_unfinished_folder_is_continued(made: Path, trace: Mock) -> None:
     scene, before = made.parent / "ball.xml", contents(made)
     (made / "train/r_001.png").unlink()
     (made / "test/r_000_depth.exr").unlink()
     (made / "transforms_train.json").unlink()
     make_dataset(scene, made, **OPTIONS)
-    assert len(traced) == 2 and contents(made) == before
+    assert trace.call_count == 2 and contents(made) == before
 
 
 def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
@@ -245,13 +240,13 @@ def relit(made: Path) -> Path:
     return make_dataset(folder / "ball.xml", out, **OPTIONS, relight=lights)
 
 
-def test_adding_lights_traces_no_other_views(relit: Path, made: Path, traced: list[int]) -> None:
+def test_adding_lights_traces_no_other_views(relit: Path, made: Path, trace: Mock) -> None:
     folder, before = made.parent, contents(relit)
     inherited = {k: v for k, v in contents(made).items() if k != "dataset.json"}
     assert before.items() >= inherited.items()
     for lights in (str(folder / "warm.exr"), ()):
         make_dataset(folder / "ball.xml", relit, **OPTIONS, relight=lights)
-        assert not traced and contents(relit) == before  # the other lights stay, too
+        assert not trace.called and contents(relit) == before  # the other lights stay, too
     assert set(json.loads(before["dataset.json"])["relight"]) == {"warm", "cold_sky"}
 
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import mitsuba as mi
@@ -159,13 +160,8 @@ def test_refusals(made: Path, tmp_path: Path, options: dict, words: str) -> None
 
 
 def test_size_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Any] = []
-
-    def make(*_: object, size: Any, **__: object) -> Path:
-        made.append(size)
-        return tmp_path
-
+    make = Mock(return_value=tmp_path)
     monkeypatch.setattr("mi_refgs.synthesis.make_dataset.make_dataset", make)
     for size in ("10x6", "12"):
         assert main(["dataset", "room.xml", "-o", str(tmp_path), "--size", size]) == 0
-    assert made == [(10, 6), 12]
+    assert [call.kwargs["size"] for call in make.call_args_list] == [(10, 6), 12]
