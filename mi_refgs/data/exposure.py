@@ -11,7 +11,7 @@ from mi_refgs.io.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, o
 
 EXPOSURE = {0x829A: 1, 0x8827: 1, 0x829D: -2}  # EXIF: exposure time, sensitivity, f-number; powers in a gain
 SET, SEEN = 0.05, 0.15  # least log gain in EXIF; least deviation of those of points: gloss feigns up to 0.1
-KEYPOINTS = 20  # of a view, from which its gain is more than chance
+KEYPOINTS = 20  # of a view that are neither dark nor clipped, from which its gain is more than chance
 DARK, BRIGHT = 0.05, 0.95  # encoded values between which noise and clipping do not matter
 OUTLIER = 0.02  # log residual from which a point counts by its sign only, nearly
 CLIPPED = float(linear_from_srgb(np.array(254.5 / 255)))  # linear value from which an 8-bit image is clipped
@@ -49,6 +49,8 @@ def _of_points(views: Sequence[View]) -> np.ndarray | None:
     colours, gains = np.concatenate([*map(_colours, views, tracks)]), []
     for encoded in colours.T:
         usable = np.flatnonzero((encoded > DARK) & (encoded < BRIGHT))
+        if np.bincount(own[usable], minlength=len(views)).min() < KEYPOINTS:
+            return None
         log, row = np.log(linear_from_srgb(encoded[usable])), np.tile(np.arange(len(usable)), 2)
         column = np.concatenate([own[usable], len(views) + points[usable]])
         shape = len(usable), len(views) + points.max() + 1

@@ -58,6 +58,9 @@ def test_gains_are_those_of_the_points(log: np.ndarray, rng: np.random.Generator
     assert told_gains(taken(0.3 * log, rng)) is None  # surfaces that shine would seem to change as much
     bare = [replace(view, tracks=None) for view in taken(log, rng)]
     assert told_gains(bare) is None and told_gains([*bare[:1], *taken(log, rng)[1:]]) is None
+    clipped, *equal = taken(0 * log, rng)  # one photograph shows no colour of a point
+    white = replace(clipped, pixels=Pixels(np.ones((SIZE, SIZE, 3), np.float32)))
+    assert told_gains([white, *equal]) is None
 
 
 def test_gains_in_exif_count_unless_points_contradict(
