@@ -1,7 +1,5 @@
 """Helpers of several tests: refused input, vectors, light levels, fresh processes, imports of a source."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import io
@@ -102,7 +100,7 @@ def unit(d: np.ndarray) -> np.ndarray:
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def vector(d: np.ndarray) -> mi.Vector3f:
+def vector(d: np.ndarray) -> "mi.Vector3f":
     """(N, 3) array → mi.Vector3f."""
     return mi.Vector3f(np.ascontiguousarray(np.asarray(d).T, dtype=np.float32))
 

@@ -1,7 +1,5 @@
 """Laws of images: what they do not depend on, what they may not exceed, and that derivatives are linear."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -174,7 +172,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 ADJOINT = 1e-5  # |⟨δ, Jv⟩ - ⟨Jᵀδ, v⟩| over |δ| |Jv|: float32 sums of a few hundred products
 
 
-def loaded(scene: Scene, light: Any, **changes: Any) -> mi.Scene:
+def loaded(scene: Scene, light: Any, **changes: Any) -> "mi.Scene":
     channels = {name: upload_tensor(values) for name, values in scene.raw.items()}
     integrator = {"type": "refgs", **channels, "light": light} | changes
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": scene.view.sensor()})
@@ -192,7 +190,7 @@ def envmap(radiance: np.ndarray, turn: np.ndarray | None = None) -> dict[str, An
 
 
 @cache
-def shared(setting: str) -> mi.Scene:
+def shared(setting: str) -> "mi.Scene":
     light = EnvironmentLight.from_radiance(sky(ROWS)).raw
     with TemporaryDirectory() as folder:
         mesh = {"mesh": plane_mesh(Path(folder))} if "mesh" in setting else {}

@@ -1,7 +1,5 @@
 """Meshes made elsewhere, of few triangles and of any size, as occluders."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,7 @@ def occluder(folder: Path, mesh: Any) -> Occluder:
     return Occluder(read_mesh(folder / "elsewhere.ply"))
 
 
-def points(rng: np.random.Generator, height: float, scale: float) -> mi.Point3f:
+def points(rng: np.random.Generator, height: float, scale: float) -> "mi.Point3f":
     place = np.append(rng.uniform(-0.4, 0.4, (200, 2)), np.full((200, 1), height), axis=1)
     return mi.Point3f((scale * place).T.astype(np.float32))
 

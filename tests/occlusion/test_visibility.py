@@ -1,7 +1,5 @@
 """Visibility through an extracted mesh against sphere tracing of the true shape."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import drjit as dr
@@ -52,7 +50,7 @@ def mirror_rays(shape: ref.Shape, count: int) -> tuple[np.ndarray, np.ndarray, n
     return point[facing], normal[facing], (view - 2 * cosine * normal)[facing]
 
 
-def point3(x: np.ndarray) -> mi.Point3f:
+def point3(x: np.ndarray) -> "mi.Point3f":
     return mi.Point3f(np.ascontiguousarray(x.T, np.float32))
 
 

@@ -1,7 +1,5 @@
 """Cameras that are displaced: their numbers, and derivatives of images against float64."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -17,7 +15,7 @@ from tests.scenes.camera_motion import CENTRE, moved_pose, require_slopes, rotat
 from tests.scenes.open_pair import CASES, Pair, weighted
 
 
-def displaced(eye: Camera, motion: mi.Float) -> Camera:
+def displaced(eye: Camera, motion: "mi.Float") -> Camera:
     """A camera that is moved in this way, by (6,) numbers under AD."""
     rotation, translation = rotation_of(motion)
     return eye.displaced(rotation, mi.Point3f(CENTRE), translation)

@@ -1,7 +1,5 @@
 """Images in passes: the same as in one, with the same derivatives, kernels and less at a time."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -140,7 +138,7 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
         np.testing.assert_allclose(several, one, atol=3e-5 * scale, err_msg=str(i))
 
 
-def history(of: mi.Scene, spp: int, backward: bool) -> list[dict[str, Any]]:
+def history(of: "mi.Scene", spp: int, backward: bool) -> list[dict[str, Any]]:
     """Kernels of a render."""
     params = mi.traverse(of)
     leaf = mi.TensorXf(params["integrator.albedo"])

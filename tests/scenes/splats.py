@@ -1,7 +1,5 @@
 """Random surfels and a camera for tests of splatting against the float64 reference, and what they compare."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -149,7 +147,7 @@ def loss_weights(scene: Scene, seed: int) -> np.ndarray:
     return np.where(keep[..., None], weights, 0).astype(np.float32).astype(np.float64)
 
 
-def fast_loss(scene: Scene, surfels: Surfels, features: list, weights: np.ndarray) -> mi.Float:
+def fast_loss(scene: Scene, surfels: Surfels, features: list, weights: np.ndarray) -> "mi.Float":
     maps = scene.splat(surfels, features)
     loss = mi.Float(0)
     for k, image in enumerate([*maps.features, maps.depth, maps.alpha]):

@@ -1,7 +1,5 @@
 """Values that are NaN, infinite or huge: they end no process, spoil no image, and are named."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any
@@ -39,7 +37,7 @@ def test_a_nan_roughness_does_not_end_the_process() -> None:
     assert float(run_python(PROGRAM, folder=ROOT)) == 0
 
 
-def rendered(made: mi.Scene, values: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def rendered(made: "mi.Scene", values: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The image with these parameters, and the gradient of a weighted sum of it."""
     params = mi.traverse(made)
     for name, value in values.items():
