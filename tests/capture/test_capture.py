@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from tests.scenes import photographed as scene
 
 COUNT = 9
 NAMES = [f"{i:02} ({i}).png" for i in range(COUNT)]
+stopped = Mock(side_effect=KeyboardInterrupt)
 needs_colmap = pytest.mark.skipif(not find_spec("pycolmap"), reason='pip install "mi_refgs[capture]"')
 
 
@@ -215,10 +217,6 @@ def test_other_lens_rewrites_images(captured: Path, tmp_path: Path, monkeypatch:
     assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
     assert (data / "images" / NAMES[0]).stat().st_ino != inode
     assert [view.name for view in read_loaded(data, "test").views] == [NAMES[3]]
-
-
-def stopped(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 @needs_colmap

@@ -49,18 +49,16 @@ def decode(monkeypatch: pytest.MonkeyPatch) -> Mock:
     return recorded
 
 
-@pytest.mark.parametrize(
-    ("downscale", "factor"), [(1, 1), (2, 2), (3, 1), (6.3, 2), (8, 8), (12, 4), (16, 8)]
-)
-def test_jpeg_decoder_shrinks_like_averaging(downscale: float, factor: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("scale", "factor"), [(1, 1), (2, 2), (3, 1), (6.3, 2), (8, 8), (12, 4), (16, 8)])
+def test_jpeg_decoder_shrinks_like_averaging(scale: float, factor: int, tmp_path: Path) -> None:
     """Whatever the orientation in EXIF data."""
     exif = Image.Exif()
     exif[0x0112] = 6
     path = jpeg(tmp_path / "a.jpg", smooth(157, 101), exif=exif)
-    assert read_bytes(path, int(downscale))[1] == factor
-    image, alpha = read(path, downscale)
-    assert alpha is None and image.shape[:2] == (int(101 / downscale), int(157 / downscale))
-    expected = box_downscale(read_png(path), downscale)
+    assert read_bytes(path, int(scale))[1] == factor
+    image, alpha = read(path, scale)
+    assert alpha is None and image.shape[:2] == (int(101 / scale), int(157 / scale))
+    expected = box_downscale(read_png(path), scale)
     assert np.abs(image - expected).mean() < 3e-3 and np.abs(image - expected).max() < 0.03
 
 

@@ -139,9 +139,7 @@ def test_a_camera_next_to_the_object_stays_outside(rng: np.random.Generator) -> 
     both = np.concatenate([bar, box((0.1, 0.4, -0.4), (0.7, 1.8, 0.4), 2000, rng)])
     region, hollow = Region((1.0, 0.0, 0.0), 1.2, ((1.0, 0.0, 0.0, 0.05),)), np.array([[1.3, 0.8, 0.0]])
     for thing, cameras, least in ((bar, ring, 0.99), (both, hollow, 0.75)):
-        found = fitted_region(
-            region, cameras, np.concatenate([wall, thing]), lambda points: np.ones(len(points))
-        )
+        found = fitted_region(region, cameras, np.concatenate([wall, thing]), lambda at: np.ones(len(at)))
         assert found is not None and not found.contains(cameras).any()
         assert np.mean(found.contains(thing)) >= least
 

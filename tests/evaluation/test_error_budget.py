@@ -33,9 +33,7 @@ def view_of(slope: float, step: float) -> View:
 def walls(*sides: int) -> TrueSurface:
     """The walls x = |y| on these sides of y = 0, larger than what the camera sees."""
     corners = [[x, side * x, z] for side in sides for x in (0, 100) for z in (-100, 100)]
-    faces = [
-        [4 * i + a, 4 * i + b, 4 * i + c] for i in range(len(sides)) for a, b, c in ((0, 1, 2), (1, 3, 2))
-    ]
+    faces = [[4 * i + k for k in face] for i in range(len(sides)) for face in ((0, 1, 2), (1, 3, 2))]
     return TrueSurface(Mesh(np.array(corners, np.float32), np.array(faces, np.uint32), 1e-3))
 
 

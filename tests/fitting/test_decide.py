@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -246,11 +246,8 @@ def test_what_cannot_be_tried_is_said(
     found = fitted(ended, views, tmp_path / "ended").fit.decisions
     assert [row["reason"] for row in found] == ["no surfels to split: densification has ended"]
 
-    def failing(*_: Any) -> Trainer:
-        raise InputError("no surfel is left")
-
     with monkeypatch.context() as patch:
-        patch.setattr(decide, "fork", failing)
+        patch.setattr(decide, "fork", Mock(side_effect=InputError("no surfel is left")))
         (row,) = fitted(without(method, "more_surfels"), views, tmp_path / "failed").fit.decisions
     assert not row["stays"] and "no surfel is left" in row["reason"]
 

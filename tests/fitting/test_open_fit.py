@@ -439,7 +439,7 @@ def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> N
 
 
 @pytest.mark.parametrize(
-    ("purpose", "without", "alpha"),
+    ("purpose", "own", "alpha"),
     [
         (None, "photographs", "auto"),
         ("relighting", "photographs_relighting", "relighting"),
@@ -447,12 +447,7 @@ def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> N
     ],
 )
 def test_images_without_alpha_have_a_method_of_their_own(
-    data: Dataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    purpose: str | None,
-    without: str,
-    alpha: str,
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, purpose: str | None, own: str, alpha: str
 ) -> None:
     """It is chosen from one reading, without decoding an image, and fits a background."""
     said: list[str] = []
@@ -460,7 +455,7 @@ def test_images_without_alpha_have_a_method_of_their_own(
     read = Mock(wraps=READERS.values)
     monkeypatch.setattr(READERS, "values", read)
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
-    assert method.name == without and any(without in text for text in said) == (without != purpose)
+    assert method.name == own and any(own in text for text in said) == (own != purpose)
     assert read.call_count == 1 and views.split == "train"
     monkeypatch.undo()
     objects = write_data(tmp_path, views=3, truth=False)

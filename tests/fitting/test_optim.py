@@ -226,9 +226,7 @@ def test_mirrors_learn_faster(rng: np.random.Generator) -> None:
     """A row's step is that of Adam times metallic (1 - roughness)², of those that the surfels have."""
     for names in ((), ("metallic",), ("metallic", "roughness")):
         values = {f"refgs.{name}": rng.normal(size=(5, 1)) for name in names}
-        params = {name: tensor(x) for name, x in values.items()} | {
-            "refgs.curvature": tensor(np.zeros((5, 3)))
-        }
+        params = {key: tensor(x) for key, x in values.items()} | {"refgs.curvature": tensor(np.zeros((5, 3)))}
         optimiser = Adam(params, {"refgs.curvature": LearningRate(0.1, mirrors=True)})
         give(optimiser, "refgs.curvature", np.ones((5, 3)))
         optimiser.step(0)

@@ -156,7 +156,7 @@ def test_a_step_on_a_crop_has_its_gradient(method: Method, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(
-    ("numbers", "raised", "saved"),
+    ("sent", "raised", "saved"),
     [
         ([signal.SIGINT], KeyboardInterrupt, 7),
         ([signal.SIGTERM], TerminatedError, 7),
@@ -165,26 +165,21 @@ def test_a_step_on_a_crop_has_its_gradient(method: Method, monkeypatch: pytest.M
 )
 @pytest.mark.usefixtures("heard_interrupts")
 def test_signal_waits_for_step_in_hand(
-    numbers: list[int],
-    raised: type,
-    saved: int,
-    method: Method,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    sent: list[int], raised: type, saved: int, method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Inside iteration 7, before its events: the newest checkpoint contains a whole iteration."""
     run, due = run_folder(tmp_path / "run", method), Densify.due
 
     def interrupted(event: Densify, trainer: Trainer) -> bool:
-        for number in numbers if trainer.iteration == 7 else ():
+        for number in sent if trainer.iteration == 7 else ():
             os.kill(os.getpid(), number)
         return due(event, trainer)
 
     monkeypatch.setattr(Densify, "due", interrupted)
-    trainer, before = Trainer(method, ball(), run), signal.getsignal(numbers[0])
+    trainer, before = Trainer(method, ball(), run), signal.getsignal(sent[0])
     with pytest.raises(KeyboardInterrupt) as caught:
         trainer.train()
-    assert caught.type is raised and signal.getsignal(numbers[0]) is before
+    assert caught.type is raised and signal.getsignal(sent[0]) is before
     state = run.load_checkpoint()
     assert state is not None and int(state["iteration"]) == saved
     for name, value in trainer.state().items():

@@ -86,9 +86,8 @@ def test_reference_gradients_match_differences() -> None:
 
 
 def test_scaled_case_scales_its_mesh() -> None:
-    small, plates = (
-        next(c for c in CASES if c.name == n) for n in ("mesh and scene times 1e-3", "two plates")
-    )
+    cases = {case.name: case for case in CASES}
+    small, plates = cases["mesh and scene times 1e-3"], cases["two plates"]
     for one, other in zip(small.surface, plates.surface, strict=True):
         np.testing.assert_allclose(one, other if one is small.surface[1] else 1e-3 * other, rtol=1e-6)
     assert small.mesh is not None and small.mesh().voxel == pytest.approx(1e-6)

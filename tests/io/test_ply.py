@@ -72,9 +72,8 @@ def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> Non
 def test_ply_of_others_is_read(kind: str, dtype: str, tmp_path: Path, rng: np.random.Generator) -> None:
     """Other order, elements before and after the vertices, unknown properties, lists of different lengths."""
     columns = {"confidence": np.ones(2), **dict(reversed(geometry(rng, 2).items()))}
-    header, _, body = ply_bytes({k: v.astype(dtype) for k, v in columns.items()}, kind).partition(
-        b"end_header\n"
-    )
+    written = ply_bytes({name: values.astype(dtype) for name, values in columns.items()}, kind)
+    header, _, body = written.partition(b"end_header\n")
     faces = b"element face 2\nproperty list uchar int vertex_indices\nelement vertex"
     header = header.replace(b"element vertex", faces) + b"property list uchar short seen\n"
     header += b"element camera 1\nproperty double focal\nend_header\n"

@@ -23,9 +23,7 @@ from tests.laws.option_cases import CROPS, FOV, HEIGHT, NEAR, WIDTH
 from tests.laws.option_scenes import AROUND, BACKDROP, Values, aov_types, mesh, rotation, shading, surfels_of
 
 Array = np.ndarray
-XYZ = np.array(
-    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
-)
+XYZ = np.array([[0.412453, 0.35758, 0.180423], [0.212671, 0.71516, 0.072169], [0.019334, 0.119193, 0.950227]])
 """From linear sRGB. [Mitsuba's srgb_to_xyz]"""
 
 

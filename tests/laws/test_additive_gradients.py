@@ -149,9 +149,7 @@ class Losses:
             **({"frame": self.frame} if "integrator.light" in kept else {}),
             "slice": lambda: self.priors(lambda _, x: x[..., 0] if isinstance(x, mi.TensorXf) else x),
             "gather": lambda: self.priors(lambda key, x: dr.gather(mi.Float, dr.ravel(x), self.picked[key])),
-            "mean": lambda: self.priors(
-                lambda key, x: self.base[key].size ** 0.5 * (2 + dr.mean(dr.ravel(x)))
-            ),
+            "mean": lambda: self.priors(lambda k, x: self.base[k].size ** 0.5 * (2 + dr.mean(dr.ravel(x)))),
             "neighbours": lambda: self.priors(self.differences),
         }
 

@@ -209,10 +209,7 @@ STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
         (f"{STAGE}at = 'voxel'", ["'voxel' is not allowed", "surfel"]),
         ("iterations = 10", ["missing key 'stage'"]),
         ("iterations = [", ["not valid TOML"]),
-        (
-            f"{STAGE}[event.mesh]\nwhen = {{start = 0, until = 9, every = 0}}",
-            ["mesh.when", "above 0"],
-        ),
+        (f"{STAGE}[event.mesh]\nwhen = {{start = 0, until = 9, every = 0}}", ["mesh.when", "above 0"]),
         (f"{STAGE}[data]\ncoarse = [{{until = 5, block = 1}}]", ["data.coarse.block: 1", "2 or more"]),
         (f"{STAGE}[event.cameras]\nafter = -1", ["event.cameras.after: -1", "0 or more"]),
         (f"{STAGE}[event.camera]", ["event: 'camera' is unknown", "cameras"]),

@@ -67,11 +67,9 @@ def test_vertices_keep_their_normals_and_materials_at_any_scale(tmp_path: Path, 
     # Surfels that lie flat on the ball do not agree with its normals: the mesh's own must serve.
     count = len(ball.vertices)
     size, flat = np.full((count, 2), np.log(0.1 * scale)), np.tile([1.0, 0, 0, 0], (count, 1))
-    materials = {"albedo": np.zeros((count, 3)), "metallic": np.zeros((count, 1))}
-    materials["roughness"] = np.linspace(-2, 2, count)[:, None]
-    surfels = Surfels.from_numpy(
-        discs(position=scale * ball.vertices, rotation=flat, scale=size, **materials)
-    )
+    colours = {"albedo": np.zeros((count, 3)), "metallic": np.zeros((count, 1))}
+    colours["roughness"] = np.linspace(-2, 2, count)[:, None]
+    surfels = Surfels.from_numpy(discs(position=scale * ball.vertices, rotation=flat, scale=size, **colours))
     made.set_materials(surfels)
     rows = np.array(made.surface(surfels, MATERIALS).rows).reshape(count, 8)
     # No vertex has the materials of a surfel that is not usable.

@@ -20,9 +20,7 @@ HALF = 1.3
 SHAPES = {
     "sphere": ref.sphere((0, 0, 0), 1),
     "ball before a wall": ref.union(ref.sphere((0, 0, 0.25), 0.5), ref.box((0, 0, -0.6), (1, 1, 0.15))),
-    "facing plates": ref.union(
-        ref.box((0, 0, 0.5), (0.8, 0.8, 0.15)), ref.box((0, 0, -0.5), (0.8, 0.8, 0.15))
-    ),
+    "facing plates": ref.union(*(ref.box((0, 0, z), (0.8, 0.8, 0.15)) for z in (0.5, -0.5))),
     "torus": ref.torus(0.8, 0.3),
 }
 

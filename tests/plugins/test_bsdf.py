@@ -75,12 +75,8 @@ def test_eval_is_the_formula(rng: np.random.Generator, roughness: float, metalli
     wo[::2] = unit(rng.normal(size=wo[::2].shape))  # below the surface too
     wi, wo = (d.astype(np.float32).astype(np.float64) for d in (wi, wo))  # both sides get the same numbers
     got = mi.load_dict(bsdf(roughness, metallic)).eval(context(), interaction(wi, count), vector(wo))
-    expected = np.concatenate(
-        [
-            reference.brdf_cosine(ALBEDO, metallic, roughness, np.array([0, 0, 1.0]), i, o[None])
-            for i, o in zip(wi, wo, strict=True)
-        ]
-    )
+    up, pairs = np.array([0, 0, 1.0]), zip(wi, wo[:, None], strict=True)
+    expected = np.concatenate([reference.brdf_cosine(ALBEDO, metallic, roughness, up, *d) for d in pairs])
     assert (expected[:, 0] > 0).mean() > 0.5 and (expected == 0).any()
     limit = (5e-3 if roughness < 0.1 else 2e-4) * expected + 1e-6
     # The table's own interpolation, in the diffuse term: up to 0.11 where its first texel ends.
@@ -120,12 +116,8 @@ def test_white_furnace_is_the_split_sum(roughness: float) -> None:
         mixed = mi.load_dict(bsdf(roughness, 0.25))
         f0 = 0.04 * 0.75 + 0.25 * ALBEDO
         diffuse = (1 - f0 * a - b) * 0.75 * ALBEDO
-        for ctx, expected in (
-            (context(SPECULAR), f0 * a + b),
-            (context(DIFFUSE), diffuse),
-            (context(), f0 * a + b + diffuse),
-        ):
-            np.testing.assert_allclose(np.ravel(mean_weight(mixed, wi, ctx)), expected, atol=2e-3)
+        for part, expected in ((SPECULAR, f0 * a + b), (DIFFUSE, diffuse), (None, f0 * a + b + diffuse)):
+            np.testing.assert_allclose(np.ravel(mean_weight(mixed, wi, context(part))), expected, atol=2e-3)
 
 
 @pytest.mark.parametrize(

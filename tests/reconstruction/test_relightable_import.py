@@ -148,11 +148,7 @@ def test_an_interrupted_import_is_an_interrupted_fit(
     ball: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its message names the command that goes on."""
-
-    def interrupted(trainer: Trainer) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Trainer, "step", interrupted)
+    monkeypatch.setattr(Trainer, "step", Mock(side_effect=KeyboardInterrupt))
     options: dict[str, Any] = {"method": method, "preset": PRESET, "progress": Progress()}
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt, match=f"train {run / 'data'} -o {run} --resume"):

@@ -47,11 +47,9 @@ def radiance(points: ShadingPoints) -> RadianceTerms:
     return RadianceTerms(specular=mi.Color3f(n.x * n.y, n.z * v, v * v * v))
 
 
-def found(
-    normal: list[mi.Float], alpha: mi.Float, visibility: mi.Float, interpolate: bool = True
-) -> mi.Color3f:
+def found(normal: list[mi.Float], alpha: mi.Float, seen: mi.Float, interpolate: bool = True) -> mi.Color3f:
     view = replace(camera(WIDTH, 8.0), height=HEIGHT)
-    points = ShadingPoints(mi.Vector3f(*normal), -dr.normalize(view.rays()), visibility=visibility)
+    points = ShadingPoints(mi.Vector3f(*normal), -dr.normalize(view.rays()), visibility=seen)
     return averaged(radiance, points, alpha, view, None, interpolate).specular
 
 

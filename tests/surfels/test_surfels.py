@@ -13,10 +13,8 @@ from mi_refgs.surfels.table import Surfels
 
 
 def raw_table(count: int, rng: np.random.Generator, degree: int = 2) -> dict[str, np.ndarray]:
-    return {
-        name: rng.normal(size=(count, channel.width(degree))).astype(np.float32)
-        for name, channel in ATTRIBUTES.items()
-    }
+    widths = {name: channel.width(degree) for name, channel in ATTRIBUTES.items()}
+    return {name: rng.normal(size=(count, width)).astype(np.float32) for name, width in widths.items()}
 
 
 @pytest.mark.parametrize("count", [1, 2, 37])
@@ -57,9 +55,8 @@ def test_degenerate_rows_stay_finite() -> None:
     huge = 3e38
     rotation = np.array([[0, 0, 0, 0], [1e-35, 0, 0, 0], [huge, huge, -huge, huge], [0, 0, 0, 1]])
     rows = np.array([huge, -huge, 0.0, 60.0])[:, None]
-    surfels = Surfels.from_numpy(
-        {"position": np.zeros((4, 3)), "rotation": rotation, "scale": np.repeat(rows, 2, 1), "opacity": rows}
-    )
+    raw = {"position": np.zeros((4, 3)), "rotation": rotation, "scale": rows.repeat(2, 1), "opacity": rows}
+    surfels = Surfels.from_numpy(raw)
     surfels.enable_grad()
     t_u, t_v, n = surfels.frame()
     total = t_u.y + 2 * t_v.z + 3 * n.x + n.z + surfels.opacity() + surfels.scale().x * 1e-6

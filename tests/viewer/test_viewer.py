@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import mitsuba as mi
 import numpy as np
@@ -254,15 +255,12 @@ def test_a_supersampled_image_is_the_mean_of_its_samples_and_restarts_after_a_ch
 
 
 def test_the_last_task_of_a_key_runs_once_and_bad_input_is_reported(loop: Loop) -> None:
-    def bad() -> None:
-        raise InputError("no such thing")
-
     done: list[int] = []
     loop.move()
     loop.steps(1)
     loop.submit("a", lambda: done.append(1))
     loop.submit("a", lambda: done.append(2))
-    loop.submit("b", bad)
+    loop.submit("b", Mock(side_effect=InputError("no such thing")))
     loop.steps(2)
     assert (done, loop.reported) == ([2], ["no such thing"])
     assert progress(loop.seen) == [COARSE, COARSE]  # the first task changed the scene
