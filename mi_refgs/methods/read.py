@@ -34,7 +34,7 @@ class Preset:
 
 
 PRESETS = {
-    "quick": Preset(2_000, 15_000, 20_000, 256 * 256),
+    "quick": Preset(2_000, 15_000, 20_000, 80_000),
     "standard": Preset(4_000, 25_000, 40_000, 400 * 400),
     "paper": Preset(50_000, 30_000, 100_000, 800 * 800),  # the size of the paper's images
 }
@@ -63,6 +63,8 @@ def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | N
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     if (most := method.surfels.preset_limit or chosen.max_surfels) < chosen.max_surfels:
         table["surfels"] |= {"count": round(START_FRACTION * most), "max_count": most}
+    if method.surroundings is not None:
+        table["surroundings"]["count"] = max(round(method.surroundings.start * chosen.surfels), 1)
     for assignment in assignments or []:
         _assign(table, assignment)
     file = str(path.resolve()) if name.endswith(".toml") else name
