@@ -72,7 +72,7 @@ def evaluate(
     method = run.method()
     views = views_of_run(run, method, "test", data, measured=True)
     renders = render_names(views.views)
-    fitted = write_if_stale(run, method, lambda _: views.views[0].camera())
+    fitted = write_if_stale(run, method, lambda _: views_of_run(run, method, "test", data).views[0].camera())
     per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
     # Render and measure the views, and write their images.
     surface = TrueSurface.read(views.path, views.offset)

@@ -138,6 +138,13 @@ def test_evaluate_measures_the_scene_files(run: Run) -> None:
     assert evaluate(run)["psnr"] == pytest.approx(before["psnr"], abs=1e-6)
 
 
+def test_scene_file_has_the_fitted_size(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where `evaluate` writes it, and measures photographs at another one."""
+    monkeypatch.setattr("mi_refgs.runs.views.MEASURED", 16)
+    assert evaluate(run, write_open_data(tmp_path / "open"))["image_size"] == [16, 16]
+    assert f'name="width" value="{SIZE}"' in (run.path / "scene.xml").read_text()
+
+
 def test_panels_show_every_map_next_to_the_ground_truth(trainer: Trainer, views: Dataset) -> None:
     view = views.views[0].load()
     panels = images.panels(images.RenderedView.of(trainer.view(view.camera()), views, view), view)
