@@ -198,7 +198,7 @@ def draw(path: Path, world: Solved, region: Region) -> None:
         axes.plot(directions[..., 0], directions[..., up], color="C0", lw=0.8)
         axes.scatter(world.origin[:, 0], world.origin[:, up], s=8, color="C0")
         axes.add_patch(Circle((centre[0], centre[up]), region.radius, fill=False, color="C3", lw=1.5))
-        for *normal, offset in region.planes:  # where they cut the plane of the plot through the centre
+        for *normal, offset in region.supports:  # where they cut the plane of the plot through the centre
             across = np.array([normal[0], normal[up]])
             if (length := np.linalg.norm(across)) > 0.3:  # sine of its angle to the plot
                 foot = centre[[0, up]] + (offset - centre @ normal) / length**2 * across

@@ -240,7 +240,7 @@ def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn
         if surfaces is not None:
             shown, scatter = surfaces, regions.DENSE
         found = regions.object_region(region, origins, shown, seen, scatter)
-        if found.planes:
+        if found.supports:
             tell(f"{views.path}: region of interest: it ends above the plane that supports the object")
         if found.radius > region.radius:
             tell(f"{views.path}: region of interest: it has grown to {found.radius:.3g} units")

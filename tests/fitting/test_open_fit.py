@@ -272,6 +272,11 @@ def test_region_is_adapted_to_points_when_fit_begins(data: Dataset, method: Meth
     assert run.region() == trainer.region
     again = begin(method, replace(data, region=replace(REGION, estimated=True)), run, said.append)
     assert again.region == trainer.region and not any("changed" in text for text in said)
+    said.clear()
+    tall = PointCloud(rng.normal(size=(1500, 3)) * [0.05, 0.05, 0.2])  # no plane supports it
+    small = replace(cameras, region=replace(REGION, radius=0.3, estimated=True), points=tall)
+    begin(method, small, Run(tmp_path / "tall"), said.append)
+    assert any("grown" in text for text in said) and not any("plane" in text for text in said)
 
 
 def test_surfels_without_weight_are_removed_from_their_own_table(
