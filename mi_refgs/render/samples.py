@@ -39,7 +39,7 @@ def supersampled(view: Callable[[Camera], Frame], camera: Camera, samples: int, 
 
     alpha = mean(fine.alpha)
     object_alpha = alpha if fine.object_alpha is fine.alpha else mean(fine.object_alpha)
-    inverse, own = inverse_alpha(alpha), inverse_alpha(object_alpha)
+    inverse = inverse_alpha(alpha)
 
     def by_alpha(value: Float) -> Float:
         return mean(value * fine.alpha) * inverse
@@ -59,7 +59,10 @@ def supersampled(view: Callable[[Camera], Frame], camera: Camera, samples: int, 
         normal=mean(fine.normal),
         radiance=mean(fine.radiance),
         terms=mean(fine.terms),
-        maps={name: mean(value * fine.object_alpha) * own for name, value in fine.maps.items()},
+        maps={
+            name: mean(value * fine.object_alpha) * inverse_alpha(object_alpha)
+            for name, value in fine.maps.items()
+        },
         background=None if fine.background is None else behind(fine.background),
         object_alpha=object_alpha,
         distance=distance,

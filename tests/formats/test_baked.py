@@ -243,7 +243,7 @@ def test_missing_package(exported: Exported, tmp_path: Path, monkeypatch: pytest
     ("change", "message"),
     [
         ({"light": None}, "light: the run has none; fit one with materials and a light, as"),
-        ({"mesh": None}, "mesh: the run has none; fit one with occlusion, as `--for relighting` does; if"),
+        ({"mesh": None}, "mesh: the run has none; fit one with occlusion, as `--for relighting` does, or"),
         ({"mesh": Mesh.empty()}, "mesh: the run has none that textures could be baked to"),
         ({"surfels": None}, "albedo, metallic: the run has none; fit one with materials"),
     ],

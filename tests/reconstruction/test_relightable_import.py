@@ -92,7 +92,7 @@ def test_cameras_are_all_around_and_test_views_are_others(imported: Path) -> Non
     assert 0 < test[0, 2] < 0.6 * np.linalg.norm(test[0])  # scene.xml has this camera
 
 
-@pytest.mark.parametrize(("preset", "side"), [("quick", 256), ("paper", 800), ("6:9", 400)])
+@pytest.mark.parametrize(("preset", "side"), [("quick", 282), ("paper", 800), ("6:9", 400)])
 def test_preset_chooses_the_size_of_the_views(
     preset: str, side: int, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
