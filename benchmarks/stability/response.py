@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.stability.cases import Array
 from mi_refgs.fitting import losses
+from mi_refgs.io.images import SATURATED
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
@@ -98,7 +99,7 @@ def _loss(name: str, radiance: Array, alpha: Array, target: Array, target_alpha:
 
     def exact(values: Array) -> float:
         image = reference.display_image(values[..., :3], values[..., 3], (0.5, 0.5, 0.5))
-        image = np.where((target >= losses.SATURATED) & (image > target), target, image)
+        image = np.where((target >= SATURATED) & (image > target), target, image)
         value = 0.8 * reference.l1(image, target) + 0.2 * (1 - reference.ssim(image, target))
         return value + 0.2 * reference.l1(values[..., 3], target_alpha)
 

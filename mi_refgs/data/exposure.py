@@ -7,14 +7,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import lsqr
 
 from mi_refgs.data.view import View
-from mi_refgs.io.images import SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_image, positive
+from mi_refgs.io.images import SATURATED, SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_image, positive
 
 EXPOSURE = {0x829A: 1, 0x8827: 1, 0x829D: -2}  # EXIF: exposure time, sensitivity, f-number; powers in a gain
 SET, SEEN = 0.05, 0.15  # least log gain in EXIF; least deviation of those of points: gloss feigns up to 0.1
 KEYPOINTS = 20  # of a view that are neither dark nor clipped, from which its gain is more than chance
 DARK, BRIGHT = 0.05, 0.95  # encoded values between which noise and clipping do not matter
 OUTLIER = 0.02  # log residual from which a point counts by its sign only, nearly
-CLIPPED = float(linear_from_srgb(np.array(254.5 / 255)))  # linear value from which an 8-bit image is clipped
+CLIPPED = float(linear_from_srgb(np.array(SATURATED)))  # linear value from which an 8-bit image is clipped
 MAX_GAIN = 16.0  # gains are limited to this and its inverse, ± 4 stops: larger ones mean a failed render
 
 

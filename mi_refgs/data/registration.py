@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mi_refgs.data.view import View
-from mi_refgs.io.images import box_downscale
+from mi_refgs.io.images import blocks_within, box_downscale
 
 STEP = 0.1  # pixels of the averaged image that the image moves by for a difference
 COARSEST = 48  # pixels along the shorter side of the image that is averaged most, at least
@@ -32,15 +32,16 @@ def registered(view: View, render: Render, distance: float, where: np.ndarray) -
 
 
 def _difference(view: View, render: Render, where: np.ndarray, block: int) -> np.ndarray:
-    """Render minus image, flat, both averaged over block² pixels: smaller renders differ in details."""
+    """Render minus image, flat, both averaged over block² pixels, of which those `where` count: smaller
+    renders differ in details."""
     shown, truth = (box_downscale(np.clip(image, 0, 1), block) for image in (render(view), view.displayed))
-    whole = box_downscale(where[..., None].astype(np.float32), block)[..., 0] == 1
-    return np.asarray(shown - truth, np.float64)[whole].ravel()
+    return np.asarray(shown - truth, np.float64)[where].ravel()
 
 
 def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> View:
     """The view with its pose fitted to the image averaged over block × block pixels."""
     unit = np.repeat([1.0, distance], 3) * block / view.fx  # moves what the camera looks at by such a pixel
+    where = blocks_within(where, block)
 
     def error(motion: np.ndarray) -> np.ndarray:
         return _difference(_moved(view, unit * motion), render, where, block)

@@ -22,7 +22,7 @@ from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
 from mi_refgs.fitting.image_error import displayed_image, with_gain
 from mi_refgs.io.files import read_json
-from mi_refgs.io.images import box_downscale, write_png
+from mi_refgs.io.images import blocks_within, write_png
 from mi_refgs.io.progress import with_bar
 from mi_refgs.kernels.device import machine
 from mi_refgs.render.pipeline import Frame
@@ -172,7 +172,7 @@ def _aligned_scores(
     fitted = (np.indices((view.height, view.width)) // edge).sum(axis=0) % 2 == 0
     gain, _ = with_gain(frame, view, data, fitted)
     block = math.ceil(math.sqrt(view.width * view.height / REGISTERED))
-    where = box_downscale(fitted[..., None].astype(np.float32), block)[..., 0] == 1
+    where = blocks_within(fitted, block)
 
     def image_of(moved: View) -> np.ndarray:
         return displayed_image(render(moved.camera()), moved, data, gain)

@@ -11,12 +11,12 @@ import mitsuba as mi
 
 from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.fitting.ssim import ssim
+from mi_refgs.io.images import SATURATED
 from mi_refgs.kernels.rows import columns_of
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.light.light import Light
 from mi_refgs.types import Bool, Color3f, Float, TensorXf, Vector3f
 
-SATURATED = 254.5 / 255.0  # from here up, 8-bit values are clipped: 255 means "at least this bright"
 CLIPPED = 0.9  # linear radiance from which a photograph may be clipped: the light may be brighter, not darker
 HUE = 0.3  # weight of the colour of light that no photograph shows
 

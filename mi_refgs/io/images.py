@@ -16,6 +16,7 @@ from mi_refgs.io.files import check_size, is_file, replace_file, require_file
 
 SRGB_LINEAR_LIMIT = 0.0031308  # linear value below which the sRGB curve is a straight line (IEC 61966-2-1)
 SRGB_ENCODED_LIMIT = 0.04045  # the same point after encoding
+SATURATED = 254.5 / 255.0  # from here up, 8-bit values are clipped: 255 means "at least this bright"
 ALPHA_FLOOR = 1e-8  # alpha by which radiance is divided at least
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp")  # of 8-bit images, in the order in which they are tried
 PSNR_MAX = 100.0  # dB, of identical images: JSON has no infinity
@@ -62,6 +63,11 @@ def box_downscale(image: np.ndarray, factor: float) -> np.ndarray:
         means = csr_array((np.maximum(shared, 0) / factor).astype(image.dtype))
         image = (means @ image.reshape(len(image), -1)).reshape(count, -1, channels).swapaxes(0, 1)
     return image
+
+
+def blocks_within(mask: np.ndarray, factor: float) -> np.ndarray:
+    """Which blocks of `box_downscale` lie wholly in a mask (H, W)."""
+    return np.asarray(box_downscale(mask[..., None].astype(np.float32), factor)[..., 0] == 1)
 
 
 def psnr_of(error: float) -> float:

@@ -117,10 +117,7 @@ def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], li
 
 def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[list[Float]]) -> PackedRows:
     """Adjoint of the rows, for adjoints δ of the maps and the maps themselves, per pixel of the lanes."""
-    behind = [
-        sum((a * b for a, b in zip(of_pixel, total, strict=True)), start=mi.Float(0))
-        for of_pixel, total in zip(δ, out, strict=True)
-    ]
+    behind = [_dot(of_pixel, total) for of_pixel, total in zip(δ, out, strict=True)]
     δrows = PackedRows.zeros(lists.rows.count, lists.rows.width)
 
     def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
@@ -139,7 +136,8 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
             moved: list[Float] = []
             if lists.turned:
                 places.append([weight * x for x in _inside(sample)])
-                moved = [weight * _dot(δhere, turn) for turn in _turns(lists, row)]  # adjoints of u and v
+                δturned = δhere[: lists.turned]
+                moved = [weight * _dot(δturned, turn) for turn in _turns(lists, row)]  # adjoints of u and v
             geometry.add(sample, δalpha, weight * δhere[-2], *moved)
             after.append((goes_on, transmittance_after, rest))
             weights.append(weight)
@@ -162,8 +160,7 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
 
 
 def _dot(first: list[Float], second: list[Float]) -> Float:
-    """Sum of products, of as many as the shorter list has."""
-    return sum((a * b for a, b in zip(first, second, strict=False)), start=mi.Float(0))
+    return sum((a * b for a, b in zip(first, second, strict=True)), start=mi.Float(0))
 
 
 def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Float]]:

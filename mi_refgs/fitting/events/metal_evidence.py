@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.fitting import per_view
 from mi_refgs.fitting.train import FEW_VIEWS, Trainer
-from mi_refgs.io.images import srgb_from_linear
+from mi_refgs.io.images import SATURATED, srgb_from_linear
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import Window
@@ -30,7 +30,6 @@ from mi_refgs.surfels.table import Surfels
 
 DIELECTRIC, METAL = 0.05, 0.95  # metallic afterwards: at 1, colour has no derivative
 OPAQUE = 0.8  # opacity of the object from which a pixel counts
-CLIPPED = 254.5 / 255  # displayed value from which a pixel may be brighter, and does not count
 LEVEL = 1 / 255  # displayed error below which materials explain equally well: a level of 8 bits
 SHADE = 0.01  # linear radiance below which the slope of sRGB stays that of this one
 NEIGHBOURS, STEPS = 16, 256  # nearest surfels, to which evidence spreads so many times
@@ -89,7 +88,7 @@ def moments(trainer: Trainer) -> np.ndarray:
         y, x = (seen - around - dull) / whole, (mirror - dull) / whole
         shade = np.maximum(seen, SHADE)
         slope = (srgb_from_linear(1.01 * shade) - srgb_from_linear(0.99 * shade)) / (0.02 * shade)
-        counts = (opacity > OPAQUE) & (view.displayed < CLIPPED).all(axis=-1, keepdims=True)
+        counts = (opacity > OPAQUE) & (view.displayed < SATURATED).all(axis=-1, keepdims=True)
         weight = np.square(slope) * counts
         maps = np.concatenate([counts, *(weight * value for value in (1, y, y * y, x * y, x * x))], axis=-1)
         planes = [upload(np.float32(plane).ravel()) for plane in np.moveaxis(maps, 2, 0)]
