@@ -11,7 +11,6 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import region_pixels
-from mi_refgs.data.registration import registered
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation import metrics
@@ -20,9 +19,9 @@ from mi_refgs.evaluation.error_budget import ErrorBudget, classify
 from mi_refgs.evaluation.images import Maps, RenderedView, contact_sheet, light_panels, over_colour, panels
 from mi_refgs.evaluation.scores import caption
 from mi_refgs.evaluation.surface import TrueSurface, surface_scores
-from mi_refgs.fitting.image_error import displayed_image, with_gain
+from mi_refgs.fitting.image_error import aligned, with_gain
 from mi_refgs.io.files import read_json
-from mi_refgs.io.images import blocks_within, write_png
+from mi_refgs.io.images import write_png
 from mi_refgs.io.progress import with_bar
 from mi_refgs.kernels.device import machine
 from mi_refgs.render.pipeline import Frame
@@ -41,7 +40,6 @@ SHEET_VIEWS = 4  # rows of the sheet, spread evenly over the test views
 ORANGE = np.array([0.75, 0.3, 0.0])  # of concave pixels
 MEANS = """psnr_aligned psnr_aligned_region psnr_aligned_object psnr psnr_region psnr_object ssim ssim_region
     region_share lpips normal_mae_deg normal_mae_deg_full""".split()  # scores whose means are reported
-REGISTERED = 128**2  # pixels of the averaged image to which a pose is fitted, at most: the renders take time
 
 
 def evaluate(
@@ -170,15 +168,7 @@ def _aligned_scores(
     other half best; `frame` is rendered with the pose that the view has."""
     edge = math.ceil(max(view.width, view.height) / 16)  # as `scores.caption` says
     fitted = (np.indices((view.height, view.width)) // edge).sum(axis=0) % 2 == 0
-    gain, _ = with_gain(frame, view, data, fitted)
-    block = math.ceil(math.sqrt(view.width * view.height / REGISTERED))
-    where = blocks_within(fitted, block)
-
-    def image_of(moved: View) -> np.ndarray:
-        return displayed_image(render(moved.camera()), moved, data, gain)
-
-    coarse = registered(view.averaged(block), image_of, data.scene_extent, where)
-    moved = replace(view, to_world=coarse.to_world)
+    moved = aligned(view, frame, render, data, fitted)
     gain, image = with_gain(render(moved.camera()), moved, data, fitted)
     scores: dict[str, Any] = {"gain": gain.round(4).tolist()}
     for name, mask in masks.items():

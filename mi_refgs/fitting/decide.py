@@ -190,14 +190,20 @@ def validation_psnr(trainer: Trainer) -> float:
     return float(np.mean([psnr(displayed_image(frame, view, trainer.data), view) for frame, view in frames]))
 
 
-def conclude(trainer: Trainer, row: Row, began: float, verdict: str = "") -> None:
-    """Record a decision, with all the time since `time.perf_counter()` was `began`, and save."""
+def record(trainer: Trainer, row: Row, verdict: str = "") -> None:
+    """Tell a decision, and keep it."""
     verdict = verdict or f"{row.component} {'stays' if row.stays else 'is left out'}"
     trainer.tell(f"{verdict}: {row.reason}")
     trainer.fit.decisions.append(asdict(row))
+    if trainer.run is not None:
+        trainer.run.write_json(DECISIONS, trainer.fit.decisions)
+
+
+def conclude(trainer: Trainer, row: Row, began: float, verdict: str = "") -> None:
+    """Record a decision, with all the time since `time.perf_counter()` was `began`, and save."""
+    record(trainer, row, verdict)
     hold_out(trainer)
     trainer.fit.seconds += time.perf_counter() - began
     trainer.save()
     if trainer.run is not None:
-        trainer.run.write_json(DECISIONS, trainer.fit.decisions)
         trainer.run.write_method(trainer.method)

@@ -1,4 +1,8 @@
-"""Displayed images of a fit as NumPy arrays, and their errors."""
+"""Displayed images of a fit as NumPy arrays, their errors, and the gains and poses that make them smaller."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -6,10 +10,14 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import fitted_gain
+from mi_refgs.data.registration import registered
 from mi_refgs.data.view import View
-from mi_refgs.io.images import psnr_of
+from mi_refgs.io.images import blocks_within, psnr_of
 from mi_refgs.render.display import composited, displayed, image_array
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.splat import Camera
+
+REGISTERED = 128 * 128  # pixels to which the image of a registered view is averaged, at most
 
 
 def displayed_image(frame: Frame, view: View, data: Dataset, gain: np.ndarray | None = None) -> np.ndarray:
@@ -26,6 +34,21 @@ def with_gain(
     rendered, alpha = (image_array(planes, view.height, view.width) for planes in composited(frame))
     gain = fitted_gain(rendered, alpha, view, data.background, where)
     return gain, displayed_image(frame, view, data, gain)
+
+
+def aligned(
+    view: View, frame: Frame, render: Callable[[Camera], Frame], data: Dataset, where: np.ndarray
+) -> View:
+    """A loaded view with the pose that fits its pixels `where` (H, W) best; `frame` has the present one."""
+    gain, _ = with_gain(frame, view, data, where)
+
+    def image_of(moved: View) -> np.ndarray:
+        return displayed_image(render(moved.camera()), moved, data, gain)
+
+    block = math.ceil(math.sqrt(view.width * view.height / REGISTERED))
+    small = view.averaged(block)
+    found = registered(small, image_of, data.scene_extent, blocks_within(where, block))
+    return replace(view, to_world=found.to_world)
 
 
 def squared_error(image: np.ndarray, view: View) -> np.ndarray:

@@ -1,57 +1,75 @@
-"""Parameters with a row per training view (`fitting.per_view`) begin to learn, once the views are final.
+"""Parameters with a row per training view (`fitting.per_view`) begin to learn where the images need them.
 
 Exposure gains are those that the photographs tell (`data.exposure.told_gains`), from the first step on, else
 fitted to renders. What no image needs stays near 1: fitted gains within DEAD_ZONE of it count as 1, they
-learn slowly, and the loss has a prior on them. Corrections of cameras begin at 0, and
-learn slowly, since true cameras hardly move (`schedule.LEARNT_BESIDE`)."""
+learn slowly, and the loss has a prior on them. Corrections of cameras begin at 0, and learn slowly, since
+true cameras hardly move (`schedule.LEARNT_BESIDE`). Those of exact cameras would only blur the scene."""
 
+import itertools
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from mi_refgs.data.exposure import told_gains
-from mi_refgs.fitting.decide import validates
-from mi_refgs.fitting.image_error import with_gain
+from mi_refgs.data.view import View, evenly_spread
+from mi_refgs.fitting.decide import Row, record, validates
+from mi_refgs.fitting.image_error import aligned, with_gain
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import GAIN, POSE
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.splat import Camera
 
 DEAD_ZONE = 0.05  # log gain that counts as none: that of a render in the first fifth of a fit
+ALIGNED = 8  # training views whose cameras are compared with their images
+EXACT = 0.5  # pixels that they move by, in the median, if they are exact: 0.1 to 0.4, after a fifth of a fit
 
 
 @dataclass(frozen=True)
 class PerView(Event[Trainer]):
-    """An event after which `parameter` learns."""
+    """An event that decides whether `parameter` learns."""
 
     parameter: ClassVar[str]
     after: int = field(default=1_200, metadata=ITERATIONS | at_least(0))  # iterations before they learn
 
     def due(self, trainer: Trainer) -> bool:
         waits = 0 < trainer.iteration < self.after or validates(trainer)
-        return not waits and self.parameter not in trainer.fit.params
+        decided = any(row["component"] == self.name for row in trainer.fit.decisions)
+        return not waits and not decided and self.parameter not in trainer.fit.params
 
     def apply(self, trainer: Trainer) -> None:
-        if (rows := self.first(trainer)) is not None:
-            trainer.fit.add(trainer.setup, self.parameter, upload_tensor(rows.astype(np.float32)))
+        if (found := self.first(trainer)) is not None:
+            rows, needed, reason = found
+            verdict = f"corrections of {self.name} {'stay' if needed else 'are left out'}"
+            record(trainer, Row(self.name, trainer.iteration, needed, reason), verdict)
+            if needed:
+                trainer.fit.add(trainer.setup, self.parameter, upload_tensor(rows.astype(np.float32)))
 
-    def first(self, trainer: Trainer) -> np.ndarray | None:
-        """The initial values, a row per training view; None, before the first step, to wait for `after`."""
+    def first(self, trainer: Trainer) -> tuple[np.ndarray, bool, str] | None:
+        """The initial values, a row per training view, whether any is needed, and why; None, before the
+        first step, to wait for `after`."""
         raise NotImplementedError
 
 
 @register_event
 @dataclass(frozen=True)
 class Cameras(PerView):
-    """Lets the camera of each training view learn: a small rigid motion."""
+    """Lets the camera of each training view learn, a small rigid motion, unless they are exact."""
 
     name: ClassVar[str] = "cameras"
     parameter: ClassVar[str] = POSE
 
-    def first(self, trainer: Trainer) -> np.ndarray | None:
-        return np.zeros((len(trainer.data.views), 6)) if trainer.iteration >= self.after else None
+    def first(self, trainer: Trainer) -> tuple[np.ndarray, bool, str] | None:
+        if trainer.iteration < self.after:
+            return None
+        views = trainer.data.views
+        moved = [_moved(trainer, views[i].load()) for i in evenly_spread(len(views), ALIGNED)]
+        off = float(np.median(moved))
+        reason = f"{len(moved)} images fit {off:.2f} pixels from where their cameras say"
+        return np.zeros((len(views), 6)), off > EXACT, reason
 
 
 @register_event
@@ -62,7 +80,7 @@ class Exposure(PerView):
     name: ClassVar[str] = "exposure"
     parameter: ClassVar[str] = GAIN
 
-    def first(self, trainer: Trainer) -> np.ndarray | None:
+    def first(self, trainer: Trainer) -> tuple[np.ndarray, bool, str] | None:
         data = trainer.data
         if (log := told_gains(data.views)) is None:
             if trainer.iteration < self.after:
@@ -72,5 +90,18 @@ class Exposure(PerView):
             log = np.log(fitted) - np.log(fitted).mean(axis=0)
             log = np.sign(log) * np.maximum(abs(log) - DEAD_ZONE, 0)
         least, most = np.exp([log.min(), log.max()])
-        trainer.tell(f"exposure: gains of {least:.2f} to {most:.2f} per image")
-        return log
+        return log, bool(log.any()), f"gains of {least:.2f} to {most:.2f} per image"
+
+
+def _moved(trainer: Trainer, view: View) -> float:
+    """Pixels that what a loaded view looks at moves by, if its pose is fitted to its image; the mean."""
+
+    def render(camera: Camera) -> Frame:
+        return trainer.view(camera, aovs=False)
+
+    everywhere = np.ones((view.height, view.width), bool)
+    fitted = aligned(view, render(view.camera()), render, trainer.data, everywhere)
+    corners = np.array([*itertools.product((-0.5, 0.5), repeat=3)])
+    points = trainer.setup.focus + trainer.setup.reach * corners
+    before, after = (np.stack(one.project(points)[:2]) for one in (view, fitted))
+    return float(np.linalg.norm(after - before, axis=0).mean())
