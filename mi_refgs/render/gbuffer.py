@@ -20,11 +20,11 @@ Slots = Mapping[str, Any]  # values by name, such as mi.Color3f; each costs time
 class GBuffer:
     """Blended slots of a view, in raster order or in that of `pixels`. A slot that nobody needs is absent."""
 
-    def __init__(self, blended: Composited, kinds: Slots) -> None:
-        """The maps of the `features` of slots, and of the attribution if it follows them."""
-        self.alpha, self.pixels = blended.alpha, blended.pixels
-        self.slots = _grouped(kinds, blended.features)  # premultiplied by alpha
-        self.attribution = next(iter(blended.features[len(features(kinds)) :]), None)
+    def __init__(self, blended: Composited, kinds: Slots, attribution: int | None = None) -> None:
+        """The maps of the `features` of slots, among which that of the attribution is, if it has a place."""
+        self.alpha, self.pixels, maps = blended.alpha, blended.pixels, [*blended.features]
+        self.attribution = None if attribution is None else maps.pop(attribution)
+        self.slots = _grouped(kinds, maps)  # premultiplied by alpha
         inverse = inverse_alpha(blended.alpha)
         self.depth = None if blended.depth is None else blended.depth * inverse  # of the camera's z
         # 1/alpha, or 1/opacity of the object, where that is seen, else 0.

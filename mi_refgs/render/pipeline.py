@@ -168,10 +168,12 @@ class _View:
     ) -> GBuffer:
         """Blend slots of the object's surfels together with those of the surroundings, in one sort; the first
         slot varies over a surfel by its `turns`."""
+        few, place = len(features(slots)), None  # features that all surfels have; place of the attribution
         if self.others:
             own, beside = (table.count for table in self.geometry)
             first = dict.fromkeys([*slots][:1], mi.Vector3f(0)) if turns else {}
-            slots = joined_slots(slots, first | others, (own, beside))
+            few = len(features(first | others))
+            slots = joined_slots(slots, first | others, (own, beside))  # begin with those of the surroundings
             turns = joined_slots(turns, {}, (own, beside))
         values = features(slots)
         if self.request.forward_only:
@@ -179,9 +181,10 @@ class _View:
             blended = splat_compact(self.geometry, values, self.camera, depth, features(turns))
         else:
             if self.request.attribution is not None:
-                values = [*values, self.request.attribution]
-            blended = splat(self.geometry, values, self.camera, features(turns))
-        return GBuffer(blended, slots)
+                values.insert(few, self.request.attribution)
+                place = few
+            blended = splat(self.geometry, values, self.camera, features(turns), few + (place is not None))
+        return GBuffer(blended, slots, place)
 
     def frame(self, buffer: GBuffer, **fields: Any) -> Frame:
         """The frame of a G-buffer and of what was shaded, in raster order."""

@@ -32,13 +32,21 @@ def project(surfels: Tables, camera: Camera) -> Footprints:
     return reduce(Footprints.followed_by, (table.primitive.project(table, camera) for table in tables))
 
 
-def splat(surfels: Tables, features: list[Float], camera: Camera, turns: Sequence[Float] = ()) -> Composited:
+def splat(
+    surfels: Tables,
+    features: list[Float],
+    camera: Camera,
+    turns: Sequence[Float] = (),
+    few: int | None = None,
+) -> Composited:
     """Splat features of surfels to maps of H·W pixels in raster order; derivatives as in `composite`. The
-    first T features gain `turns` (2 T of them) per standard deviation of a surfel, along u, then along v."""
+    first T features gain `turns` (2 T of them) per standard deviation of a surfel, along u, then along v. All
+    but the first `few` are zero in the tables after the first, and are not blended where only these are."""
     if surfel_count(surfels) == 0:
         return Composited.nothing(len(features), camera)
     footprints = project(surfels, camera)
-    lists = list_by_tile(footprints, camera, features, turns)
+    begin = None if few is None else (tables_of(surfels)[0].count, few)
+    lists = list_by_tile(footprints, camera, features, turns, begin)
     return composite(footprints, features, lists, [*turns])
 
 

@@ -67,16 +67,16 @@ def composite_compact(lists: TileLists, depth: bool) -> Composited:
     dr.eval(lists.rows.data)
     chosen = Lanes.filled(lists)
     lanes = Lanes.of(lists, chosen)
-    transmittance, sums = _forward(lists, lanes, lists.features + depth)
+    transmittance, sums = _forward(lists, lanes, lists.features, lists.features + depth)
     values = [[*of_pixel, 1 - T] for of_pixel, T in zip(sums, transmittance, strict=True)]
     maps = CompactedPixels.scattered(values, dr.width(chosen))
     pixels = CompactedPixels.of(lists.camera, chosen, lanes)
     return Composited(maps[: lists.features], maps[-2] if depth else None, maps[-1], pixels)
 
 
-def _values(lists: TileLists, row: list[Float], sample: Any) -> list[Float]:
-    """What a surfel adds to each map, times its weight: features, depth, and 1 for alpha."""
-    features = row[lists.primitive.columns :][: lists.features]
+def _values(lists: TileLists, row: list[Float], sample: Any, count: int) -> list[Float]:
+    """What a surfel adds to each map, times its weight: the first features, depth, and 1 for alpha."""
+    features = row[lists.primitive.columns :][:count]
     if lists.turned:
         (u, v), (by_u, by_v) = _inside(sample), _turns(lists, row)
         features[: lists.turned] = [
@@ -96,8 +96,10 @@ def _inside(sample: Any) -> list[Float]:
     return [dr.select(sample.low_pass, 0, x) for x in (sample.u, sample.v)]
 
 
-def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], list[list[Float]]]:
-    """Transmittance and the first `maps` maps, per pixel of the lanes."""
+def _forward(
+    lists: TileLists, lanes: Lanes, features: int, maps: int
+) -> tuple[list[Float], list[list[Float]]]:
+    """Transmittance and the first `maps` of so many features, depth and alpha, per pixel of the lanes."""
 
     def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row = lists.rows.fetch(surfel, some)
@@ -105,7 +107,7 @@ def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], li
         for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
             sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-            values = _values(lists, row, sample)[:maps]
+            values = _values(lists, row, sample, features)[:maps]
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
             after.append((goes_on, transmittance_after, out))
         return after
@@ -115,10 +117,12 @@ def _forward(lists: TileLists, lanes: Lanes, maps: int) -> tuple[list[Float], li
     return transmittance, out
 
 
-def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[list[Float]]) -> PackedRows:
-    """Adjoint of the rows, for adjoints δ of the maps and the maps themselves, per pixel of the lanes."""
+def _backward(
+    lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[list[Float]], δrows: PackedRows
+) -> None:
+    """Add the adjoint of the rows, for adjoints δ of the maps and the maps, per pixel of the lanes."""
     behind = [_dot(of_pixel, total) for of_pixel, total in zip(δ, out, strict=True)]
-    δrows = PackedRows.zeros(lists.rows.count, lists.rows.width)
+    features = len(δ[0]) - 2
 
     def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row = lists.rows.fetch(surfel, some)
@@ -129,7 +133,7 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
             sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
             g = mi.Float(0)
-            for adjoint, value in zip(δhere, _values(lists, row, sample), strict=True):
+            for adjoint, value in zip(δhere, _values(lists, row, sample, features), strict=True):
                 g = dr.fma(adjoint, value, g)
             rest = dr.fma(-weight, g, behind_here)
             δalpha = dr.select(weight > 0, dr.fma(transmittance, g, -rest / (1 - sample.alpha)), 0)
@@ -143,12 +147,13 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
             weights.append(weight)
         # One addition per lane to the adjoint of the row.
         δrow = geometry.columns(row)
-        for k in range(lists.features):
+        for k in range(features):
             δfeature = mi.Float(0)
             for weight, δhere in zip(weights, δ, strict=True):
                 δfeature = dr.fma(weight, δhere[k], δfeature)
             δrow.append(δfeature)
-        for axis, k in itertools.product(range(2), range(lists.turned)):
+        turned = lists.turned if features == lists.features else 0  # surfels of few features do not turn
+        for axis, k in itertools.product(range(2), range(turned)):
             δrow.append(_dot([of_pixel[axis] for of_pixel in places], [δhere[k] for δhere in δ]))
         δrows.add(surfel, δrow, any_of([weight > 0 for weight in weights]))
         return after
@@ -156,7 +161,6 @@ def _backward(lists: TileLists, lanes: Lanes, δ: list[list[Float]], out: list[l
     start = [(mi.Bool(a), mi.Float(1), b) for a, b in zip(lanes.inside, behind, strict=True)]
     walk(lists, lanes, step, start, "composite_backward")
     dr.eval(δrows.data)
-    return δrows
 
 
 def _dot(first: list[Float], second: list[Float]) -> Float:
@@ -176,7 +180,7 @@ def _tangent(lists: TileLists, lanes: Lanes, drows: PackedRows) -> list[list[Flo
                 dr.set_grad(start, [*drow, dtransmittance])
                 sample = lists.primitive.evaluate(start, pixel, lists.camera.near)
                 weight, transmittance_after, goes_on = advance(sample, active_here, start[-1])
-                maps = [weight * value for value in _values(lists, start, sample)]
+                maps = [weight * value for value in _values(lists, start, sample, lists.features)]
                 *dmaps, dafter = dr.forward_to([*maps, transmittance_after])
             dout = [total + dmap for total, dmap in zip(dout, dmaps, strict=True)]
             after.append((goes_on, dr.detach(transmittance_after), dafter, dout))
@@ -195,25 +199,34 @@ class _Composite(dr.CustomOp):
         self.lists = lists
         dr.eval(lists.rows.data)
         self.out = _blank(lists.features + 2, lists.camera)
-        if lists.pairs:  # Dr.Jit refuses to gather from an empty list, even fully masked
-            lanes = Lanes.of(lists)
-            self.out = lanes.to_raster(lists.camera, _forward(lists, lanes, lists.features + 2)[1])
+        self.parts = Lanes.parts(lists) if lists.pairs else []  # Dr.Jit refuses to gather from an empty list
+        for lanes, count in self.parts:
+            values = _forward(lists, lanes, count, count + 2)[1]
+            lanes.to_raster(_maps(self.out, count), values)
         return self.out
 
     def forward(self) -> None:
         lists, dout = self.lists, _blank(self.lists.features + 2, self.lists.camera)
         if lists.pairs:
             lanes, drows = Lanes.of(lists), PackedRows.pack(self.grad_in("columns"))
-            dout = lanes.to_raster(lists.camera, _tangent(lists, lanes, drows))
+            lanes.to_raster(dout, _tangent(lists, lanes, drows))
         self.set_grad_out(dout)
 
     def backward(self) -> None:
         if not self.lists.pairs:
             return
-        δout, lanes = self.grad_out(), Lanes.of(self.lists)
+        δout, rows = self.grad_out(), self.lists.rows
         dr.eval(δout)  # together: to gather from them would evaluate one by one what they have in common
-        δrows = _backward(self.lists, lanes, lanes.from_raster(δout), lanes.from_raster(self.out))
+        δrows = PackedRows.zeros(rows.count, rows.width)
+        for lanes, count in self.parts:
+            δ, out = (lanes.from_raster(_maps(images, count)) for images in (δout, self.out))
+            _backward(self.lists, lanes, δ, out, δrows)
         self.set_grad_in("columns", δrows.columns())
+
+
+def _maps(every: list[Float], features: int) -> list[Float]:
+    """The maps of the first features, of depth and of alpha."""
+    return [*every[:features], *every[-2:]]
 
 
 def _blank(count: int, camera: Camera) -> list[Float]:

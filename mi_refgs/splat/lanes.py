@@ -69,6 +69,7 @@ class Lanes:
     inside: list[Bool]  # LANE_PIXELS × (L,): whether it is in the image
     begin: UInt32  # (L,): first pair of the tile
     end: UInt32  # (L,): one past its last pair
+    tile: UInt32  # (L,): in the image, where it has pairs
 
     @staticmethod
     def of(lists: TileLists, chosen: UInt32 | None = None) -> Lanes:
@@ -96,27 +97,36 @@ class Lanes:
             [there & (x < camera.width) & (y < camera.height) for x, y in pixels],
             dr.gather(mi.UInt32, lists.pair_begin, tile, there),
             dr.gather(mi.UInt32, lists.pair_end, tile, there),
+            tile,
         )
 
     @staticmethod
     def filled(lists: TileLists) -> UInt32:
         """The patches with a tile that lists a surfel; waits for the device."""
         lanes = Lanes.of(lists)
-        listed = dr.select(lanes.begin < lanes.end, mi.UInt32(1), 0)
-        return dr.compress(dr.block_reduce(dr.ReduceOp.Or, listed, PATCH_LANES) > 0)
+        return dr.compress(_of_patches(lanes.begin < lanes.end))
+
+    @staticmethod
+    def parts(lists: TileLists) -> list[tuple[Lanes, int]]:
+        """All lanes, with the number of features that their surfels have: those of patches with a surfel of
+        the first table, then the others; waits for the device if rows differ."""
+        lanes = Lanes.of(lists)
+        if lists.few is None:
+            return [(lanes, lists.features)]
+        whole = _of_patches(dr.gather(mi.UInt32, lists.with_all, lanes.tile, lanes.begin < lanes.end) > 0)
+        parts = ((dr.compress(whole), lists.features), (dr.compress(~whole), lists.few))
+        return [(Lanes.of(lists, chosen), count) for chosen, count in parts if dr.width(chosen)]
 
     def each(self, *values: list[Any]) -> Any:
         """Iterate over a lane's pixels: centre, raster index, inside, and lists of a value per pixel."""
         return zip(self.pixel, self.raster, self.inside, *values, strict=True)
 
-    def to_raster(self, camera: Camera, values: list[list[Float]]) -> list[Float]:
-        """Images of values per pixel of the lanes, written in the kernel of the loop that made them."""
-        images = [dr.empty(mi.Float, camera.width * camera.height) for _ in values[0]]
+    def to_raster(self, images: list[Float], values: list[list[Float]]) -> None:
+        """Write values per pixel of the lanes to images, in the kernel of the loop that made them."""
         for _, raster, inside, of_pixel in self.each(values):
             for image, value in zip(images, of_pixel, strict=True):
                 dr.scatter(image, value, raster, inside, mode=dr.ReduceMode.NoConflicts)
         dr.eval(images)
-        return images
 
     def from_raster(self, images: list[Float]) -> list[list[Float]]:
         """Inverse of `to_raster`; 0 outside the image."""
@@ -176,6 +186,11 @@ class CompactedPixels:
             return value if dr.width(value) == 1 else dr.gather(type(value), value, self.index, self.there)
 
         return mapped(raster, values)
+
+
+def _of_patches(flags: Bool) -> Bool:
+    """Whether a flag is set in one of the lanes of each patch."""
+    return dr.block_reduce(dr.ReduceOp.Or, dr.select(flags, mi.UInt32(1), 0), PATCH_LANES) > 0
 
 
 def any_of(flags: list[Bool]) -> Bool:

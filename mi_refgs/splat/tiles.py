@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -30,6 +30,8 @@ class TileLists:
     pair_begin: UInt32  # (tiles,): first pair of a tile
     pair_end: UInt32  # (tiles,): one past its last pair
     turned: int = 0  # the first features that vary over their surfel, by two turns each
+    few: int | None = None  # features of the rows of tables after the first; the others are zero
+    with_all: UInt32 = None  # (tiles,): 1 where a row of the first table is listed, if there are few
 
     @property
     def pairs(self) -> int:
@@ -44,10 +46,15 @@ class TileLists:
 
 @phase("tile lists")
 def list_by_tile(
-    footprints: Footprints, camera: Camera, features: Sequence[Float] = (), turns: Sequence[Float] = ()
+    footprints: Footprints,
+    camera: Camera,
+    features: Sequence[Float] = (),
+    turns: Sequence[Float] = (),
+    few: tuple[int, int] | None = None,
 ) -> TileLists:
     """List every surfel, stably, in each tile that its footprint may touch, and pack footprints, features and
-    turns (N,). Raises InputError for more than 2^MAX_PAIR_BITS pairs."""
+    turns (N,). `few`: a row from which on only so many features are not zero. Raises InputError for more than
+    2^MAX_PAIR_BITS pairs."""
     tiles = camera.tiles[0] * camera.tiles[1]
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     rows, turned = PackedRows.pack([*footprints.columns, *features, *turns]), len(turns) // 2
@@ -77,7 +84,12 @@ def list_by_tile(
         return TileLists(camera, primitive, rows, mi.UInt32(), none, none, turned)
     pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
     tile, surfel = _sorted(pairs, depth, tiles)
-    return TileLists(camera, primitive, rows, surfel, *_runs(tile, tiles), turned)
+    lists = TileLists(camera, primitive, rows, surfel, *_runs(tile, tiles), turned)
+    if few is None or few[1] >= len(features):
+        return lists
+    with_all = dr.zeros(mi.UInt32, tiles)
+    dr.scatter(with_all, mi.UInt32(1), tile, surfel < dr.opaque(mi.UInt32, few[0]))
+    return replace(lists, few=few[1], with_all=with_all)
 
 
 @phase("sort")

@@ -16,6 +16,7 @@ from mi_refgs.reference import splat as oracle
 from mi_refgs.reference.camera import look_at, rotation_axes
 from mi_refgs.reference.footprint import Gaussian, Rules, Surfel
 from mi_refgs.splat import Camera, list_by_tile, project, splat, tiles
+from mi_refgs.splat.lanes import Lanes
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import slow
 from tests.scenes import splats as scenes
@@ -228,6 +229,31 @@ def test_crossing_surfels_each_hide_the_other_on_their_own_side() -> None:
     first, second = (f.numpy().reshape(32, 32)[16] for f in maps.features)
     left, right = first[11] - second[11], first[20] - second[20]
     assert left * right < 0 and min(abs(left), abs(right)) > 0.5
+
+
+@BOTH
+def test_features_of_the_first_table_alone(kind: Primitive, rng: np.random.Generator) -> None:
+    """Where only other surfels are, only theirs are blended: with the same maps and gradients."""
+    scene, few, own = kind.make(8), 1, 2
+    camera = scene.fast_camera()
+    columns = rng.normal(size=(4, len(scene.raw["position"]))).astype(np.float32)
+    columns[few:, own:] = 0
+    weights = rng.normal(size=(6, camera.width * camera.height)).astype(np.float32)
+    found = []
+    for count in (None, few):
+        parts = (slice(own), slice(own, None))
+        tables = [Surfels.from_numpy({n: x[rows] for n, x in scene.raw.items()}) for rows in parts]
+        features = [mi.Float(column) for column in columns]
+        dr.enable_grad(features, [table.raw for table in tables])
+        blended = splat(tables, features, camera, few=count)
+        maps = [*blended.features, blended.depth, blended.alpha]
+        dr.backward(sum(dr.sum(mi.Float(w) * x) for w, x in zip(weights, maps, strict=True)))
+        slopes = [dr.grad(x) for x in (features[0], *tables[0].raw.values(), *tables[1].raw.values())]
+        found.append([x.numpy() for x in maps + slopes] + [dr.grad(x).numpy()[:own] for x in features[few:]])
+    lists = list_by_tile(project(tables, camera), camera, features, few=(own, few))
+    assert [count for _, count in Lanes.parts(lists)] == [4, few]
+    for plain, parted in zip(*found, strict=True):
+        np.testing.assert_allclose(parted, plain, rtol=1e-5, atol=2e-6 * np.abs(plain).max())
 
 
 def test_second_view_compiles_nothing() -> None:
