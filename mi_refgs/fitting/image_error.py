@@ -15,6 +15,7 @@ from mi_refgs.data.view import View
 from mi_refgs.io.images import blocks_within, psnr_of
 from mi_refgs.render.display import composited, displayed, image_array
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.samples import supersampled
 from mi_refgs.splat import Camera
 
 REGISTERED = 128 * 128  # pixels to which the image of a registered view is averaged, at most
@@ -40,15 +41,18 @@ def aligned(
     view: View, frame: Frame, render: Callable[[Camera], Frame], data: Dataset, where: np.ndarray
 ) -> View:
     """A loaded view with the pose that fits its pixels `where` (H, W) best; `frame` has the present one."""
-    gain, _ = with_gain(frame, view, data, where)
+    gain, before = with_gain(frame, view, data, where)
+    block = math.ceil(math.sqrt(view.width * view.height / REGISTERED))
 
     def image_of(moved: View) -> np.ndarray:
-        return displayed_image(render(moved.camera()), moved, data, gain)
+        # One sample per pixel of an averaged image aliases: poses were half a pixel off.
+        samples = 4 if moved.width < view.width else 1
+        return displayed_image(supersampled(render, moved.camera(), samples, maps=False), moved, data, gain)
 
-    block = math.ceil(math.sqrt(view.width * view.height / REGISTERED))
-    small = view.averaged(block)
-    found = registered(small, image_of, data.scene_extent, blocks_within(where, block))
-    return replace(view, to_world=found.to_world)
+    found = registered(view.averaged(block), image_of, data.scene_extent, blocks_within(where, block))
+    moved = replace(view, to_world=found.to_world)
+    errors = [squared_error(image, view)[where].mean() for image in (before, image_of(moved))]
+    return moved if errors[1] < errors[0] else view
 
 
 def squared_error(image: np.ndarray, view: View) -> np.ndarray:
