@@ -45,16 +45,11 @@ Picture = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture
-def method(tmp_path: Path) -> Method:
-    """Without coarse images and other events; gains and cameras learn from iteration AFTER on."""
+def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
+    """Without coarse images and other events; gains and cameras, which seem wrong, learn from AFTER on."""
+    monkeypatch.setattr("mi_refgs.fitting.events.per_view._moved", lambda trainer, view: 1.0)
     events: dict[str, Any] = {"exposure": Exposure(AFTER), "cameras": Cameras(AFTER)}
     return replace(small_method(tmp_path), event=events, data=DataOptions())
-
-
-@pytest.fixture
-def inexact(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cameras that seem to be wrong."""
-    monkeypatch.setattr("mi_refgs.fitting.events.per_view._moved", lambda trainer, view: 1.0)
 
 
 @pytest.fixture
@@ -162,7 +157,6 @@ def perfect(data: Dataset) -> Any:
     return frame
 
 
-@pytest.mark.usefixtures("inexact")
 def test_gains_of_images(method: Method, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Up to the mean of all views, less the dead zone; images of one exposure have none, and none learns."""
     log, said = rng.uniform(-0.5, 0.3, (12, 3)), list[str]()
@@ -267,7 +261,6 @@ def opposed(trainer: Trainer, rows: np.ndarray, index: int, i: int, change: floa
     return moved
 
 
-@pytest.mark.usefixtures("inexact")
 @pytest.mark.parametrize("stop", [AFTER - 1, AFTER + 3])
 def test_fit_resumes_bit_for_bit(
     stop: int, method: Method, rng: np.random.Generator, tmp_path: Path, one_thread: None
@@ -294,7 +287,6 @@ def test_fit_resumes_bit_for_bit(
         refused(partial(Trainer, method, fewer, state=one), *words)
 
 
-@pytest.mark.usefixtures("inexact")
 def test_warm_step_compiles_nothing(method: Method, rng: np.random.Generator) -> None:
     """Another view has another gain and pose, and no other kernel; its rows move with their own gradient."""
     trainer = step_to(Trainer(method, exposed(ball(), rng.uniform(-0.5, 0.3, (6, 3)))), 18)
@@ -403,16 +395,14 @@ def test_averaged_images_align(rng: np.random.Generator, monkeypatch: pytest.Mon
 
 
 def test_exact_cameras_stay(tmp_path: Path, rng: np.random.Generator) -> None:
-    """The images of exact surfels, from exact poses, and from ones 0.05 pixels off."""
+    """The images of exact surfels, from poses 0.05 pixels off."""
     path, said = tmp_path / "radiance.toml", list[str]()
     path.write_text(RADIANCE)
     data, surfels, true = disturbed_discs(rng)
-    for share in (0.0, 0.05):
-        poses = true + share * (np.stack([view.to_world for view in data.views]) - true)
-        views = [replace(view, to_world=pose) for view, pose in zip(data.views, poses, strict=True)]
-        trainer = Trainer(load_resolved(path), replace(data, views=tuple(views)), tell=said.append)
-        trainer.fit.tables[0].replace(surfels, tuple(surfels.raw))
-        step_to(trainer, 3)
-        assert POSE not in trainer.fit.params
-    words = "corrections of cameras are left out: 8 images fit 0.0"
-    assert [words in text for text in said] == [True, True]
+    poses = true + 0.05 * (np.stack([view.to_world for view in data.views]) - true)
+    views = [replace(view, to_world=pose) for view, pose in zip(data.views, poses, strict=True)]
+    trainer = Trainer(load_resolved(path), replace(data, views=tuple(views)), tell=said.append)
+    trainer.fit.tables[0].replace(surfels, tuple(surfels.raw))
+    step_to(trainer, 3)
+    assert POSE not in trainer.fit.params
+    assert len(said) == 1 and "corrections of cameras are left out: 8 images fit 0.0" in said[0]
