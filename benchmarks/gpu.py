@@ -180,7 +180,7 @@ def tests(small: bool) -> Iterator[Row]:
     yield {"code": done.returncode, "tail": done.stdout.splitlines()[-30:]}
 
 
-LIMITS = {values: 60, splat: 80, step: 120, gsplat: 60, fit: 150, frame: 30, volprim: 30, tests: 60}
+LIMITS = {values: 60, splat: 80, step: 120, gsplat: 60, fit: 210, frame: 30, volprim: 30, tests: 60}
 """Seconds of each step, in order of worth."""
 
 
