@@ -31,9 +31,9 @@ def gaussian_shader(_: Path) -> mi.Scene:
 
 
 def surfels(folder: Path) -> mi.Scene:
-    curvature = np.random.default_rng(6).normal(size=(COUNT, 3)).astype(np.float32)
-    raw, mesh = raw_channels() | {"curvature": curvature}, scenes.plane_mesh(folder)
-    return scenes.open_scene(raw=raw, mesh=mesh, aovs="n:normal,d:depth")
+    rng, raw = np.random.default_rng(6), raw_channels()
+    raw |= {n: rng.normal(size=(COUNT, k)).astype(np.float32) for n, k in (("curvature", 3), ("confidence", 1))}
+    return scenes.open_scene(raw=raw, mesh=scenes.plane_mesh(folder), aovs="n:normal,d:depth,c:confidence")
 
 
 def emitters(_: Path) -> mi.Scene:

@@ -24,7 +24,8 @@ RELIT_RAYS = {"visibility_rays": 16, "traced_bounces": 2, "ambient_rays": 128}
 
 def spare(attributes: Iterable[str], used: Collection[str]) -> list[str]:
     """Materials among the attributes that are not used."""
-    return [name for name in attributes if name not in {*used, *LIT} and not ATTRIBUTES[name].geometry]
+    kept = {*used, *LIT, "confidence"}
+    return [name for name in attributes if name not in kept and not ATTRIBUTES[name].geometry]
 
 
 @dataclass(frozen=True)

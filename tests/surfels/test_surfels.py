@@ -87,7 +87,7 @@ def test_turns_are_bounded_however_curved_or_large_a_surfel_is() -> None:
 def everything(surfels: Surfels) -> object:
     """Every accessor of every channel, with a weight of its own per entry."""
     arrays = [*surfels.position(), *surfels.scale(), surfels.opacity()]
-    arrays += [surfels.value("metallic"), surfels.value("roughness")]
+    arrays += [surfels.value(name) for name in ("metallic", "roughness", "confidence")]
     arrays += [entry for axis in surfels.frame() for entry in axis]
     arrays += [entry for name in ("albedo", "tint", "normal_offset") for entry in surfels.value(name)]
     turns = surfels.primitive.turns(surfels, surfels.frame()[2])

@@ -41,7 +41,8 @@ FITTED = 0.2  # dB by which metallic as it was learnt counts from 0 to 1: it dec
 @register_event
 @dataclass(frozen=True)
 class MetalEvidence(Event[Trainer]):
-    """Makes each surfel a metal or a dielectric, as images and its neighbours say; metallic then stays."""
+    """Makes each surfel a metal or a dielectric, as images and its neighbours say; metallic then stays.
+    `confidence` becomes the share of the other material's squared error that this one avoids."""
 
     name: ClassVar[str] = "metal_evidence"
     attributes: ClassVar[tuple[str, ...]] = ("albedo", "metallic", "roughness")
@@ -53,7 +54,8 @@ class MetalEvidence(Event[Trainer]):
     def apply(self, trainer: Trainer) -> None:
         errors, tint, colour, pixels = fitted(moments(trainer))
         raw = trainer.surfels.to_numpy()
-        metal = preferred(trainer.surfels, errors, pixels, colour) > 0
+        gain = preferred(trainer.surfels, errors, pixels, colour)
+        metal = gain > 0
         was = sigmoid(raw["metallic"][:, 0]) > 0.5
         # A surfel that changes continues with the colour that was fitted to it.
         raw["metallic"] = np.where(metal, logit(METAL), logit(DIELECTRIC))[:, None].astype(np.float32)
@@ -61,6 +63,8 @@ class MetalEvidence(Event[Trainer]):
         if "radiance_sh" in raw:
             raw["radiance_sh"][was & ~metal] = 0
             raw["radiance_sh"][was & ~metal, :3] = ((colour - 0.5) / SH_DC)[was & ~metal]
+        if "confidence" in raw:
+            raw["confidence"] = logit(1 - 10 ** (-np.abs(gain[:, None]) / 10)).astype(np.float32)
         trainer.fit.tables[0].replace(Surfels.from_numpy(raw), ("metallic", "albedo", "radiance_sh"))
         trainer.fit.optimiser.factors["metallic"] = 0.0
         trainer.tell(f"metal: {metal.mean():.0%} of the surfels, {np.mean(metal != was):.0%} changed")

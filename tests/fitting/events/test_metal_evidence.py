@@ -40,13 +40,13 @@ def sphere(rng: np.random.Generator) -> dict[str, np.ndarray]:
         "metallic": logit(upper),
         "roughness": np.full((COUNT, 1), logit(0.2)),
         "indirect_sh": np.zeros((COUNT, 48)),
+        "confidence": np.zeros((COUNT, 1)),
     }
 
 
 @pytest.mark.filterwarnings("ignore:Optimal rotation")
 def test_images_decide(tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Images of a ball of gold and plastic, whose surfels start between both, tell one from the other, and
-    the colour of the metal; metallic does not learn afterwards."""
+    """Images of a ball of gold and plastic tell both apart, and the metal's colour; metallic then stays."""
     method = replace(small_method(tmp_path), event={}, data=DataOptions())
     data, said = ball(32, views=12), list[str]()
     trainer = Trainer(method, data, tell=said.append)
@@ -72,6 +72,8 @@ def test_images_decide(tmp_path: Path, rng: np.random.Generator, monkeypatch: py
     assert {*np.round(metal, 6)} == {event.DIELECTRIC, event.METAL}
     right = (metal > 0.5) == (raw["position"][:, 2] > 0)
     assert right[clear].mean() > 0.95
+    sure = sigmoid(found["confidence"][:, 0])
+    assert sure[right].mean() > 0.5 and sure[~right].mean() < sure[right].mean() - 0.1
     assert np.median(abs(sigmoid(found["albedo"]) - GOLD)[clear & (metal > 0.5)]) < 0.05
     assert f"metal: {np.mean(metal > 0.5):.0%} of the surfels" in said[-1]
     assert trainer.fit.optimiser.factors["metallic"] == 0
@@ -84,8 +86,7 @@ def test_each_material_is_fitted(rng: np.random.Generator) -> None:
     sums = [np.ones_like(y), y, y * y, x * y, x * x + 0 * y]
     flat = np.concatenate([50 * np.ones((1, 8)), *(part.sum(axis=0).T for part in sums)])
     errors, tint, colour, pixels = event.fitted(flat)
-    np.testing.assert_allclose(errors[0, :4], 0, atol=1e-9)
-    np.testing.assert_allclose(errors[1, 4:], 0, atol=1e-9)
+    np.testing.assert_allclose([errors[0, :4], errors[1, 4:]], 0, atol=1e-9)
     assert (errors[1, :4] > 0.1).all() and (errors[0, 4:] > 0.01).all() and (pixels == 50).all()
     np.testing.assert_allclose(tint[4:], albedo)
     np.testing.assert_allclose(colour[:4], radiance)
