@@ -127,6 +127,7 @@ def losses_in_use(weights: Mapping[str, LossWeight]) -> list[Loss[LossInputs]]:
 def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: int) -> tuple[Float, Float]:
     """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached."""
     image, target = inputs.image, inputs.target
+    dr.eval(image, inputs.frame.radiance)  # once, for all losses and their adjoints
     # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
     factors = {
         name: dr.opaque(mi.Float, weight) if window.rise else weight
