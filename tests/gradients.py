@@ -32,7 +32,7 @@ def gaussian_shader(_: Path) -> mi.Scene:
 
 def surfels(folder: Path) -> mi.Scene:
     rng, raw = np.random.default_rng(6), raw_channels()
-    raw |= {n: rng.normal(size=(COUNT, k)).astype(np.float32) for n, k in (("curvature", 3), ("confidence", 1))}
+    raw |= {x: rng.normal(size=(COUNT, k)).astype("f4") for x, k in (("curvature", 3), ("confidence", 1))}
     return scenes.open_scene(raw=raw, mesh=scenes.plane_mesh(folder), aovs="n:normal,d:depth,c:confidence")
 
 

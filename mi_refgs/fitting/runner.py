@@ -1,5 +1,6 @@
 """A fit from data to artefacts: chooses method and image size, begins or resumes a run, finishes it."""
 
+import hashlib
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -180,6 +181,11 @@ def begin(
     Raises InputError for data that they refuse unless `force`, damaged checkpoints, and a folder that cannot
     be written."""
     resumed = run.exists()
+    if before := run.images():
+        now = _digests(views)
+        if changed := [name for name in before | now if before.get(name) != now.get(name)]:
+            what = f"not as when {run.path} began: {len(changed)} of {len(before | now)} images or cameras"
+            raise InputError(what, views.path, changed[0], "restore them, or choose another -o")
     views = with_region(views, run.region(), tell)
     state, found = run.load_checkpoint() if resumed else None, list[checks.Finding]()
     if resumed and state is None and (run.path / MODEL).is_file():
@@ -208,11 +214,23 @@ def begin(
         run.rewind(trainer.iteration)
     else:
         run.create(trainer.method, views.folder, views.region)
+        run.write_dataset(views.folder, views.region, _digests(views))
         run.write_json("checks.json", {one.name: one.numbers for one in found})
         if len(views.views) < HOLDOUT and (names := waiting(trainer)):
             few = f"{len(views.views)} views: too few to hold some out"
             tell(f"{views.path}: {few}, so {' and '.join(names)} are not decided")
     return trainer
+
+
+def _digests(views: Dataset) -> dict[str, str]:
+    """A digest of the camera and of the size of the file of each image, by name."""
+    found = {}
+    for view in views.views:
+        size = view.file.path.stat().st_size if view.file and view.file.path.is_file() else 0
+        camera = np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 5)
+        text = repr((size, view.width, view.height, (camera + 0.0).tolist()))
+        found[view.name] = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return found
 
 
 def _with_stereo(views: Dataset, tell: Tell) -> tuple[Dataset, np.ndarray | None]:

@@ -70,8 +70,12 @@ class Run:
         self.write_dataset(dataset, region)
         self.write_method(method)
 
-    def write_dataset(self, dataset: str | None, region: Region | None) -> None:
-        record = {"path": dataset} | ({} if region is None else {"region": region.content})
+    def write_dataset(
+        self, dataset: str | None, region: Region | None, images: dict[str, str] | None = None
+    ) -> None:
+        """Record the folder of the data set, its region, and digests of its images, by default as before."""
+        record: dict[str, Any] = {"path": dataset, "images": self.images() if images is None else images}
+        record |= {} if region is None else {"region": region.content}
         files.write_bytes(self.path / DATASET, json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
@@ -88,6 +92,10 @@ class Run:
 
     def _record(self, name: str) -> dict[str, Any]:
         return files.read_json(self.path / name) if (self.path / name).is_file() else {}
+
+    def images(self) -> dict[str, str]:
+        """Digests of the images and cameras that the run began with, by name; none of older runs."""
+        return dict(self._record(DATASET).get("images") or {})
 
     def dataset(self) -> Path | None:
         """Folder of the data set that the run was fitted to, if it records one; raises InputError if not."""
