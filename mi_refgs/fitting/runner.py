@@ -181,10 +181,10 @@ def begin(
     Raises InputError for data that they refuse unless `force`, damaged checkpoints, and a folder that cannot
     be written."""
     resumed = run.exists()
-    if before := run.images():
+    if known := run.images():
         now = _digests(views)
-        if changed := [name for name in before | now if before.get(name) != now.get(name)]:
-            what = f"not as when {run.path} began: {len(changed)} of {len(before | now)} images or cameras"
+        if changed := [name for name in known | now if known.get(name) != now.get(name)]:
+            what = f"not as when {run.path} began: {len(changed)} of {len(known | now)} images or cameras"
             raise InputError(what, views.path, changed[0], "restore them, or choose another -o")
     views = with_region(views, run.region(), tell)
     state, found = run.load_checkpoint() if resumed else None, list[checks.Finding]()
