@@ -167,9 +167,6 @@ def make_view(
     for focal in intrinsics[:2]:
         if not 1 / MAX_NUMBER <= focal <= MAX_NUMBER:
             raise InputError(f"{focal:.3g} pixels is out of range", where, "focal length", "correct it")
-    if image.is_linear_radiance != (options.images == "exr"):
-        what, other = ("an EXR file", "exr") if image.is_linear_radiance else ("no EXR file", "png")
-        raise InputError(what, image.path, "images", f"give data.images={other}")
     fx, fy, cx, cy = intrinsics
     file = FileCamera(image.path, *own, (fx, fy, cx, cy), lens, image.mask)
     if (mask := image.mask) is not None and mask.below is None:
@@ -187,7 +184,7 @@ def make_view(
         image = replace(image, undistortion=straight)
     source = ImageSource(image, options.background, options.cache, image.has_alpha())
     view = View(name, *image.size, fx, fy, cx, cy, to_world, source, file=file)
-    return replace(view, is_linear_radiance=options.images == "exr"), straight
+    return replace(view, is_linear_radiance=image.is_linear_radiance), straight
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +254,7 @@ def read_dataset(
     `downscale`: side of the blocks of pixels that are averaged, by default the smallest whole one for which
         the first image has at most `pixels`; incomplete blocks are left out.
     `background`: "white" or "black", behind images with alpha.
-    `images`: "png" (sRGB-encoded 8-bit files) or "exr" (linear radiance).
+    `images`: "png" (sRGB-encoded 8-bit files; EXR files if there are no others) or "exr" (linear radiance).
     `truth`: read ground-truth normals, depth and materials where there are any.
 
     Images are decoded by `View.load`. The region of interest is that of region.json, or without alpha the one
@@ -282,6 +279,12 @@ def read_dataset(
             found = reader.read(path, split, options)
     views, points = found.views, found.points
     notes = found.notes + options.notes()
+    linear = {view.is_linear_radiance: view for view in reversed(views)}  # the first of each
+    if len(linear) > 1 or (images == "exr" and False in linear):
+        file, remedy = linear[False].file, "save all images alike, or give data.images=png"
+        raise InputError("no EXR file", file.path if file else path, "images", remedy)
+    if True in linear and images == "png":
+        notes = (*notes, "the images are EXR files: they are read as linear radiance")
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
     require_few_sizes(found.source or path, "images", sizes, remedy)
@@ -314,7 +317,7 @@ def read_dataset(
         position = f"({x:.12g}, {y:.12g}, {z:.12g})"
         notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
     colour, about = np.full(3, options.background, dtype=np.float32), (points, region, notes, (x, y, z))
-    known = (colour, images == "exr", found.environment, *about)
+    known = (colour, True in linear, found.environment, *about)
     return Dataset(path, split, views, *known, downscale=options.downscale, source=found.source)
 
 

@@ -65,10 +65,16 @@ def test_png_is_composited_as_displayed(folder: Path) -> None:
 
 
 def test_exr_is_linear_and_premultiplied(folder: Path) -> None:
+    """Where there are no other files, it is read unasked, and that is said."""
     view = read_loaded(folder, "train", images="exr").views[2]
     pixels = read_exr_image(folder / "train/r_2.exr")
     assert view.is_linear_radiance and view.image.max() > 1
     np.testing.assert_allclose(view.image, pixels[..., :3] + 1 - pixels[..., 3:], atol=1e-6)
+    for path in folder.glob("*/*.png"):
+        path.unlink()
+    alone = read_loaded(folder, "train")
+    assert alone.is_linear_radiance and "EXR files" in alone.notes[-1]
+    np.testing.assert_array_equal(alone.views[2].image, view.image)
 
 
 def test_downscale_averages_composited_pixels(folder: Path) -> None:
@@ -168,11 +174,6 @@ def nan(folder: Path) -> None:
     write_exr(folder / "train/r_4.exr", broken)
 
 
-def only_exr(folder: Path) -> None:
-    for path in folder.glob("*/*.png"):
-        path.unlink()
-
-
 @pytest.mark.parametrize(
     ("damage", "options", "words"),
     [
@@ -184,7 +185,7 @@ def only_exr(folder: Path) -> None:
         (edit(lambda c: c.update(camera_angle_x="wide")), {}, ["camera_angle_x", "'wide'"]),
         (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),
         (named("file_path", "train/none"), {}, ["none.png", "missing"]),
-        (only_exr, {}, ["r_0.exr: images: an EXR file", "data.images=exr"]),
+        (lambda f: (f / "train/r_0.png").unlink(), {}, ["images: no EXR file", "alike"]),
         (edit(lambda c: c["frames"][1].pop("transform_matrix")), {}, ["frames[1].transform_matrix", "4 × 4"]),
         (named("transform_matrix", np.diag([1.0, 1, -2, 1]).tolist()), {}, ["mirroring"]),
         (named("depth_path", "train/r_1.exr"), {}, ["[0].depth_path", "size"]),
