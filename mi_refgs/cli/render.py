@@ -9,7 +9,8 @@ from tyro.conf import Positional, arg
 from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, optional, separated
 from mi_refgs.errors import InputError, counted, require_between
 
-AOVS = "albedo, metallic, roughness, normal, depth, alpha, visibility, diffuse, specular, indirect"
+MAPS = "albedo, metallic, confidence, roughness, normal, depth, alpha, visibility"
+AOVS = f"{MAPS}, diffuse, specular, indirect"
 
 
 @dataclass(frozen=True, kw_only=True)
