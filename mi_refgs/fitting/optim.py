@@ -35,7 +35,7 @@ MEMORY = 4096  # steps that `report` may come late
 
 @dataclass(frozen=True)
 class LearningRate:
-    """Rate of one tensor: log-linear from `rate` to `final` in `steps` iterations, then constant."""
+    """Rate of one tensor: log-linear from `rate` to `final` between the iterations `begin` and `steps`."""
 
     rate: float  # per step, units of the raw tensor
     final: float | None = None  # None: constant
@@ -47,12 +47,13 @@ class LearningRate:
     unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
     centre: tuple[float, float, float] | None = None
     """Rows of positions learn at the rate times their distance from here, in units of the tensor."""
+    begin: int = 0  # iteration until which it is `rate`
 
     def at(self, iteration: int) -> float:
         """Learning rate at this iteration (0-based)."""
         if self.final is None or self.rate <= 0 or self.final <= 0:
             return self.rate
-        progress = min(max(iteration / max(self.steps, 1), 0.0), 1.0)
+        progress = min(max((iteration - self.begin) / max(self.steps - self.begin, 1), 0.0), 1.0)
         return math.exp((1 - progress) * math.log(self.rate) + progress * math.log(self.final))
 
 

@@ -144,6 +144,9 @@ class FitSetup:
         for name, (rate, final) in LEARNT_BESIDE.items():
             if name in params:
                 groups[name] = LearningRate(rate, final, iterations)
+        if POSE in groups:  # whose corrections begin late
+            after = getattr(self.method.event.get("cameras"), "after", 0)
+            groups[POSE] = replace(groups[POSE], begin=after)
         return groups
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:

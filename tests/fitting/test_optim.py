@@ -38,8 +38,9 @@ def adam(values: np.ndarray, group: LearningRate = GROUP) -> tuple[dict[str, Any
 
 def test_group_rates() -> None:
     """Log-linear to the end of the schedule, then constant; half-way is the geometric mean."""
-    group = LearningRate(1e-2, final=1e-4, steps=100)
-    assert [group.at(i) for i in (-5, 0, 50, 100, 10**6)] == pytest.approx([1e-2, 1e-2, 1e-3, 1e-4, 1e-4])
+    for begin, half in ((0, 50), (50, 75)):
+        group, at = LearningRate(1e-2, final=1e-4, steps=100, begin=begin), (-5, begin, half, 100, 10**6)
+        assert [group.at(i) for i in at] == pytest.approx([1e-2, 1e-2, 1e-3, 1e-4, 1e-4])
     assert LearningRate(0.05).at(7) == 0.05 and LearningRate(0.0, final=1.0).at(50) == 0.0
 
 
