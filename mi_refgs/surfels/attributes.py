@@ -131,7 +131,7 @@ for _declared in (
     Attribute("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, aov="RGB"),
     Attribute("normal_offset", (3,), "identity", 1e-3, _numbered("offset")),
     Attribute("curvature", (3,), "identity", 0.2, _numbered("curvature"), geometry=True),
-    # Of metallic, 0 … 1: nothing shades with it, and it does not learn.
-    Attribute("confidence", (1,), "sigmoid", 0.0, ("confidence",), aov="Y"),
+    # Of metallic: nothing shades with it, and it does not learn. Files of scanners have a `confidence`, too.
+    Attribute("confidence", (1,), "sigmoid", 0.0, ("metallic_confidence",), aov="Y"),
 ):
     register(_declared)

@@ -157,7 +157,7 @@ def test_every_registered_thing_is_an_option() -> None:
     assert {name.partition("/")[0] for name in DIMENSIONS["shading"]} == {*MODELS} <= {*REFERENCE_MODELS}
     assert {*suffixes()} == {
         "albedo", "metallic", "roughness", "tint", "normal", "depth", "alpha", "visibility", "diffuse",
-        "specular", "indirect",
+        "specular", "indirect", "confidence",
     }  # fmt: skip
 
 
