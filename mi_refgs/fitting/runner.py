@@ -213,8 +213,7 @@ def begin(
     if resumed:
         run.rewind(trainer.iteration)
     else:
-        run.create(trainer.method, views.folder, views.region)
-        run.write_dataset(views.folder, views.region, _digests(views))
+        run.create(trainer.method, views.folder, views.region, _digests(views))
         run.write_json("checks.json", {one.name: one.numbers for one in found})
         if len(views.views) < HOLDOUT and (names := waiting(trainer)):
             few = f"{len(views.views)} views: too few to hold some out"

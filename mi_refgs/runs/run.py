@@ -62,12 +62,18 @@ class Run:
         except files.BusyError:
             return True
 
-    def create(self, method: Method, dataset: str | None, region: Region | None = None) -> None:
+    def create(
+        self,
+        method: Method,
+        dataset: str | None,
+        region: Region | None = None,
+        images: dict[str, str] | None = None,
+    ) -> None:
         """Start a run on the data set in folder `dataset`, None in memory; raises as `require_none`."""
         self.require_none()
         own_folder(self.path, RUN)
         self._make_folders()
-        self.write_dataset(dataset, region)
+        self.write_dataset(dataset, region, images)
         self.write_method(method)
 
     def write_dataset(
