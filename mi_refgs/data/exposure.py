@@ -29,13 +29,16 @@ def told_gains(views: Sequence[View]) -> np.ndarray | None:
 
 
 def _of_settings(views: Sequence[View]) -> np.ndarray | None:
-    log = np.zeros(len(views))
+    settings = np.full((len(views), len(EXPOSURE)), np.nan)
     for i, view in enumerate(views):
         if view.file is None or view.is_linear_radiance:
             return None
         with open_image(view.file.path) as image:
             found = exif_tags(image)[1]
-        log[i] = sum(power * np.log(positive(found.get(tag)) or np.nan) for tag, power in EXPOSURE.items())
+        settings[i] = [positive(found.get(tag)) or np.nan for tag in EXPOSURE]
+    if np.isnan(settings[:, 2]).all():  # a lens without contacts; its aperture seldom changes
+        settings[:, 2] = 1
+    log = np.log(settings) @ list(EXPOSURE.values())
     return None if np.isnan(log).any() else np.repeat(log[:, None] - log.mean(), 3, axis=1)
 
 

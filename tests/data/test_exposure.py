@@ -33,12 +33,12 @@ def taken(log: np.ndarray, rng: np.random.Generator) -> list[View]:
     return views
 
 
-def with_exif(views: list[View], log: np.ndarray, folder: Path, iso: int | None = 100) -> list[View]:
+def with_exif(views: list[View], log: np.ndarray, folder: Path, iso: float = 100, f: float = 2) -> list[View]:
     """The views with files whose EXIF data have log gains (V,)."""
     found = []
     for i, (view, time) in enumerate(zip(views, 0.01 * np.exp(log), strict=True)):
         exif, path = Image.Exif(), folder / f"{i}.jpg"
-        exif[0x8769] = {0x829A: float(time), 0x829D: 2.0} | ({} if iso is None else {0x8827: iso})
+        exif[0x8769] = {0x829A: float(time), 0x829D: float(f), 0x8827: iso}
         Image.new("RGB", (SIZE, SIZE)).save(path, exif=exif)
         found.append(replace(view, file=FileCamera(path, SIZE, SIZE, (1.0, 1.0, 0.0, 0.0))))
     return found
@@ -71,5 +71,7 @@ def test_gains_in_exif_count_unless_points_contradict(
     for exif in (-grey, np.zeros(VIEWS)):
         np.testing.assert_allclose(told_gains(with_exif(views, exif, tmp_path)), told_gains(views))  # type: ignore[arg-type]
     bare = [replace(view, tracks=None) for view in views]
-    assert told_gains(with_exif(bare, grey, tmp_path, iso=None)) is None
+    assert told_gains(with_exif(bare, grey, tmp_path, iso=0)) is None  # nobody knows
+    manual = np.asarray(told_gains(with_exif(bare, grey, tmp_path, f=0)))  # a lens without contacts
+    np.testing.assert_allclose(manual, np.tile(expected, 3), atol=1e-3)
     assert told_gains(with_exif(bare, 0.02 * grey, tmp_path)) is None
