@@ -1,8 +1,9 @@
 """Surfels that cross the border of the region of interest change tables.
 
-One of the object that is more than MARGIN radii outside becomes one of the background, with its geometry and
-SH; one of the background that is as far inside becomes one of the object, whose other attributes start as the
-method says. Neither has a history. A table keeps one surfel at least, and may exceed what its method allows.
+One of the object whose centre is more than MARGIN radii outside becomes one of the background, with its
+geometry and SH; one of the background that is inside, and through no plane, becomes one of the object, whose
+other attributes start as the method says. Neither has a history. A table keeps one surfel at least, and may
+exceed what its method allows.
 """
 
 import numpy as np
@@ -15,8 +16,8 @@ from mi_refgs.methods.method import Method
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 
-REACH = 1.0  # deviations to which a surfel extends: one through the plane below the object is the table's
-MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel changes tables
+REACH = 1.0  # deviations to which a surfel extends: one through the plane below the object stays the table's
+MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel leaves the object
 
 
 def exchange(setup: FitSetup, fit: FitState) -> None:
@@ -35,10 +36,9 @@ def exchanged(
 ) -> list[TableEdit]:
     """Both tables after the exchange; what changes its primitive keeps axes and sizes, as far as possible."""
     tables = [inner.to_numpy(), outer.to_numpy()]
-    own_depth, other_depth = (
-        depth_outside(table["position"], region, reach_of(table, region)) for table in tables
-    )
-    leaves = [own_depth > MARGIN, other_depth < -MARGIN]
+    own_depth = depth_outside(tables[0]["position"], region)
+    other_depth = depth_outside(tables[1]["position"], region, reach_of(tables[1], region))
+    leaves = [own_depth > MARGIN, other_depth < 0]
     for gone in leaves:  # one surfel stays
         gone &= np.cumsum(gone) < len(gone)
     edits = []
