@@ -30,6 +30,7 @@ EPSILON = 1e-15  # as in 3DGS: tiny, as per-surfel gradients of a pixel mean are
 OUTLIER = 100.0  # gradients beyond this many times the usual are cut; see above
 WIDE_ROW = 64  # columns beyond which rows are not distinguished: SH have 48, a row of the light hundreds
 WORD = 32  # tensors whose bits fit one integer of the marks
+LEAST_DIFFUSE = 0.05  # 1 - metallic below which rates rise no further: of a metal of `metal_evidence`
 MEMORY = 4096  # steps that `report` may come late
 
 
@@ -44,6 +45,7 @@ class LearningRate:
     tail: float = 1.0  # factor of the rate of the other columns: SH beyond degree 0
     relative: bool = False  # values above 1 learn at the rate times themselves: lamps grow exponentially
     mirrors: bool = False  # rows learn at the rate times metallic (1 - roughness)²: others reflect no normals
+    diffuse: bool = False  # rows learn at the rate over 1 - metallic, by which their colour is displayed
     unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
     centre: tuple[float, float, float] | None = None
     """Rows of positions learn at the rate times their distance from here, in units of the tensor."""
@@ -209,7 +211,10 @@ class Adam:
                 )
                 η = η * dr.norm(mi.Vector3f(*offset)) / dr.opaque(mi.Float, group.unit)
             if group.mirrors:
-                η = η * self._mirrored(name)
+                smooth = 1 - self._material(name, "roughness", 0)
+                η = η * self._material(name, "metallic", 1) * dr.square(smooth)
+            if group.diffuse:
+                η = η / dr.maximum(1 - self._material(name, "metallic", 0), LEAST_DIFFUSE)
             updated[name] = (dr.select(good, θ - η * m / (dr.sqrt(v) + EPSILON), θ), shape)
             self._first[name] = dr.select(good, m, self._first[name])
             self._second[name] = dr.select(good, v, self._second[name])
@@ -221,15 +226,13 @@ class Adam:
             self.params[name] = mi.TensorXf(θ, shape=shape)
             self._make_leaf(name)
 
-    def _mirrored(self, name: str) -> Float:
-        """How much of a mirror the surfel of each entry is, metallic (1 - roughness)²; without these, 1."""
+    def _material(self, name: str, material: str, absent: float) -> Float:
+        """A material of the surfel of each entry of a tensor; `absent` if the surfels do not have it."""
+        values = self.params.get(name[: max(name.rfind("."), name.rfind("/")) + 1] + material)
+        if values is None:
+            return mi.Float(absent)
         row = dr.arange(mi.UInt32, math.prod(self.params[name].shape)) // self.params[name].shape[-1]
-
-        def of(other: str, absent: float) -> Float:
-            values = self.params.get(name.removesuffix("curvature") + other)
-            return absent if values is None else sigmoid(dr.gather(mi.Float, dr.detach(values.array), row))
-
-        return of("metallic", 1) * dr.square(1 - of("roughness", 0))
+        return sigmoid(dr.gather(mi.Float, dr.detach(values.array), row))
 
     def _cut(self, name: str, g: Float, t: int, inverse: Float) -> Float:
         """The gradient of step t, without unit, cut, 0 where not finite; `inverse` is 1 / (1 - β₂ᵗ⁻¹)."""

@@ -185,6 +185,8 @@ def learning_rates(
     for name in names:
         rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
         groups[name] = LearningRate(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
+    if "radiance_sh" in groups:
+        groups["radiance_sh"] = replace(groups["radiance_sh"], diffuse=rates.diffuse_relative)
     if "curvature" in groups:  # 1/scene unit
         groups["curvature"] = replace(groups["curvature"], mirrors=True, unit=1 / extent)
     start, final = rates.of("position") * extent, POSITION_FINAL * extent

@@ -138,6 +138,7 @@ class Rates:
     rest: dict[str, float] = field(default_factory=dict)  # factors for SH degrees above 0; else their own
     light: float = 0.01  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
+    diffuse_relative: bool = False  # SH of the diffuse colour: over 1 - metallic, by which it is displayed
     decay: float = 1.0  # log-linear factor of all other rates at the last iteration
 
     def of(self, name: str) -> float:

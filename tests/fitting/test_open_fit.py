@@ -23,7 +23,7 @@ from mi_refgs.fitting.exchange import depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.runner import Choice, begin, chosen
-from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.fitting.schedule import FitSetup, learning_rates
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.fields import Window
@@ -133,23 +133,23 @@ def test_surfels_beyond_border_change_tables(method: Method) -> None:
     outer = table(around, [2.0, 0.5, 0.99, 1.5], 0)
     own, other = exchanged(inner, outer, method, REGION, rng)
     distance = own.surfels.to_numpy()["position"][:, 0] / REGION.radius
-    np.testing.assert_allclose(distance, [0.2, 0.9, 1.01, 0.5], rtol=1e-5)
+    np.testing.assert_allclose(distance, [0.2, 0.9, 1.01, 0.5, 0.99], rtol=1e-5)
     beyond = other.surfels.to_numpy()["position"][:, 0] / REGION.radius
-    np.testing.assert_allclose(beyond, [2.0, 0.99, 1.5, 1.2, 5.0], rtol=1e-5)
-    assert own.parent[:3].tolist() == [0, 1, 2] and own.fresh.tolist() == [False] * 3 + [True]
-    assert {*other.surfels.raw} == {*around} and other.fresh.tolist() == [False] * 3 + [True] * 2
+    np.testing.assert_allclose(beyond, [2.0, 1.5, 1.2, 5.0], rtol=1e-5)
+    assert own.parent[:3].tolist() == [0, 1, 2] and own.fresh.tolist() == [False] * 3 + [True] * 2
+    assert {*other.surfels.raw} == {*around} and other.fresh.tolist() == [False] * 2 + [True] * 2
     before, after = inner.to_numpy(), other.surfels.to_numpy()
-    np.testing.assert_array_equal(after["scale"][3:], before["scale"][3:])
-    np.testing.assert_array_equal(after["radiance_sh"][3:], before["radiance_sh"][3:, :3])
+    np.testing.assert_array_equal(after["scale"][2:], before["scale"][3:])
+    np.testing.assert_array_equal(after["radiance_sh"][2:], before["radiance_sh"][3:, :3])
     entered = own.surfels.to_numpy()
     np.testing.assert_array_equal(entered["radiance_sh"][3, :3], outer.to_numpy()["radiance_sh"][1])
     assert np.all(entered["radiance_sh"][3, 3:] == 0)
     assert sigmoid(entered["metallic"][3, 0]) == pytest.approx(method.surfels.first("metallic"))
 
     full = replace(method, surfels=replace(method.surfels, max_count=3))
-    assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 4  # for one came and two left
+    assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 5  # for two came and two left
     gone = table(method.surfels.names, [2.0, 3.0], 1)
-    assert exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 2  # one left, one came
+    assert exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 3  # one left, two came
 
 
 def test_surfels_become_thin_gaussians_and_back(method: Method) -> None:
@@ -180,11 +180,11 @@ def test_surfels_become_thin_gaussians_and_back(method: Method) -> None:
 
 
 def test_surfels_below_planes_change_tables(method: Method) -> None:
-    """Those of the object that are below a plane of the region, and those of the background above all."""
+    """Those of the object with centres below a plane of the region; of the background, what is above all."""
     rng = np.random.default_rng(0)
     region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1), (1.0, 0.0, 0.0, -0.5)))
 
-    def table(names: tuple[str, ...], places: list[list[float]], size: float = 1e-4) -> Surfels:
+    def table(names: Any, places: list[list[float]], size: float = 1e-4) -> Surfels:
         raw = {n: rng.normal(size=(len(places), method.surfels.columns(n))) for n in names}
         raw["radiance_sh"] = rng.normal(size=(len(places), 3))
         raw |= {"position": np.array(places), "scale": np.full((len(places), 2), np.log(size))}
@@ -194,14 +194,15 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     inner = table(method.surfels.names, [[0, 0, 0.4], [0, 0, 0.05], [-0.6, 0, 0.2], [0, 0, 0.095]])
     outer = table(SurroundingsOptions("surfel", degree=0).names, [[0, 0, 0], [0, 0.1, 0.3], [0, 0, 0.105]])
     own, other = (x.surfels.to_numpy()["position"] for x in exchanged(inner, outer, method, region, rng))
-    np.testing.assert_allclose(own, [[0.0, 0.0, 0.4], [0.0, 0.0, 0.095], [0.0, 0.1, 0.3]], atol=1e-6)
-    outside = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.105], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]]
-    np.testing.assert_allclose(other, outside, atol=1e-6)
-    # Tangents along x and y, deviations of 0.1: they extend through the second plane, not through the first.
-    wide = table(method.surfels.names, [[0, 0, 0.2], [-0.45, 0, 0.2]], 0.1)
-    own, _ = (edit.surfels.to_numpy()["position"] for edit in exchanged(wide, outer, method, region, rng))
-    np.testing.assert_allclose(own[:1], [[0, 0, 0.2]], atol=1e-6)
-    assert not np.any(own[:, 0] < -0.1)
+    inside = [[0.0, 0.0, 0.4], [0.0, 0.0, 0.095], [0.0, 0.1, 0.3], [0.0, 0.0, 0.105]]
+    np.testing.assert_allclose(own, inside, atol=1e-6)
+    np.testing.assert_allclose(other, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]], atol=1e-6)
+    # Tangents along x and y, deviations of 0.1: some extend through the second plane, none through the first.
+    through = [[0, 0, 0.2], [-0.45, 0, 0.2]]
+    wide, others = (table(names, through, 0.1) for names in (method.surfels.names, outer.raw))
+    own, other = (x.surfels.to_numpy()["position"] for x in exchanged(wide, others, method, region, rng))
+    np.testing.assert_allclose(own, [*through, through[0]], atol=1e-6)
+    np.testing.assert_allclose(other, through[1:], atol=1e-6)
 
 
 def test_points_start_on_their_side_of_planes(data: Dataset, method: Method) -> None:
@@ -442,14 +443,10 @@ def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> N
     assert "surroundings/opacity" in said[0]
 
 
-@pytest.mark.parametrize(
-    ("purpose", "own", "alpha"),
-    [
-        (None, "photographs", "auto"),
-        ("relighting", "photographs_relighting", "relighting"),
-        ("photographs", "photographs", "photographs"),
-    ],
-)
+CHOSEN = (None, "photographs", "auto"), ("relighting", "photographs_relighting", "relighting")
+
+
+@pytest.mark.parametrize(("purpose", "own", "alpha"), [*CHOSEN, ("photographs",) * 3])
 def test_images_without_alpha_have_a_method_of_their_own(
     data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, purpose: str | None, own: str, alpha: str
 ) -> None:
@@ -460,6 +457,8 @@ def test_images_without_alpha_have_a_method_of_their_own(
     monkeypatch.setattr(READERS, "values", read)
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
     assert method.name == own and any(own in text for text in said) == (own != purpose)
+    relative = learning_rates(method.surfels.names, 1.0, 9, method.rates)["radiance_sh"].diffuse
+    assert relative == method.rates.diffuse_relative == (own == "photographs")
     assert read.call_count == 1 and views.split == "train"
     monkeypatch.undo()
     objects = write_data(tmp_path, views=3, truth=False)

@@ -45,8 +45,7 @@ def test_group_rates() -> None:
 
 
 def test_equals_published_algorithm(rng: np.random.Generator) -> None:
-    """Ten steps of two tensors with a schedule and per-column rates; gradients as small as a mean over pixels
-    gives."""
+    """Ten steps of two tensors with a schedule and per-column rates; gradients as small as in fits."""
     start = {"position": rng.normal(size=(7, 3)), "radiance_sh": rng.normal(size=(7, 12))}
     sh = LearningRate(7.5e-3, head=3, tail=1 / 20)
     groups = {"position": LearningRate(1e-2, 1e-4, 10), "radiance_sh": sh}
@@ -162,8 +161,7 @@ def test_ordinary_fit_is_not_cut(rng: np.random.Generator) -> None:
 
 
 def test_moments_follow_their_rows(rng: np.random.Generator) -> None:
-    """Permuting, cloning and pruning rows commutes with stepping; fresh rows start as a new optimiser
-    would."""
+    """Permuting, cloning and pruning rows commutes with stepping; fresh rows start anew."""
     start, g1, g2 = (rng.normal(size=(5, 3)) for _ in range(3))
     (_, whole), (_, moved) = (adam(start, LearningRate(0.01)) for _ in range(2))
     for optimiser in (whole, moved):
@@ -223,20 +221,23 @@ def test_rates_of_lamps_and_of_distant_positions_grow(
     np.testing.assert_allclose(params["x"].numpy() - start, 0.1 * np.array(factors), rtol=1e-3)
 
 
-def test_mirrors_learn_faster(rng: np.random.Generator) -> None:
-    """A row's step is that of Adam times metallic (1 - roughness)², of those that the surfels have."""
+def test_materials_decide_how_fast_rows_learn(rng: np.random.Generator) -> None:
+    """A row's step is that of Adam times metallic (1 - roughness)², or over 1 - metallic, 0.05 at least."""
     for names in ((), ("metallic",), ("metallic", "roughness")):
-        values = {f"refgs.{name}": rng.normal(size=(5, 1)) for name in names}
-        params = {key: tensor(x) for key, x in values.items()} | {"refgs.curvature": tensor(np.zeros((5, 3)))}
-        optimiser = Adam(params, {"refgs.curvature": LearningRate(0.1, mirrors=True)})
-        give(optimiser, "refgs.curvature", np.ones((5, 3)))
+        values = {f"n.{name}": np.append(rng.normal(size=(4, 1)), [[4.0]], axis=0) for name in names}
+        params = {key: tensor(x) for key, x in values.items()}
+        rates = {"n.curvature": LearningRate(0.1, mirrors=True), "n.sh": LearningRate(0.1, diffuse=True)}
+        params |= {name: tensor(np.zeros((5, 3))) for name in rates}
+        optimiser = Adam(params, rates)
+        for name in rates:
+            give(optimiser, name, np.ones((5, 3)))
         optimiser.step(0)
-        metallic, rough = (
-            1 / (1 + np.exp(-values.get(f"refgs.{name}", np.full((5, 1), at))))
-            for name, at in (("metallic", np.inf), ("roughness", -np.inf))
-        )
-        expected = np.broadcast_to(-0.1 * metallic * (1 - rough) ** 2, (5, 3))
-        np.testing.assert_allclose(params["refgs.curvature"].numpy(), expected, rtol=1e-4)
+        share = {name: 1 / (1 + np.exp(-raw)) for name, raw in values.items()}
+        metallic = share.get("n.metallic", 0)
+        mirror = (metallic if names else 1) * (1 - share.get("n.roughness", 0)) ** 2
+        for name, factor in (("curvature", mirror), ("sh", 1 / np.maximum(1 - metallic, 0.05))):
+            expected = np.broadcast_to(-0.1 * factor, (5, 3))
+            np.testing.assert_allclose(params[f"n.{name}"].numpy(), expected, rtol=1e-4)
 
 
 def test_every_tensor_has_its_bit_however_many_there_are() -> None:
