@@ -32,8 +32,7 @@ LAYOUTS = {"3DGS of degree 0": (3, 0), "3DGS of degree 3": (3, 3), "2DGS": (2, 2
 
 
 def their_columns(sizes: int, degree: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """The columns as the released code writes them: f_rest channel after channel, zero normals; colours go
-    beyond black and white."""
+    """Columns of the released code: f_rest channel after channel, zero normals; colours beyond 0 … 1."""
     position = rng.uniform(-0.5, 0.5, (COUNT, 3))
     position[:, 2] = np.linspace(-0.6, 0.6, COUNT)  # far enough apart for every rule of sorting
     turn = np.concatenate([np.ones((COUNT, 1)), 0.25 * rng.normal(size=(COUNT, 3))], axis=1)

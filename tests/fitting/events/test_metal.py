@@ -44,8 +44,7 @@ def metallic(trainer: Trainer) -> np.ndarray:
 def judged(
     monkeypatch: pytest.MonkeyPatch, dielectric: np.ndarray | float, metal: np.ndarray | float
 ) -> list[tuple[int, np.ndarray]]:
-    """Replace the errors of both trials, (H, W) each; returns their iterations and metallic, when they have
-    run."""
+    """Replace the errors of both trials, (H, W) each; returns iterations and metallic of those that ran."""
     judged, trials = list[Trainer](), list[tuple[int, np.ndarray]]()
 
     def error(trainer: Trainer, view: View) -> np.ndarray:
