@@ -184,7 +184,7 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     rng = np.random.default_rng(0)
     region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1), (1.0, 0.0, 0.0, -0.5)))
 
-    def table(names: Any, places: list[list[float]], size: float = 1e-4) -> Surfels:
+    def table(names: tuple[str, ...], places: list[list[float]], size: float = 1e-4) -> Surfels:
         raw = {n: rng.normal(size=(len(places), method.surfels.columns(n))) for n in names}
         raw["radiance_sh"] = rng.normal(size=(len(places), 3))
         raw |= {"position": np.array(places), "scale": np.full((len(places), 2), np.log(size))}
@@ -199,7 +199,7 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     np.testing.assert_allclose(other, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]], atol=1e-6)
     # Tangents along x and y, deviations of 0.1: some extend through the second plane, none through the first.
     through = [[0, 0, 0.2], [-0.45, 0, 0.2]]
-    wide, others = (table(names, through, 0.1) for names in (method.surfels.names, outer.raw))
+    wide, others = (table(names, through, 0.1) for names in (method.surfels.names, (*outer.raw,)))
     own, other = (x.surfels.to_numpy()["position"] for x in exchanged(wide, others, method, region, rng))
     np.testing.assert_allclose(own, [*through, through[0]], atol=1e-6)
     np.testing.assert_allclose(other, through[1:], atol=1e-6)

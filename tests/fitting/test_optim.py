@@ -223,21 +223,22 @@ def test_rates_of_lamps_and_of_distant_positions_grow(
 
 def test_materials_decide_how_fast_rows_learn(rng: np.random.Generator) -> None:
     """A row's step is that of Adam times metallic (1 - roughness)², or over 1 - metallic, 0.05 at least."""
-    for names in ((), ("metallic",), ("metallic", "roughness")):
-        values = {f"n.{name}": np.append(rng.normal(size=(4, 1)), [[4.0]], axis=0) for name in names}
+    materials = ("metallic", "roughness")
+    for at, names in [(at, materials[:count]) for at in ("", "n.", "n/") for count in range(3)]:
+        values = {at + name: np.append(rng.normal(size=(4, 1)), [[4.0]], axis=0) for name in names}
         params = {key: tensor(x) for key, x in values.items()}
-        rates = {"n.curvature": LearningRate(0.1, mirrors=True), "n.sh": LearningRate(0.1, diffuse=True)}
+        rates = {at + "normal": LearningRate(0.1, mirrors=True), at + "sh": LearningRate(0.1, diffuse=True)}
         params |= {name: tensor(np.zeros((5, 3))) for name in rates}
         optimiser = Adam(params, rates)
         for name in rates:
             give(optimiser, name, np.ones((5, 3)))
         optimiser.step(0)
         share = {name: 1 / (1 + np.exp(-raw)) for name, raw in values.items()}
-        metallic = share.get("n.metallic", 0)
-        mirror = (metallic if names else 1) * (1 - share.get("n.roughness", 0)) ** 2
-        for name, factor in (("curvature", mirror), ("sh", 1 / np.maximum(1 - metallic, 0.05))):
+        metallic = share.get(at + "metallic", 0)
+        mirror = (metallic if names else 1) * (1 - share.get(at + "roughness", 0)) ** 2
+        for name, factor in (("normal", mirror), ("sh", 1 / np.maximum(1 - metallic, 0.05))):
             expected = np.broadcast_to(-0.1 * factor, (5, 3))
-            np.testing.assert_allclose(params[f"n.{name}"].numpy(), expected, rtol=1e-4)
+            np.testing.assert_allclose(params[at + name].numpy(), expected, rtol=1e-4)
 
 
 def test_every_tensor_has_its_bit_however_many_there_are() -> None:

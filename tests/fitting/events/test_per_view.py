@@ -252,7 +252,7 @@ def test_derivative_of_corrected_camera(method: Method, rng: np.random.Generator
 
 
 def opposed(trainer: Trainer, rows: np.ndarray, index: int, i: int, change: float) -> np.ndarray:
-    """Rows with entry i of a view changed, and the next view's: a step treats the mean as a constant."""
+    """Rows with entry i of a view changed, and the next view's so that the mean stays, a step's constant."""
     moved, three, other = rows.copy(), slice(3 * (i // 3), 3 * (i // 3) + 3), (index + 1) % len(rows)
     own, axes = (trainer.data.views[j].to_world[:3, :3] for j in (index, other))
     moved[index, i] += change
