@@ -6,20 +6,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.splat import Tables, list_by_tile, project, splat, surfel_count, tables_of
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Float
 
 
 def blended_weights(
-    surfels: Tables, camera: Camera, maps: Sequence[Float | float] = (1.0,)
+    surfels: Tables, camera: Camera, maps: Sequence[Float | float] = (1.0,), depth: bool = False
 ) -> list[np.ndarray]:
     """Sums Σ w m (N,) float64 of blending weights, for each map m (H·W,): gradients of Σ m Σ w f by f. A map
-    of 1 gives pixels."""
-    features = [dr.opaque(mi.Float, 0, surfel_count(surfels)) for _ in maps]
+    of 1 gives pixels; with `depth`, the last one is the expected depth of the view."""
+    features = [dr.opaque(mi.Float, 0, surfel_count(surfels)) for _ in range(len(maps) + depth)]
     dr.enable_grad(features)
-    blended = splat([table.detach() for table in tables_of(surfels)], features, camera).features
-    total = dr.sum(sum(m * image for m, image in zip(maps, blended, strict=True)))
+    blended = splat([table.detach() for table in tables_of(surfels)], features, camera)
+    if depth:
+        maps = [*maps, dr.detach(blended.depth / dr.maximum(blended.alpha, COVERAGE_FLOOR))]
+    total = dr.sum(sum(m * image for m, image in zip(maps, blended.features, strict=True)))
     if dr.grad_enabled(total):  # unless the view shows nothing
         dr.backward(total)
     return [np.array(dr.grad(feature), dtype=np.float64) for feature in features]

@@ -295,19 +295,18 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
         assert np.isin(rows, faint).all() and len(faint) < count / 2
 
 
-def test_space_in_front_of_cameras_is_cleared(data: Dataset, method: Method) -> None:
-    """Densification removes background surfels right in front of a camera, but none of the object."""
-    trainer = Trainer(method, data)
-    eye = data.views[3].to_world[:3, 3]
-    for table in trainer.fit.tables:
+def test_background_before_what_views_show_floats(data: Dataset, method: Method) -> None:
+    """Faint surfels half way to an opaque ball in a shell: those of the background, not the object's."""
+    trainer, eye = Trainer(method, data), data.views[3].to_world[:3, 3]
+    shell = map_directions(8).reshape(-1, 3)[np.linspace(0, 127, 80, dtype=int)]
+    for table, radius in zip(trainer.fit.tables, (0.5, 6), strict=True):
         raw = table.surfels.to_numpy()
-        raw["position"][:7] = eye + 0.1 * (np.array(REGION.centre) - eye)
-        raw["opacity"][:7] = 1
+        raw["position"] = (radius * shell[: table.surfels.count]).astype(np.float32)
+        raw["opacity"][:], raw["scale"][:] = 5, np.log(radius / 6)
+        raw["position"][:7], raw["opacity"][:7] = eye + (np.array(REGION.centre) - eye) / 2, -2
         table.replace(Surfels.from_numpy(raw))
-    Densify(Window(0, 1, 1))._clear_free_space(trainer)
-    inner, background = (table.surfels.raw["position"].numpy() for table in trainer.fit.tables)
-    assert (len(inner), len(background)) == (80, 60 - 7)
-    assert not in_free_space(data.views, REGION, background).any()
+    (_, own), (_, floating) = Densify(Window(0, 1, 1))._weighed(trainer)
+    assert not len(own) and floating.tolist() == [*range(7)]
     initial = initial_parameters(method, data, np.random.default_rng(0), True)[f"{AROUND}position"].numpy()
     assert not in_free_space(data.views, REGION, initial).any()
 

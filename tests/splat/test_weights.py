@@ -17,17 +17,18 @@ def camera(eye: tuple[float, float, float]) -> Camera:
 
 
 def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) -> None:
-    """Also with a map; the weights of all surfels sum to alpha."""
+    """Also with a map and the depth; the weights of all surfels sum to alpha."""
     surfels = Surfels.from_numpy(raw_channels())
     view = camera((0, -4, 1))
     values = rng.random(24 * 24).astype(np.float32)
-    weight, weighted = blended_weights(surfels, view, [mi.Float(1), mi.Float(values)])
+    weight, weighted, deep = blended_weights(surfels, view, [mi.Float(1), mi.Float(values)], depth=True)
     features = [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)]
     blended = splat(surfels, features, view)
     images = np.array([image.numpy() for image in blended.features], np.float64)
     assert images.any()
     np.testing.assert_allclose(weight, images.sum(axis=1), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(weighted, images @ values, rtol=1e-4, atol=1e-5)
+    assert deep == pytest.approx(images @ (blended.depth / dr.maximum(blended.alpha, 1e-3)).numpy(), rel=1e-4)
     assert weight.sum() == pytest.approx(float(dr.sum(blended.alpha)[0]), rel=1e-5)
 
 

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mi_refgs.data.object_region import in_free_space
 from mi_refgs.data.view import evenly_spread
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.events.resets import ResetOpacity
@@ -18,7 +17,6 @@ from mi_refgs.fitting.state import TableEdit
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import Window, at_least, between
-from mi_refgs.splat import surfel_count
 from mi_refgs.splat.weights import blended_weights, listed_tiles
 from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.primitives.primitive import primitive_of
@@ -30,6 +28,9 @@ SPLIT_OFFSET, SPLIT_SCALE = 0.6, 0.72
 with `split_opacity` their profile is the parent's but for 2 % of its energy."""
 BACKGROUND_EXTENT = 0.5  # distances from the region's centre; larger surfels of the background are removed
 WEIGHED_VIEWS, WEIGHED_SIZE = 48, 128  # views in which faint surfels are sought; their longer side, pixels
+# A surfel of the background floats, and is removed, if this share of its weight is in pixels of which it has
+# less than this part of the expected depth: it serves few views, and hides the scene in others.
+FLOATING, NEARER = 0.9, 0.7
 NO_ROWS = np.empty(0, np.int64)
 
 
@@ -59,44 +60,38 @@ class Densify(Event[Trainer]):
         reset, rate = trainer.method.event.get(ResetOpacity.name), trainer.method.rates.of("opacity")
         grown = not isinstance(reset, ResetOpacity) or reset.grown(fit.iteration, self.prune_opacity, rate)
         opacity = self.prune_opacity if grown else 0.0
-        if len(fit.tables) > 1:
-            self._clear_free_space(trainer)
-        faint = self._faint(trainer) if opacity else [NO_ROWS] * len(fit.tables)
-        for table, few in zip(fit.tables, faint, strict=True):
+        weighed = self._weighed(trainer) if opacity else [(NO_ROWS, NO_ROWS)] * len(fit.tables)
+        for table, (faint, floating) in zip(fit.tables, weighed, strict=True):
             largest: float | np.ndarray = self.prune_extent * extent
             if table.prefix:  # the background's surfels may grow with their distance
                 region = trainer.region
                 assert region is not None
                 offset = table.surfels.raw["position"].numpy() - np.array(region.centre)
                 largest = BACKGROUND_EXTENT * np.maximum(np.linalg.norm(offset, axis=1), region.radius)
-            given: dict[str, Any] = {"largest": largest, "faint": few, "keep_one": bool(table.prefix)}
-            given |= {"grow": self.grow, "prune_opacity": opacity}
+            given: dict[str, Any] = {"largest": largest, "faint": faint, "gone": floating}
+            given |= {"keep_one": bool(table.prefix), "grow": self.grow, "prune_opacity": opacity}
             table.apply(densify_and_prune(table.surfels, table.error_sum, table.max_count, **given))
         exchange(trainer.setup, fit)
         for table in fit.tables:
             table.clear()
 
-    def _clear_free_space(self, trainer: Trainer) -> None:
-        """Remove the background's surfels right in front of cameras; one stays in any case."""
-        background, region = trainer.fit.tables[1], trainer.region
-        assert region is not None
-        floating = in_free_space(trainer.data.views, region, background.surfels.raw["position"].numpy())
-        floating &= np.cumsum(floating) < len(floating)
-        if floating.any():
-            background.remove(np.flatnonzero(floating))
-
-    def _faint(self, trainer: Trainer) -> list[np.ndarray]:
-        """The rows of each table with the least blending weight for the tiles they cost, these first."""
+    def _weighed(self, trainer: Trainer) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The rows of each table with the least blending weight for the tiles they cost, these first, and of
+        the background those that float before what the views show."""
         every = [table.surfels.detach() for table in trainer.fit.tables]
+        position = np.concatenate([table.raw["position"].numpy() for table in every])
         own, views = trainer.surfels.count, trainer.data.views
-        weight, cost = np.zeros(surfel_count(every)), np.zeros(surfel_count(every))
+        weight, cost, before = np.zeros((3, len(position)))
         for index in evenly_spread(len(views), WEIGHED_VIEWS):
             camera = views[index].camera()
             small = camera.resized(min(WEIGHED_SIZE, max(camera.width, camera.height)))
-            weight += blended_weights(every, small)[0]
+            pixels, depths = blended_weights(every, small, depth=True)
+            weight += pixels
+            before += pixels * (pixels * views[index].depth_of(position) < NEARER * depths)
             cost += listed_tiles(every, small)
-        tables = zip(np.split(weight, [own]), np.split(cost, [own]), strict=True)
-        return [least_weight(w, c, self.prune_weight) for w, c in tables][: len(every)]
+        floating = np.flatnonzero(before[own:] > FLOATING * weight[own:])
+        tables = zip(np.split(weight, [own]), np.split(cost, [own]), (NO_ROWS, floating), strict=True)
+        return [(least_weight(w, c, self.prune_weight), gone) for w, c, gone in tables][: len(every)]
 
 
 def fill(trainer: Trainer) -> None:
@@ -121,6 +116,7 @@ def densify_and_prune(
     prune_opacity: float = 0.05,
     largest: float | np.ndarray = np.inf,
     faint: np.ndarray = NO_ROWS,
+    gone: np.ndarray = NO_ROWS,
     keep_one: bool = False,
 ) -> TableEdit:
     """Split the surfels with the largest error; remove transparent and oversized ones, and faint ones.
@@ -128,8 +124,9 @@ def densify_and_prune(
     error: (N,), Σ w e² over the pixels of recent steps, or another score, such as the length of the
     position's gradient; none is split where it is 0. most: surfels that result at most. grow: fraction that
     is split at most. prune_opacity: surfels of less are removed, as are those larger than `largest`, scene
-    units, one or (N,). faint: rows that make room for splits, the first ones first. keep_one: the most opaque
-    surfel stays in any case. `ParameterTable.apply` takes the result. InputError if no surfel is left.
+    units, one or (N,). faint: rows that make room for splits, the first ones first; gone: rows that
+    are removed. keep_one: the most opaque surfel stays in any case. `ParameterTable.apply` takes the result.
+    InputError if no surfel is left.
     """
     error = np.array(error)
     raw = surfels.to_numpy()
@@ -137,6 +134,7 @@ def densify_and_prune(
     opacity = sigmoid(raw["opacity"][:, 0])
     size = primitive.extent(raw)[1].max(axis=1)
     keep = (size <= largest) & (opacity >= prune_opacity)
+    keep[gone] = False
     if keep_one and not keep.any():
         keep[np.argmax(opacity)] = True
     if not keep.any():

@@ -36,10 +36,10 @@ def densify(
     most: int = 100,
     largest: float = 0.1,
     options: Densify = OPTIONS,
-    faint: np.ndarray = event.NO_ROWS,
+    **rows: np.ndarray,
 ) -> TableEdit:
-    given: dict[str, Any] = {"grow": options.grow, "prune_opacity": options.prune_opacity}
-    return event.densify_and_prune(surfels, error, most, largest=largest, faint=faint, **given)
+    given: dict[str, Any] = {"grow": options.grow, "prune_opacity": options.prune_opacity, **rows}
+    return event.densify_and_prune(surfels, error, most, largest=largest, **given)
 
 
 def test_children_of_curved_surfels_turn_as_their_parents_do_there() -> None:
@@ -128,12 +128,12 @@ def test_least_weight_is_counted_per_tile_up_to_a_share_of_it() -> None:
         assert event.least_weight(weight, cost, share).tolist() == found, share
 
 
-def test_transparent_and_oversized_surfels_go_even_when_hot() -> None:
+def test_transparent_oversized_and_floating_surfels_go_even_when_hot() -> None:
     raw = table().to_numpy()
     raw["opacity"][0] = logit(0.01)
     raw["scale"][1] = np.log(0.5)
-    edited = densify(Surfels.from_numpy(raw), np.full(6, 1e-3))
-    assert sorted(set(edited.parent.tolist())) == [2, 3, 4, 5]
+    edited = densify(Surfels.from_numpy(raw), np.full(6, 1e-3), gone=np.array([5]))
+    assert sorted(set(edited.parent.tolist())) == [2, 3, 4]
 
 
 def test_wait_follows_rate_that_lifts_opacities() -> None:
