@@ -20,9 +20,10 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refgs.constants import RAW_LIMIT
+from mi_refgs.fitting.row_rates import RowRate
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.timing import phase
-from mi_refgs.surfels.table import gather_rows, sigmoid
+from mi_refgs.surfels.table import gather_rows
 from mi_refgs.types import Bool, Float, TensorXf, UInt32
 
 BETA_1, BETA_2 = 0.9, 0.999
@@ -30,7 +31,6 @@ EPSILON = 1e-15  # as in 3DGS: tiny, as per-surfel gradients of a pixel mean are
 OUTLIER = 100.0  # gradients beyond this many times the usual are cut; see above
 WIDE_ROW = 64  # columns beyond which rows are not distinguished: SH have 48, a row of the light hundreds
 WORD = 32  # tensors whose bits fit one integer of the marks
-LEAST_DIFFUSE = 0.05  # 1 - metallic below which rates rise no further: of a metal of `metal_evidence`
 MEMORY = 4096  # steps that `report` may come late
 
 
@@ -43,12 +43,8 @@ class LearningRate:
     steps: int = 1  # iterations
     head: int = 0  # columns that learn at the rate; 0: all
     tail: float = 1.0  # factor of the rate of the other columns: SH beyond degree 0
-    relative: bool = False  # values above 1 learn at the rate times themselves: lamps grow exponentially
-    mirrors: bool = False  # rows learn at the rate times metallic (1 - roughness)²: others reflect no normals
-    diffuse: bool = False  # rows learn at the rate over 1 - metallic, by which their colour is displayed
+    by_row: RowRate | None = None  # which rows learn faster, and which slower
     unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
-    centre: tuple[float, float, float] | None = None
-    """Rows of positions learn at the rate times their distance from here, in units of the tensor."""
     begin: int = 0  # iteration until which it is `rate`
 
     def at(self, iteration: int) -> float:
@@ -202,19 +198,8 @@ class Adam:
                 column = dr.arange(mi.UInt32, math.prod(shape)) % shape[-1]
                 η = η * dr.select(column < group.head, 1.0, group.tail)
             θ = dr.detach(self.params[name].array)
-            if group.relative:
-                η = η * dr.maximum(θ, 1)
-            if group.centre is not None:  # the distance of each entry's row
-                row = dr.arange(mi.UInt32, dr.width(θ)) // 3 * 3
-                offset = (
-                    dr.gather(mi.Float, θ, row + k) - dr.opaque(mi.Float, group.centre[k]) for k in range(3)
-                )
-                η = η * dr.norm(mi.Vector3f(*offset)) / dr.opaque(mi.Float, group.unit)
-            if group.mirrors:
-                smooth = 1 - self._material(name, "roughness", 0)
-                η = η * self._material(name, "metallic", 1) * dr.square(smooth)
-            if group.diffuse:
-                η = η / dr.maximum(1 - self._material(name, "metallic", 0), LEAST_DIFFUSE)
+            if group.by_row is not None:
+                η = group.by_row(η, self.params, name)
             updated[name] = (dr.select(good, θ - η * m / (dr.sqrt(v) + EPSILON), θ), shape)
             self._first[name] = dr.select(good, m, self._first[name])
             self._second[name] = dr.select(good, v, self._second[name])
@@ -225,14 +210,6 @@ class Adam:
         for name, (θ, shape) in updated.items():
             self.params[name] = mi.TensorXf(θ, shape=shape)
             self._make_leaf(name)
-
-    def _material(self, name: str, material: str, absent: float) -> Float:
-        """A material of the surfel of each entry of a tensor; `absent` if the surfels do not have it."""
-        values = self.params.get(name[: max(name.rfind("."), name.rfind("/")) + 1] + material)
-        if values is None:
-            return mi.Float(absent)
-        row = dr.arange(mi.UInt32, math.prod(self.params[name].shape)) // self.params[name].shape[-1]
-        return sigmoid(dr.gather(mi.Float, dr.detach(values.array), row))
 
     def _cut(self, name: str, g: Float, t: int, inverse: Float) -> Float:
         """The gradient of step t, without unit, cut, 0 where not finite; `inverse` is 1 / (1 - β₂ᵗ⁻¹)."""

@@ -13,6 +13,7 @@ from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.hull import view_focus
 from mi_refgs.errors import InputError
+from mi_refgs.fitting import row_rates
 from mi_refgs.fitting.events import place
 from mi_refgs.fitting.optim import LearningRate
 from mi_refgs.kernels.device import upload
@@ -135,12 +136,14 @@ class FitSetup:
             table = learning_rates(around.names, extent, iterations, rates)
             # The farther a surface, the less is known of its place.
             assert self.data.region is not None
-            table["position"] = replace(table["position"], centre=self.data.region.centre)
+            by_row = row_rates.ByDistance(self.data.region.centre, extent)
+            table["position"] = replace(table["position"], by_row=by_row)
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = LearningRate(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None and self.method.light.learns:
             final = rates.light * rates.decay
-            groups[LIGHT] = LearningRate(rates.light, final, iterations, relative=rates.light_relative)
+            by_row = row_rates.relative if rates.light_relative else None
+            groups[LIGHT] = LearningRate(rates.light, final, iterations, by_row=by_row)
         for name, (rate, final) in LEARNT_BESIDE.items():
             if name in params:
                 groups[name] = LearningRate(rate, final, iterations)
@@ -185,10 +188,10 @@ def learning_rates(
     for name in names:
         rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
         groups[name] = LearningRate(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
-    if "radiance_sh" in groups:
-        groups["radiance_sh"] = replace(groups["radiance_sh"], diffuse=rates.diffuse_relative)
+    if "radiance_sh" in groups and rates.diffuse_relative:
+        groups["radiance_sh"] = replace(groups["radiance_sh"], by_row=row_rates.of_diffuse_colour)
     if "curvature" in groups:  # 1/scene unit
-        groups["curvature"] = replace(groups["curvature"], mirrors=True, unit=1 / extent)
+        groups["curvature"] = replace(groups["curvature"], by_row=row_rates.of_mirrors, unit=1 / extent)
     start, final = rates.of("position") * extent, POSITION_FINAL * extent
     groups["position"] = LearningRate(start, final, int(POSITION_STEPS * iterations), unit=extent)
     return groups

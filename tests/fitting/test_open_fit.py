@@ -305,8 +305,7 @@ def test_background_before_what_views_show_floats(data: Dataset, method: Method)
         raw["opacity"][:], raw["scale"][:] = 5, np.log(radius / 6)
         raw["position"][:7], raw["opacity"][:7] = eye + (np.array(REGION.centre) - eye) / 2, -2
         table.replace(Surfels.from_numpy(raw))
-    (_, own), (_, floating) = Densify(Window(0, 1, 1))._weighed(trainer)
-    assert not len(own) and floating.tolist() == [*range(7)]
+    assert [gone.tolist() for _, gone in Densify(Window(0, 1, 1))._weighed(trainer)] == [[], [*range(7)]]
     initial = initial_parameters(method, data, np.random.default_rng(0), True)[f"{AROUND}position"].numpy()
     assert not in_free_space(data.views, REGION, initial).any()
 
@@ -456,8 +455,8 @@ def test_images_without_alpha_have_a_method_of_their_own(
     monkeypatch.setattr(READERS, "values", read)
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
     assert method.name == own and any(own in text for text in said) == (own != purpose)
-    relative = learning_rates(method.surfels.names, 1.0, 9, method.rates)["radiance_sh"].diffuse
-    assert relative == method.rates.diffuse_relative == (own == "photographs")
+    by_row = learning_rates(method.surfels.names, 1.0, 9, method.rates)["radiance_sh"].by_row
+    assert (by_row is not None) == method.rates.diffuse_relative == (own == "photographs")
     assert read.call_count == 1 and views.split == "train"
     monkeypatch.undo()
     objects = write_data(tmp_path, views=3, truth=False)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import mi_refgs
+from mi_refgs.fitting import row_rates
 from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.reference import losses as reference
 from tests.helpers import unit
@@ -204,11 +205,11 @@ def test_resume_is_bitwise(rng: np.random.Generator) -> None:
     ("start", "options", "factors"),
     [
         # What is above 1 moves by the rate times itself, what is below by the rate.
-        ([[-3.0], [0.5], [1.0], [4.0], [50.0]], {"relative": True}, [[1], [1], [1], [4], [50]]),
+        ([[-3.0], [0.5], [1.0], [4.0], [50.0]], {"by_row": row_rates.relative}, [[1], [1], [1], [4], [50]]),
         # Each row moves by the rate times its distance from the centre, in its unit.
         (
             [[1.0, 2, 3], [1, 2, 5], [1 + 30, 2, 3 + 40], [1, 1.5, 3]],
-            {"centre": (1.0, 2.0, 3.0), "unit": 2.0},
+            {"by_row": row_rates.ByDistance((1.0, 2.0, 3.0), 2.0), "unit": 2.0},
             [[0] * 3, [1] * 3, [25] * 3, [0.25] * 3],
         ),
     ],
@@ -227,12 +228,11 @@ def test_materials_decide_how_fast_rows_learn(rng: np.random.Generator) -> None:
     for at, names in [(at, materials[:count]) for at in ("", "n.", "n/") for count in range(3)]:
         values = {at + name: np.append(rng.normal(size=(4, 1)), [[4.0]], axis=0) for name in names}
         params = {key: tensor(x) for key, x in values.items()}
-        rates = {at + "normal": LearningRate(0.1, mirrors=True), at + "sh": LearningRate(0.1, diffuse=True)}
+        rules = {"normal": row_rates.of_mirrors, "sh": row_rates.of_diffuse_colour}
+        rates = {at + name: LearningRate(0.1, by_row=rule) for name, rule in rules.items()}
         params |= {name: tensor(np.zeros((5, 3))) for name in rates}
         optimiser = Adam(params, rates)
-        for name in rates:
-            give(optimiser, name, np.ones((5, 3)))
-        optimiser.step(0)
+        advance(optimiser, 0, **{name: np.ones((5, 3)) for name in rates})
         share = {name: 1 / (1 + np.exp(-raw)) for name, raw in values.items()}
         metallic = share.get(at + "metallic", 0)
         mirror = (metallic if names else 1) * (1 - share.get(at + "roughness", 0)) ** 2
