@@ -1,7 +1,5 @@
-"""Learning rates by row: what a surfel or a texel is decides how fast it learns.
-
-A `RowRate` turns the rate η of a tensor into those of its entries, from the parameters of the fit by name,
-and the tensor's own name; the surfels' materials have the same prefix."""
+"""Learning rates by row: what a surfel or a texel is decides how fast it learns. A `RowRate` turns the rate η
+of a tensor into those of its entries, from all parameters by name, and its own name."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -42,18 +40,16 @@ class ByDistance:
     unit: float
 
     def __call__(self, η: Float, params: Params, name: str) -> Float:
-        position = dr.detach(params[name].array)
-        row = dr.arange(mi.UInt32, dr.width(position)) // 3 * 3  # of each entry
-        offset = (
-            dr.gather(mi.Float, position, row + k) - dr.opaque(mi.Float, self.centre[k]) for k in range(3)
-        )
+        p = dr.detach(params[name].array)
+        row = dr.arange(mi.UInt32, dr.width(p)) // 3 * 3  # of each entry
+        offset = [dr.gather(mi.Float, p, row + k) - dr.opaque(mi.Float, x) for k, x in enumerate(self.centre)]
         return η * dr.norm(mi.Vector3f(*offset)) / dr.opaque(mi.Float, self.unit)
 
 
 def _material(params: Params, name: str, material: str, absent: float) -> Float:
-    """A material of the surfel of each entry of a tensor; `absent` if the surfels do not have it."""
+    """A material of the surfel of each entry; `absent` if these, such as a background's, have none."""
     values = params.get(name[: max(name.rfind("."), name.rfind("/")) + 1] + material)
-    if values is None:
+    if values is None or values.shape[0] != params[name].shape[0]:
         return mi.Float(absent)
     row = dr.arange(mi.UInt32, math.prod(params[name].shape)) // params[name].shape[-1]
     return sigmoid(dr.gather(mi.Float, dr.detach(values.array), row))

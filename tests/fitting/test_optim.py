@@ -223,21 +223,21 @@ def test_rates_of_lamps_and_of_distant_positions_grow(
 
 
 def test_materials_decide_how_fast_rows_learn(rng: np.random.Generator) -> None:
-    """A row's step is that of Adam times metallic (1 - roughness)², or over 1 - metallic, 0.05 at least."""
+    """A row's step is Adam's times metallic (1 - roughness)², or over 1 - metallic ≥ 0.05, else Adam's."""
     materials = ("metallic", "roughness")
     for at, names in [(at, materials[:count]) for at in ("", "n.", "n/") for count in range(3)]:
         values = {at + name: np.append(rng.normal(size=(4, 1)), [[4.0]], axis=0) for name in names}
         params = {key: tensor(x) for key, x in values.items()}
-        rules = {"normal": row_rates.of_mirrors, "sh": row_rates.of_diffuse_colour}
+        rules = {"normal": row_rates.of_mirrors} | dict.fromkeys(("sh", "other"), row_rates.of_diffuse_colour)
         rates = {at + name: LearningRate(0.1, by_row=rule) for name, rule in rules.items()}
-        params |= {name: tensor(np.zeros((5, 3))) for name in rates}
-        optimiser = Adam(params, rates)
-        advance(optimiser, 0, **{name: np.ones((5, 3)) for name in rates})
+        params |= {name: tensor(np.zeros((7 if "other" in name else 5, 3))) for name in rates}
+        advance(Adam(params, rates), 0, **{name: np.ones(params[name].shape) for name in rates})
         share = {name: 1 / (1 + np.exp(-raw)) for name, raw in values.items()}
         metallic = share.get(at + "metallic", 0)
         mirror = (metallic if names else 1) * (1 - share.get(at + "roughness", 0)) ** 2
-        for name, factor in (("normal", mirror), ("sh", 1 / np.maximum(1 - metallic, 0.05))):
-            expected = np.broadcast_to(-0.1 * factor, (5, 3))
+        factors = {"normal": mirror, "sh": 1 / np.maximum(1 - metallic, 0.05), "other": 1}
+        for name, factor in factors.items():
+            expected = np.broadcast_to(-0.1 * factor, params[at + name].shape)
             np.testing.assert_allclose(params[at + name].numpy(), expected, rtol=1e-4)
 
 

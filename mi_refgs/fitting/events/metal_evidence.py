@@ -49,7 +49,7 @@ class MetalEvidence(Event[Trainer]):
     when: Window  # iterations at which it happens
 
     def due(self, trainer: Trainer) -> bool:
-        return self.when.due(trainer.iteration)
+        return self.when.due(trainer.iteration) and trainer.shading().model.light != "none"
 
     def apply(self, trainer: Trainer) -> None:
         errors, tint, colour, pixels = fitted(moments(trainer))
