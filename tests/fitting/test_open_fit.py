@@ -296,14 +296,14 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
 
 
 def test_background_before_what_views_show_floats(data: Dataset, method: Method) -> None:
-    """Faint surfels half way to an opaque ball in a shell: those of the background, not the object's."""
-    trainer, eye = Trainer(method, data), data.views[3].to_world[:3, 3]
+    """Faint surfels of the background half way to a ball in a shell; not opaque ones with faint fringes."""
+    trainer, eyes = Trainer(method, data), [data.views[i].to_world[:3, 3] for i in (3, 0)]
     shell = map_directions(8).reshape(-1, 3)[np.linspace(0, 127, 80, dtype=int)]
     for table, radius in zip(trainer.fit.tables, (0.5, 6), strict=True):
         raw = table.surfels.to_numpy()
         raw["position"] = (radius * shell[: table.surfels.count]).astype(np.float32)
         raw["opacity"][:], raw["scale"][:] = 5, np.log(radius / 6)
-        raw["position"][:7], raw["opacity"][:7] = eye + (np.array(REGION.centre) - eye) / 2, -2
+        raw["position"][:14], raw["opacity"][:7], raw["scale"][7:14] = np.repeat(eyes, 7, axis=0) / 2, -2, -3
         table.replace(Surfels.from_numpy(raw))
     assert [gone.tolist() for _, gone in Densify(Window(0, 1, 1))._weighed(trainer)] == [[], [*range(7)]]
     initial = initial_parameters(method, data, np.random.default_rng(0), True)[f"{AROUND}position"].numpy()
