@@ -43,7 +43,7 @@ class LearningRate:
     steps: int = 1  # iterations
     head: int = 0  # columns that learn at the rate; 0: all
     tail: float = 1.0  # factor of the rate of the other columns: SH beyond degree 0
-    by_row: RowRate | None = None  # which rows learn faster, and which slower
+    by_row: RowRate | None = None  # of `fitting.row_rates`: which rows learn faster
     unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
     begin: int = 0  # iteration until which it is `rate`
 

@@ -124,8 +124,8 @@ def densify_and_prune(
     error: (N,), Σ w e² over the pixels of recent steps, or another score, such as the length of the
     position's gradient; none is split where it is 0. most: surfels that result at most. grow: fraction that
     is split at most. prune_opacity: surfels of less are removed, as are those larger than `largest`, scene
-    units, one or (N,). faint: rows that make room for splits, the first ones first; gone: rows that
-    are removed. keep_one: the most opaque surfel stays in any case. `ParameterTable.apply` takes the result.
+    units, one or (N,). faint: rows that make room for splits, the first ones first. gone: rows that are
+    removed. keep_one: the most opaque surfel stays in any case. `ParameterTable.apply` takes the result.
     InputError if no surfel is left.
     """
     error = np.array(error)
