@@ -136,8 +136,8 @@ class FitSetup:
             table = learning_rates(around.names, extent, iterations, rates)
             # The farther a surface, the less is known of its place.
             assert self.data.region is not None
-            by_row = row_rates.ByDistance(self.data.region.centre, extent)
-            table["position"] = replace(table["position"], by_row=by_row)
+            distance = row_rates.ByDistance(self.data.region.centre, extent)
+            table["position"] = replace(table["position"], by_row=distance)
             groups |= {AROUND + name: group for name, group in table.items()}
             groups[BACKGROUND] = LearningRate(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None and self.method.light.learns:
