@@ -5,11 +5,11 @@ import mitsuba as mi
 
 from mi_refgs.constants import COVERAGE_FLOOR, NORM_FLOOR
 from mi_refgs.errors import InputError
-from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import ray_distance
 from mi_refgs.shade.points import TERMS
 from mi_refgs.splat.camera import Camera
+from mi_refgs.splat.composite import inverse_alpha
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.types import Float
 

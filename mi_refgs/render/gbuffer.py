@@ -7,9 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.kernels.rows import joined
-from mi_refgs.splat import Composited
+from mi_refgs.splat.composite import Composited, inverse_alpha
 from mi_refgs.types import Array, Float
 
 OBJECT = "object"  # slot of the object's opacity; where it is blended, slots are divided by it
@@ -48,12 +47,6 @@ def joined_slots(first: Slots, second: Slots, rows: tuple[int, int]) -> dict[str
             found = _parts(values[name]) if name in values else [mi.Float(0)] * len(_parts(kind))
             column += [x if dr.width(x) == count else x + dr.zeros(mi.Float, count) for x in found]
     return _grouped(kinds, joined(*columns))
-
-
-def inverse_alpha(alpha: Float) -> Float:
-    """1/A where anything is seen (COVERAGE_FLOOR), else 0, with a finite gradient everywhere."""
-    seen = alpha > COVERAGE_FLOOR
-    return dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
 
 
 def _parts(value: Array) -> list[Float]:

@@ -21,7 +21,7 @@ from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.kernels.timing import boundary
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.antialias import averaged
-from mi_refgs.render.gbuffer import OBJECT, SURROUNDINGS, GBuffer, features, inverse_alpha, joined_slots
+from mi_refgs.render.gbuffer import OBJECT, SURROUNDINGS, GBuffer, features, joined_slots
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.light.near_field import LocalLight, NearField
@@ -29,6 +29,7 @@ from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_norm
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace
 from mi_refgs.splat import Camera, splat, splat_compact
+from mi_refgs.splat.composite import inverse_alpha
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels

@@ -11,9 +11,9 @@ from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.errors import require_between
 from mi_refgs.kernels.linear import linear
 from mi_refgs.kernels.trees import mapped
-from mi_refgs.render.gbuffer import inverse_alpha
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.splat.camera import Camera
+from mi_refgs.splat.composite import inverse_alpha
 from mi_refgs.types import Arrays, Color3f, Float
 
 

@@ -24,6 +24,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.kernels.rows import PackedRows
 from mi_refgs.kernels.timing import boundary, phase
 from mi_refgs.splat.camera import Camera
@@ -47,6 +48,12 @@ class Composited:
         """Maps of a view without surfels."""
         *maps, z, alpha = _blank(features + 2, camera)
         return Composited(maps, z if depth else None, alpha)
+
+
+def inverse_alpha(alpha: Float) -> Float:
+    """1/A where anything is seen (COVERAGE_FLOOR), else 0, with a finite gradient everywhere."""
+    seen = alpha > COVERAGE_FLOOR
+    return dr.select(seen, dr.rcp(dr.select(seen, alpha, 1)), 0)
 
 
 @phase("splat forward", backward="splat backward")

@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.splat import Tables, list_by_tile, project, splat, surfel_count, tables_of
 from mi_refgs.splat.camera import Camera
+from mi_refgs.splat.composite import inverse_alpha
 from mi_refgs.types import Float
 
 
@@ -21,7 +21,7 @@ def blended_weights(
     dr.enable_grad(features)
     blended = splat([table.detach() for table in tables_of(surfels)], features, camera)
     if depth:
-        maps = [*maps, dr.detach(blended.depth / dr.maximum(blended.alpha, COVERAGE_FLOOR))]
+        maps = [*maps, dr.detach(blended.depth * inverse_alpha(blended.alpha))]
     total = dr.sum(sum(m * image for m, image in zip(maps, blended.features, strict=True)))
     if dr.grad_enabled(total):  # unless the view shows nothing
         dr.backward(total)

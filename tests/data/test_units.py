@@ -14,7 +14,7 @@ from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.region import Region, write_region
 from mi_refgs.data.survey import survey
 from mi_refgs.fitting.initial import initial_surfels
-from mi_refgs.fitting.optim import Adam
+from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.fitting.schedule import FitSetup
 from tests.scenes import dots, layouts
 from tests.scenes.tiny import write_data
@@ -59,6 +59,7 @@ def test_optimiser_step_scales_with_the_scene(scale: float, tmp_path: Path) -> N
         return params["position"].numpy() / scale
 
     np.testing.assert_allclose(step(scale), step(1), rtol=1e-4)
+    assert LearningRate(1.0).unit == 1
 
 
 UTM = np.array([5e5, 4e6 + 4, 120.0])

@@ -22,6 +22,7 @@ from mi_refgs.fitting.events.resets import ResetOpacity
 from mi_refgs.fitting.exchange import depth_outside, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
+from mi_refgs.fitting.row_rates import of_diffuse_colour
 from mi_refgs.fitting.runner import Choice, begin, chosen
 from mi_refgs.fitting.schedule import FitSetup, learning_rates
 from mi_refgs.fitting.train import Trainer
@@ -456,7 +457,7 @@ def test_images_without_alpha_have_a_method_of_their_own(
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
     assert method.name == own and any(own in text for text in said) == (own != purpose)
     by_row = learning_rates(method.surfels.names, 1.0, 9, method.rates)["radiance_sh"].by_row
-    assert (by_row is not None) == method.rates.diffuse_relative == (own == "photographs")
+    assert (by_row is of_diffuse_colour) == method.rates.diffuse_relative == (own == "photographs")
     assert read.call_count == 1 and views.split == "train"
     monkeypatch.undo()
     objects = write_data(tmp_path, views=3, truth=False)

@@ -235,8 +235,7 @@ def test_materials_decide_how_fast_rows_learn(rng: np.random.Generator) -> None:
         share = {name: 1 / (1 + np.exp(-raw)) for name, raw in values.items()}
         metallic = share.get(at + "metallic", 0)
         mirror = (metallic if names else 1) * (1 - share.get(at + "roughness", 0)) ** 2
-        factors = {"normal": mirror, "sh": 1 / np.maximum(1 - metallic, 0.05), "other": 1}
-        for name, factor in factors.items():
+        for name, factor in (("normal", mirror), ("sh", 1 / np.maximum(1 - metallic, 0.05)), ("other", 1)):
             expected = np.broadcast_to(-0.1 * factor, params[at + name].shape)
             np.testing.assert_allclose(params[at + name].numpy(), expected, rtol=1e-4)
 

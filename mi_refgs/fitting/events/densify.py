@@ -28,8 +28,7 @@ SPLIT_OFFSET, SPLIT_SCALE = 0.6, 0.72
 with `split_opacity` their profile is the parent's but for 2 % of its energy."""
 BACKGROUND_EXTENT = 0.5  # distances from the region's centre; larger surfels of the background are removed
 WEIGHED_VIEWS, WEIGHED_SIZE = 48, 128  # views in which faint surfels are sought; their longer side, pixels
-# A surfel of the background floats, and is removed, if this share of its weight is in pixels of which it has
-# less than this part of the expected depth: it serves few views, and hides the scene in others.
+# A surfel of the background floats, if this share of its weight is before this part of the expected depth.
 FLOATING, NEARER = 0.9, 0.7
 NO_ROWS = np.empty(0, np.int64)
 
@@ -85,9 +84,10 @@ class Densify(Event[Trainer]):
         for index in evenly_spread(len(views), WEIGHED_VIEWS):
             camera = views[index].camera()
             small = camera.resized(min(WEIGHED_SIZE, max(camera.width, camera.height)))
-            pixels, depths = blended_weights(every, small, depth=True)
+            pixels, *depths = blended_weights(every, small, depth=len(every) > 1)
             weight += pixels
-            before += pixels * (pixels * views[index].depth_of(position) < NEARER * depths)
+            for deep in depths:
+                before += pixels * (pixels * views[index].depth_of(position) < NEARER * deep)
             cost += listed_tiles(every, small)
         floating = np.flatnonzero(before[own:] > FLOATING * weight[own:])
         tables = zip(np.split(weight, [own]), np.split(cost, [own]), (NO_ROWS, floating), strict=True)
@@ -124,9 +124,8 @@ def densify_and_prune(
     error: (N,), Σ w e² over the pixels of recent steps, or another score, such as the length of the
     position's gradient; none is split where it is 0. most: surfels that result at most. grow: fraction that
     is split at most. prune_opacity: surfels of less are removed, as are those larger than `largest`, scene
-    units, one or (N,). faint: rows that make room for splits, the first ones first. gone: rows that are
-    removed. keep_one: the most opaque surfel stays in any case. `ParameterTable.apply` takes the result.
-    InputError if no surfel is left.
+    units, one or (N,). faint: rows that make room for splits, the first ones first. gone: rows to remove.
+    keep_one: the most opaque surfel stays. `ParameterTable.apply` takes the result. InputError if none stays.
     """
     error = np.array(error)
     raw = surfels.to_numpy()

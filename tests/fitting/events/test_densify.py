@@ -130,8 +130,7 @@ def test_least_weight_is_counted_per_tile_up_to_a_share_of_it() -> None:
 
 def test_transparent_oversized_and_floating_surfels_go_even_when_hot() -> None:
     raw = table().to_numpy()
-    raw["opacity"][0] = logit(0.01)
-    raw["scale"][1] = np.log(0.5)
+    raw["opacity"][0], raw["scale"][1] = logit(0.01), np.log(0.5)
     edited = densify(Surfels.from_numpy(raw), np.full(6, 1e-3), gone=np.array([5]))
     assert sorted(set(edited.parent.tolist())) == [2, 3, 4]
 
