@@ -74,6 +74,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Modules and tests stay until the end: the collection after each test need not look at them again."""
+    mi.set_variant(VARIANT)  # for fixtures of modules, which are made before those of tests
     gc.collect()
     gc.freeze()
 
@@ -81,7 +82,6 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(scope="session")
 def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """day.exr, dusk.exr, the data set `data` of two balls under them, and a perfect reconstruction `run`."""
-    mi.set_variant(VARIANT)
     folder = tmp_path_factory.mktemp("known")
     write_known_run(write_known_data(folder), folder / "run")
     return folder
@@ -89,7 +89,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def llvm_ad_rgb() -> Iterator[None]:
-    """Set variant and threads; afterwards wait for kernels, restore flags, return memory; kernels stay."""
+    """Set variant and threads; afterwards wait for kernels, restore variant and flags, return memory."""
     mi.set_variant(VARIANT)
     if dr.thread_count() != THREADS:  # a command was run with --threads
         dr.set_thread_count(THREADS)
@@ -97,6 +97,7 @@ def llvm_ad_rgb() -> Iterator[None]:
     gc.collect()
     if mi.variant() != "scalar_rgb":
         dr.sync_thread()
+    mi.set_variant(VARIANT)
     dr.kernel_history_clear()
     dr.flush_malloc_cache()
     dr.set_flag(dr.JitFlag.Default, True)

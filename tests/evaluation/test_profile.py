@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import pytest
 
 from mi_refgs import methods
@@ -28,7 +27,6 @@ PAUSE = 0.25
 @pytest.fixture(scope="module")
 def trainer(data: Path, method: Path) -> Trainer:
     """Stages up to iterations 30 and 60."""
-    mi.set_variant("llvm_ad_rgb")
     until = ["iterations=60", "stage.initial.until=30", "stage.deferred.until=60"]
     return Trainer(methods.load(str(method), "quick", [*SETTINGS, *until]), read_dataset(data, "train"))
 

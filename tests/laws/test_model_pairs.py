@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -52,7 +51,6 @@ def forget(*registries: Any) -> None:
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """`data`, a light, `coated.toml`, and a run per model, named after it."""
-    mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("models")
     data = write_data(folder / "data", views=8)
     write_exr(folder / "light.exr", np.linspace(0.1, 3, 8 * 16 * 3, dtype=np.float32).reshape(8, 16, 3))

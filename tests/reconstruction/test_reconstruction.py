@@ -244,4 +244,3 @@ def test_load_requires_a_supported_variant(balls: Reconstruction) -> None:
     mi.set_variant("scalar_rgb")
     with pytest.raises(InputError, match=r"mi_refgs.load: variant: .* call mi.set_variant\('llvm_ad_rgb'\)"):
         mi_refgs.load(balls.folder or "")
-    mi.set_variant("llvm_ad_rgb")  # for fixtures of the next file

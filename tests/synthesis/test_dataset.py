@@ -36,7 +36,6 @@ OPTIONS["environment_height"] = 64
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of one sphere, off the origin."""
-    mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("dataset")
     (folder / "ball.xml").write_text(SCENE)
     return make_dataset(folder / "ball.xml", folder / "out", **OPTIONS)

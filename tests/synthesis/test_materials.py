@@ -143,7 +143,6 @@ SCENE = """<scene version="3.0.0">
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A chequered metal ball, a clay one, and a glass tube."""
-    mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("materials")
     (folder / "three.xml").write_text(SCENE)
     options: dict[str, Any] = {"views": 4, "test_views": 1, "size": 32, "spp": 4, "environment_height": 0}

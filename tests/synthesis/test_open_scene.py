@@ -53,7 +53,6 @@ OPTIONS |= {"objects": ["ball"], "elevation": (20.0, 60.0), "distance": (2.0, 2.
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball on a table before a wall."""
-    mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("open")
     (folder / "room.xml").write_text(ROOM)
     return make_dataset(folder / "room.xml", folder / "out", **OPTIONS)
