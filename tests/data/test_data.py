@@ -15,7 +15,7 @@ from PIL import Image
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.images import box_downscale, write_png
-from tests.helpers import read_loaded, refused
+from tests.helpers import read_loaded, refused, unit
 from tests.scenes.layouts import change_transforms
 
 ANGLE = 0.7  # camera_angle_x, radians
@@ -27,8 +27,7 @@ def pose(azimuth: float) -> np.ndarray:
     focus = np.array([0.1, 0.2, 0.3])
     low = math.cos(0.35)
     backward = np.array([math.cos(azimuth) * low, math.sin(azimuth) * low, math.sin(0.35)])
-    right = np.cross([0, 0, 1], backward)
-    right /= np.linalg.norm(right)
+    right = unit(np.cross([0, 0, 1], backward))
     matrix = np.eye(4)
     matrix[:3] = np.stack([right, np.cross(backward, right), backward, focus + 3 * backward], axis=1)
     return matrix

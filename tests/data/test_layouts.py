@@ -13,19 +13,13 @@ from PIL import Image
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.io.images import write_png
 from tests.helpers import refused
+from tests.scenes import layouts
 from tests.scenes.dots import check
-from tests.scenes.layouts import (
-    SHOTS,
-    change_transforms,
-    write_glossy,
-    write_llff,
-    write_nerfstudio,
-    write_transforms,
-)
+from tests.scenes.layouts import SHOTS, change_transforms, write_glossy, write_llff
 
 
 def test_filenames_define_splits(tmp_path: Path) -> None:
-    data = write_nerfstudio(tmp_path, test_filenames=["images/c.png"], val_filenames=["images/d.png"])
+    data = layouts.write_nerfstudio(tmp_path, test_filenames=["images/c.png"], val_filenames=["images/d.png"])
     names = {split: [v.name for v in read_dataset(data, split).views] for split in ("train", "test")}
     assert names["test"] == ["images/c"] and len(names["train"]) == 7
     change_transforms(data, lambda content: content.update(train_filenames=["images/a.png", "images/b.png"]))
@@ -50,7 +44,7 @@ def shiny(folder: Path, alpha: bool = True) -> Path:
     if not alpha:
         write_png(folder / "test/r_0_alpha.png", np.repeat(inside[..., None], 3, axis=-1))
     frame = {"file_path": "test/r_0", "transform_matrix": SHOTS[0].camera_to_world.tolist()}
-    return write_transforms(folder, [frame], camera_angle_x=0.7)
+    return layouts.write_transforms(folder, [frame], camera_angle_x=0.7)
 
 
 @pytest.mark.parametrize("alpha", [True, False])

@@ -6,18 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mi_refgs.data import object_region as regions
 from mi_refgs.data.images import Pixels
-from mi_refgs.data.object_region import (
-    DENSE,
-    NORMALS,
-    camera_positions,
-    fitted_region,
-    in_free_space,
-    object_region,
-    seen_share,
-    shown_whole,
-    support_planes,
-)
+from mi_refgs.data.object_region import camera_positions, fitted_region, in_free_space, object_region
 from mi_refgs.data.region import Region, region_of
 from mi_refgs.data.view import View
 from mi_refgs.reference.camera import look_at
@@ -54,7 +45,8 @@ def test_table_is_found_and_left_out(rng: np.random.Generator) -> None:
     item = box((-0.3, -0.2, TABLE), (0.3, 0.2, 0.4), 400, rng)
     mirrored = item * [1, 1, -1] + [0, 0, 2 * TABLE]
     points = np.concatenate([table(rng), item, mirrored, rng.uniform(0, 3, (300, 3))])
-    region = object_region(region_of(views), camera_positions(views), points, partial(seen_share, views))
+    seen = partial(regions.seen_share, views)
+    region = object_region(region_of(views), camera_positions(views), points, seen)
     ((*normal, offset),) = region.planes
     np.testing.assert_allclose(normal, [0, 0, 1], atol=0.01)
     assert TABLE < offset < TABLE + 0.06 * region.radius
@@ -68,7 +60,7 @@ def test_faces_of_object_support_nothing(rng: np.random.Generator) -> None:
     points = box((-1, -1, TABLE), (1, 1, 0.5), 4000, rng)
     points = points[points[:, 2] > TABLE]  # nobody sees the bottom
     for some in (points, points[:10], rng.normal(size=(4000, 3))):
-        assert support_planes(some, camera_positions(views), Region((0, 0, 0), 1.0)) == ()
+        assert regions.support_planes(some, camera_positions(views), Region((0, 0, 0), 1.0)) == ()
 
 
 def test_tall_object_is_whole(rng: np.random.Generator) -> None:
@@ -76,12 +68,12 @@ def test_tall_object_is_whole(rng: np.random.Generator) -> None:
     views = views_around((0, 0, 0.3))
     item = box((-0.2, -0.2, TABLE), (0.2, 0.2, 1.8), 1500, rng)
     points = np.concatenate([table(rng), item])
-    sphere, origins, seen = region_of(views), camera_positions(views), partial(seen_share, views)
+    sphere, origins, seen = region_of(views), camera_positions(views), partial(regions.seen_share, views)
     assert not sphere.contains(item).all()
     region = object_region(sphere, origins, points, seen)
     assert region.contains(item[item[:, 2] > TABLE + 0.12]).all() and region.estimated
-    assert shown_whole(views, region, points)
-    assert not shown_whole(views_around((0, 0, 0.3), focal=300.0), region, points)
+    assert regions.shown_whole(views, region, points)
+    assert not regions.shown_whole(views_around((0, 0, 0.3), focal=300.0), region, points)
     few = np.concatenate([table(rng), item[:20]])
     assert object_region(sphere, origins, few, seen).radius == sphere.radius
 
@@ -92,7 +84,7 @@ def test_surfaces_of_fit_enclose_object_alone(rng: np.random.Generator) -> None:
     beside = box((0.9, -0.2, TABLE), (1.2, 0.2, 0.2), 4000, rng)
     points = np.concatenate([table(rng, 20_000), item, beside])
     region = Region((0, 0, 0.3), 1.2, ((0, 0, 1, TABLE + 0.05),), True)
-    origins, seen = camera_positions(views), partial(seen_share, views)
+    origins, seen = camera_positions(views), partial(regions.seen_share, views)
     assert region.contains(beside).any() and not region.contains(item[item[:, 2] > TABLE + 0.05]).all()
     found = fitted_region(region, origins, points, seen)
     assert found is not None and found.estimated
@@ -115,19 +107,19 @@ L = ((-0.8, -0.8, TABLE), (0.8, -0.4, -0.2)), ((-0.8, -0.4, TABLE), (-0.4, 0.8, 
 def test_object_of_any_shape_is_whole(boxes: list[Any], distance: float, rng: np.random.Generator) -> None:
     """Before a fit and during it; without the table, what is beside the object, and the cameras."""
     views = views_around((0, 0, -0.2), 80.0, distance)
-    cameras, seen, sphere = camera_positions(views), partial(seen_share, views), region_of(views)
+    cameras, seen, sphere = camera_positions(views), partial(regions.seen_share, views), region_of(views)
     item = np.concatenate([box(low, high, 4000, rng) for low, high in boxes])
     beside, cloth = box((1.3, 1.3, TABLE), (1.6, 1.6, -0.2), 1000, rng), table(rng, 10_000)
     points, above = np.concatenate([cloth, item, beside]), item[item[:, 2] > TABLE + 0.04]
-    before = object_region(sphere, cameras, points, seen, DENSE)
+    before = object_region(sphere, cameras, points, seen, regions.DENSE)
     during = fitted_region(before, cameras, points, seen)
-    assert during is not None and len(during.planes) == len(before.supports) + len(NORMALS)
+    assert during is not None and len(during.planes) == len(before.supports) + len(regions.NORMALS)
     for region in (before, during):
         assert region.contains(above).all() and not region.contains(np.concatenate([cameras, cloth])).any()
     assert not during.contains(beside).any() and sphere.contains(above).all() == (distance > 2)
     # Lower than the points of a table are accurate: its neighbour must not become the object.
     points = np.concatenate([cloth, item * [1, 1, 0] + [0, 0, TABLE + 0.03], beside])
-    low = object_region(sphere, cameras, points, seen, DENSE)
+    low = object_region(sphere, cameras, points, seen, regions.DENSE)
     assert low.radius == sphere.radius and fitted_region(low, cameras, points, seen) is None
 
 

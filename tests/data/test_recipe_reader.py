@@ -6,16 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mi_refgs
 from mi_refgs.cli import main
-from mi_refgs.data.dataset import (
-    READERS,
-    PointCloud,
-    ReadOptions,
-    Recording,
-    held_out,
-    read_dataset,
-    register_reader,
-)
+from mi_refgs.data.dataset import READERS, PointCloud, ReadOptions, Recording, held_out, read_dataset
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.io.images import box_downscale, read_png, write_png
@@ -60,7 +53,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     (out / "cameras.txt").write_text("\n".join(lines))
     directions = np.random.default_rng(0).normal(size=(300, 3))
     np.savetxt(out / "points.txt", RADIUS * directions / np.linalg.norm(directions, axis=1, keepdims=True))
-    register_reader(TableReader())
+    mi_refgs.register_reader(TableReader())
     yield out
     READERS.unregister(TableReader.name)
 

@@ -7,17 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mi_refgs.data import region as regions
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.object_region import NORMALS
-from mi_refgs.data.region import (
-    REGION_FILE,
-    Plane,
-    Region,
-    read_region,
-    region_of,
-    region_pixels,
-    write_region,
-)
+from mi_refgs.data.region import REGION_FILE, Plane, Region, read_region, region_of, region_pixels
 from mi_refgs.data.view import View
 from mi_refgs.reference.camera import look_at
 from tests.helpers import refused, unit
@@ -96,7 +89,7 @@ def test_region_file_is_read(tmp_path: Path) -> None:
     read = read_region(tmp_path)
     assert read == Region((1.0, 2.0, 3.0), 0.5, ((0.0, 0.0, 1.0, 0.5),)) and not read.estimated
     for region in (read, replace(read, planes=()), replace(read, estimated=True)):
-        write_region(tmp_path, region)
+        regions.write_region(tmp_path, region)
         again = read_region(tmp_path)
         assert again == region and again is not None and again.estimated == region.estimated
 

@@ -13,10 +13,10 @@ from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.images import Pixels
 from mi_refgs.data.view import View
 from mi_refgs.evaluation import surface
-from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference.camera import look_at
 from tests.helpers import unit
+from tests.scenes.integrator import joined
 from tests.scenes.known import CENTRES, RADII, SIZE
 
 
@@ -25,12 +25,8 @@ def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surface, "QUERIES", 4_000)
 
 
-def mesh_of(shape: Any) -> Mesh:
-    return Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32), 1e-3)
-
-
 def truth_of(*shapes: Any) -> surface.TrueSurface:
-    return surface.TrueSurface(mesh_of(trimesh.util.concatenate(shapes)))
+    return surface.TrueSurface(joined(1e-3, *shapes))
 
 
 def around(count: int = 8) -> list[View]:
@@ -50,18 +46,18 @@ def ball(radius: float, centre: tuple[float, ...] = (0, 0, 0)) -> Any:
 @pytest.mark.parametrize(("radius", "percent"), [(1, 0), (1.1, 5)])
 def test_distance_of_spheres(radius: float, percent: float) -> None:
     """In percent of the true diameter, either way."""
-    found = surface.surface_distance(mesh_of(ball(radius)), truth_of(ball(1)), around())
+    found = surface.surface_distance(joined(1e-3, ball(radius)), truth_of(ball(1)), around())
     assert found == pytest.approx(dict.fromkeys(surface.SURFACE_KEYS, percent), rel=0.01, abs=1e-3)
 
 
 def test_distance_counts_missing_but_not_hidden_surface() -> None:
     """A second ball beside the first is missing; one inside it is hidden, on either side."""
     both = truth_of(ball(1), ball(0.5, (1.7, 0, 0)))
-    found = surface.surface_distance(mesh_of(ball(1)), both, around())
+    found = surface.surface_distance(joined(1e-3, ball(1)), both, around())
     assert found["surface_accuracy"] < 0.02 and found["surface_completeness"] > 2
     inside = trimesh.util.concatenate([ball(1), ball(0.5)])
     for ours, true in ((ball(1), inside), (inside, ball(1))):
-        found = surface.surface_distance(mesh_of(ours), truth_of(true), around())
+        found = surface.surface_distance(joined(1e-3, ours), truth_of(true), around())
         assert found["surface_distance"] < 1e-3
 
 
@@ -70,7 +66,7 @@ def test_closed_cavity_counts_as_concave_error() -> None:
     box = trimesh.creation.box((2, 2, 1)).subdivide().subdivide()
     poses = [look_at(np.array([0.1 * i, 0.3, 6]), np.zeros(3)) for i in range(3)]
     above = [replace(view, to_world=pose) for view, pose in zip(around(3), poses, strict=True)]
-    found = surface.surface_distance(mesh_of(box), truth_of(pitted_box()), [*around(), *above])
+    found = surface.surface_distance(joined(1e-3, box), truth_of(pitted_box()), [*around(), *above])
     assert found["surface_distance_concave"] > 4 * found["surface_distance"] > 0
     assert found["surface_completeness_concave"] > 3
 
@@ -93,7 +89,7 @@ def test_ambient_visibility_inside_a_cap() -> None:
     for height in (0.5, 1.0):
         cap = sphere.copy()
         cap.update_faces(cap.triangles_center[:, 2] < height - 1)
-        occluder = Occluder(mesh_of(cap))
+        occluder = Occluder(joined(1e-3, cap))
         point = unit(np.array([[0, 0, -1], [0.3, 0, -0.95], [0.2, 0.2, -0.96]]))
         inside = surface.ambient_visibility(occluder, mi.Point3f(point.T * 0.999), mi.Vector3f(-point.T))
         np.testing.assert_allclose(inside.numpy(), 1 - height / 2, atol=0.04)

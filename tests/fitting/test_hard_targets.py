@@ -18,8 +18,6 @@ from tests.scenes.highlight import ball, small_method
 
 STEPS = 14
 """Into the deferred stage, with the first mesh, a reset and two rounds of densifying."""
-
-
 SIZE = (24, 24)
 
 
@@ -57,7 +55,6 @@ CASES: dict[str, Callable[[], Dataset]] = {
     "peak of 1e6": lambda: changed(lambda view: radiance(view, 1e6), linear=True),
     "peak of 1e30": lambda: changed(lambda view: radiance(view, 1e30), linear=True),
 }
-
 
 LIGHTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "a texel of the light starts at 1e6": lambda raw: np.concatenate([[np.full_like(raw[0], 1e6)], raw[1:]]),

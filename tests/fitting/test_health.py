@@ -14,9 +14,8 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import LOSSES, Loss, register_loss
 from mi_refgs.methods.method import LossWeight, Method
 from mi_refgs.surfels.primitives.surfel import Surfel
-from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
-from tests.scenes.highlight import ball, run_folder, small_method, without
+from tests.scenes.highlight import ball, run_folder, set_rows, small_method, without
 
 
 @pytest.fixture
@@ -71,9 +70,7 @@ def test_bad_surfels_are_removed_and_the_fit_goes_on(name: str, value: float, me
     trainer = Trainer(replace(method, iterations=12), ball(), warn=said.append)
     assert trainer.statistics()["loss"] is None  # before the first step
     trainer.step()
-    raw = trainer.surfels.to_numpy()
-    raw[name][[3, 9], 0] = value
-    trainer.fit.tables[0].replace(Surfels.from_numpy(raw))
+    set_rows(trainer.fit.tables[0], name, ([3, 9], 0), value)
     trainer.train()
     assert "2 were removed" in said[0] and f"{name} not finite at surfels 3, 9" in said[0]
     assert trainer.iteration == 12 and np.isfinite(trainer.statistics()["loss"])

@@ -37,10 +37,10 @@ from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.surfels.attributes import sigmoid
-from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import refused
-from tests.scenes.highlight import require_same_state, step_to, without
+from tests.helpers import refused, unit
+from tests.scenes.highlight import require_same_state, set_rows, step_to, without
+from tests.scenes.splats import opaque
 from tests.scenes.tiny import METHOD, REGION, write_data, write_open_data
 
 STEPS = 12
@@ -100,9 +100,7 @@ def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None
 def test_points_keep_to_their_side(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SurroundingsOptions, "scattered", 0.0)
     rng = np.random.default_rng(1)
-    near, far = rng.normal(size=(2, 30, 3))
-    near *= 0.4 / np.linalg.norm(near, axis=1, keepdims=True)
-    far *= 3 / np.linalg.norm(far, axis=1, keepdims=True)
+    near, far = np.array([0.4, 3])[:, None, None] * unit(rng.normal(size=(2, 30, 3)))
     colour = np.concatenate([np.tile([1.0, 0, 0], (30, 1)), np.tile([0, 0, 1.0], (30, 1))])
     known = replace(data, points=PointCloud(np.concatenate([near, far]), colour))
     assert method.surroundings is not None
@@ -284,9 +282,7 @@ def test_surfels_without_weight_are_removed_from_their_own_table(
     """Transparent ones of the object and of the background have no weight in any view; others have."""
     trainer, hidden = Trainer(method, data), (np.arange(5), np.arange(20, 32))
     for table, rows in zip(trainer.fit.tables, hidden, strict=True):
-        raw = table.surfels.to_numpy()
-        raw["opacity"][rows] = -10
-        table.replace(Surfels.from_numpy(raw))
+        set_rows(table, "opacity", rows, -10)
     edit = Mock(wraps=densify_event.densify_and_prune)
     monkeypatch.setattr(densify_event, "densify_and_prune", edit)
     trainer.fit.iteration = 4
@@ -318,9 +314,7 @@ def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Meth
         full = replace(method.surfels, max_count=method.surfels.count)
         trainer = Trainer(replace(method, event={"densify": densify, **events}, surfels=full), data)
         table = trainer.fit.tables[0]
-        raw = table.surfels.to_numpy()
-        raw["opacity"][:5] = -10
-        table.replace(Surfels.from_numpy(raw))
+        set_rows(table, "opacity", slice(5), -10)
         trainer.fit.iteration = 4
         trainer.happen()
         opacity = table.surfels.raw["opacity"].numpy()
@@ -415,14 +409,10 @@ def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None
     """A wall behind a nearer wall has no weight; without the nearer one it has."""
     assert data.region is not None
     centre = np.array(data.region.centre)
-    towards = centre - data.views[0].to_world[:3, 3]
-    towards /= np.linalg.norm(towards)
+    towards = unit(centre - data.views[0].to_world[:3, 3])
 
     def wall(distance: float) -> Surfels:
-        options: Any = {"attributes": ["radiance_sh"], "opacity": 0.99, "rng": np.random.default_rng(0)}
-        raw = from_points((centre + distance * towards)[None], -towards[None], **options).to_numpy()
-        raw["scale"][:] = np.log(3.0)
-        return Surfels.from_numpy(raw)
+        return opaque((centre + distance * towards)[None], -towards[None], None, [3.0])
 
     far = Surroundings(wall(3.0), EnvironmentLight.constant(0.5, 8))
     behind = map_directions(8) @ towards > 0.95
@@ -434,9 +424,7 @@ def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None
 def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> None:
     said: list[str] = []
     trainer = Trainer(method, data, warn=said.append)
-    raw = trainer.fit.tables[1].surfels.to_numpy()
-    raw["opacity"][[3, 5]] = np.nan
-    trainer.fit.tables[1].replace(Surfels.from_numpy(raw))
+    set_rows(trainer.fit.tables[1], "opacity", [3, 5], np.nan)
     step_to(trainer, 2).check()
     assert trainer.fit.tables[1].surfels.count == 58 and trainer.surfels.count == 80
     assert "surroundings/opacity" in said[0]

@@ -12,6 +12,7 @@ from benchmarks.stability.cases import Case, catalogue, plain
 from benchmarks.stability.measure import GRADIENTS, IMAGE_LIMIT, Row, measure
 from mi_refgs.reference import image as oracle
 from mi_refgs.surfels.primitives.surfel import FootprintAdjoint
+from tests.helpers import slow
 
 CASES = [case for case in catalogue() if case.quick]
 ILL_CONDITIONED = {
@@ -26,11 +27,7 @@ ILL_CONDITIONED = {
 """What may miss the limits, and then only by what one unit in the last place of the inputs explains."""
 
 
-@pytest.mark.parametrize(
-    "case",
-    [*CASES[::2], *(pytest.param(case, marks=pytest.mark.slow) for case in CASES[1::2])],
-    ids=lambda case: case.name,
-)
+@pytest.mark.parametrize("case", [*CASES[::2], *map(slow, CASES[1::2])], ids=lambda case: case.name)
 def test_case(case: Case) -> None:
     row = measure(case, floors=False)
     assert row.verdict == "within limits" or case.name in ILL_CONDITIONED, row

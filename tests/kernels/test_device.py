@@ -13,7 +13,7 @@ import mi_refgs
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload, upload_tensor
 from tests.helpers import run_python
-from tests.scenes.integrator import raw_channels
+from tests.scenes.integrator import raw_channels, wall
 
 
 @pytest.mark.parametrize("offset", [0, 1])
@@ -45,7 +45,7 @@ UNUSABLE: dict[str, Callable[[], object]] = {
     "a tensor": lambda: upload_tensor(np.zeros((3, 2))),
     "surfels": lambda: mi_refgs.Surfels.from_numpy(raw_channels()),
     "a light": lambda: mi_refgs.EnvironmentLight.constant(),
-    "a mesh": lambda: mi_refgs.Occluder(tetrahedron()),
+    "a mesh": lambda: mi_refgs.Occluder(wall()),
     "points": lambda: mi_refgs.from_points(np.zeros((3, 3)), np.zeros((3, 3)), rng=np.random.default_rng()),
     "a PLY file": lambda: mi_refgs.import_splats("some.ply"),
     "a run": lambda: mi_refgs.load("some"),
@@ -53,11 +53,6 @@ UNUSABLE: dict[str, Callable[[], object]] = {
     "a plugin": lambda: mi.load_dict({"type": "refgs", "filename": "some.ply"}),
     "a material": lambda: mi.load_dict({"type": "refgs_bsdf"}),
 }
-
-
-def tetrahedron() -> mi_refgs.Mesh:
-    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]], np.uint32)
-    return mi_refgs.Mesh(np.vstack([np.zeros(3), np.eye(3)]).astype(np.float32), faces, 0.1)
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])

@@ -23,7 +23,6 @@ COUNT, WIDTH, HEIGHT, FOCAL = 40, 24, 16, 26.0
 LIGHT_ROWS = 16
 SHADINGS = (Shading(), Shading(at="surfel", diffuse="irradiance"))  # both orders, both diffuse terms
 
-
 Raw = dict[str, np.ndarray]
 
 
@@ -46,7 +45,9 @@ class View:
         fov = float(2 * np.degrees(np.arctan(self.width / 2 / FOCAL)))
         return scenes.sensor(fov=fov, to_world=mi.ScalarTransform4f(self.to_world), film=film)
 
-    def moved(self, matrix: np.ndarray) -> "View":
+    def turned(self, turn: Rotation) -> "View":
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn.as_matrix()
         return replace(self, to_world=matrix @ self.to_world)
 
 
@@ -144,8 +145,6 @@ def differing(a: dict[str, np.ndarray], b: dict[str, np.ndarray], tolerance: flo
 
 
 def rotated(scene: Scene, turn: Rotation) -> Scene:
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn.as_matrix()
     position = turn.apply(scene.raw["position"])
     rotation = (turn * Rotation.from_quat(scene.raw["rotation"])).as_quat()
-    return replace(scene.changed(position=position, rotation=rotation), view=scene.view.moved(matrix))
+    return replace(scene.changed(position=position, rotation=rotation), view=scene.view.turned(turn))

@@ -68,8 +68,7 @@ def mesh() -> Mesh:
     ball = trimesh.creation.icosphere(subdivisions=1)
     wall = trimesh.creation.box((0.2, 4, 4))
     wall.apply_translation((1.3, -2.2, 0))
-    both: Any = trimesh.util.concatenate([ball, wall])
-    return Mesh(np.array(both.vertices, np.float32), np.array(both.faces, np.uint32), 0.02)
+    return scenes.joined(0.02, ball, wall)
 
 
 def radiance(case: Case) -> np.ndarray:

@@ -15,13 +15,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from mi_refgs.render.pipeline import SurfelScene, render
-from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.attributes import attribute
 from tests.gradients import differentiable
-from tests.scenes.integrator import hollow_mesh, integrator, lit_scene, raw_channels, sensor, sky
+from tests.helpers import slow
+from tests.scenes import integrator as scenes
+from tests.scenes.integrator import background_light, hollow_mesh, lit_scene, raw_channels, sensor, sky
 
 TOLERANCE = 1e-5  # relative to the largest entry of the sum, per parameter: sums by scatter are in any order
 COUNT = 400  # surfels: enough that two threads share the work on them
@@ -46,18 +47,15 @@ def model_scene(model: str, diffuse: str = "sh", gaussians: bool = False, **chan
     if "mesh" in changes and "traced_bounces" not in changes:
         raw["indirect_sh"] = raw_channels(COUNT)["indirect_sh"]
     chosen = {"reflectance": model, "diffuse": diffuse, **changes}
-    inner = integrator(raw, aovs="a:alpha,d:depth,n:normal,s:diffuse", **chosen)
-    if MODELS[model].light == "none":
-        del inner["light"]
-    return mi.load_dict({"type": "scene", "integrator": inner, "sensor": sensor()})
+    lit = {"light": None} if MODELS[model].light == "none" else {}
+    return scenes.scene(raw=raw, aovs="a:alpha,d:depth,n:normal,s:diffuse", **chosen, **lit)
 
 
 def open_scene(**changes: Any) -> Any:
     far = every_channel("radiance", "sh", False)
     far["position"] = 1.7 * far["position"]
     around = {AROUND + name: mi.TensorXf(values) for name, values in far.items()}
-    background = EnvironmentLight.from_radiance(0.3 + sky(16)).raw
-    return model_scene("split_sum", background=background, **around, **changes)
+    return model_scene("split_sum", background=background_light().raw, **around, **changes)
 
 
 def lit(emitter: dict[str, Any]) -> Any:
@@ -217,12 +215,8 @@ class Losses:
         return {name: self.gradient(name) for name in self.terms}
 
 
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=() if name in SAMPLE else pytest.mark.slow) for name in SCENES],
-)
+@pytest.fixture(scope="module", params=[name if name in SAMPLE else slow(name) for name in SCENES])
 def losses(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Losses:
-    mi.set_variant("llvm_ad_rgb")
     scene = SCENES[request.param](tmp_path_factory.mktemp("scene"))
     # Mitsuba's texels of a map that is resampled have no derivative, and say so.
     return Losses(scene, [key for key in trained(scene) if (key, request.param) != RESAMPLED])
@@ -239,7 +233,7 @@ def check_additive(losses: Losses, alone: dict[str, Any], orders: list[tuple[str
             assert not wrong, f"{key}: {', then '.join(order)}: off by {error:.1e}, gradients {sizes}"
 
 
-@pytest.mark.parametrize("threads", [2, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("threads", [2, slow(1)])
 def test_gradients_of_losses_add(losses: Losses, threads: int, set_threads: Callable[[int], None]) -> None:
     """In two orders, in which each loss comes before each other one."""
     set_threads(threads)

@@ -152,11 +152,7 @@ def test_units_do_not_matter(shading: Shading, scene: Scene, decades: float) -> 
 @given(scene=SCENES, seed=SEEDS)
 def test_view_does_not_depend_on_other_views(shading: Shading, scene: Scene, seed: int) -> None:
     """Gradients of views one by one add up to those of a set, and an image is the same in any set."""
-    views = [scene.view]
-    for turn in Rotation.random(2, random_state=seed):
-        matrix = np.eye(4)
-        matrix[:3, :3] = turn.as_matrix()
-        views.append(scene.view.moved(matrix))
+    views = [scene.view, *map(scene.view.turned, Rotation.random(2, random_state=seed))]
     alone = draw(scene, shading)
     parts = [gradients(scene, shading, seed, (view,)) for view in views]
     together = gradients(scene, shading, seed, tuple(views))

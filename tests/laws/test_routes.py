@@ -35,14 +35,9 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
+from mi_refgs.viewer import reconstruction_view
 from mi_refgs.viewer.pose import Pose
-from mi_refgs.viewer.reconstruction_view import (
-    BACKGROUND,
-    IMAGE,
-    DisplayOptions,
-    ReconstructionView,
-    planes_of,
-)
+from mi_refgs.viewer.reconstruction_view import BACKGROUND, IMAGE, DisplayOptions, ReconstructionView
 from tests.helpers import read_exr
 from tests.laws.covering import covering_array, marked
 from tests.laws.option_scenes import xml
@@ -185,7 +180,8 @@ def by_viewer_of_a_run(case: Case) -> Maps:
         if case.samples == 1:
             planes = drawable.draw(camera, look, True)
         else:
-            planes = planes_of(drawable.fine(camera, look, case.samples), camera, look, None)
+            fine = drawable.fine(camera, look, case.samples)
+            planes = reconstruction_view.planes_of(fine, camera, look, None)
         values = planes if what == IMAGE else values_of_planes(what, planes)
         found[what] = image_array(values, HEIGHT, WIDTH)
     return case.of_whole(found)

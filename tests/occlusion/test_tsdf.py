@@ -23,16 +23,13 @@ BOX = (np.full(3, -1.25), np.full(3, 1.25))
 SHAPES = {"sphere": ref.sphere((0, 0, 0), 1), "torus": ref.torus(0.8, 0.3)}
 
 
-def directions(count: int) -> np.ndarray:
-    """Fibonacci points on the unit sphere."""
+def ring_of_views(count: int) -> list[np.ndarray]:
+    """Poses at Fibonacci points on a sphere."""
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (1 + 5**0.5)
     r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
-
-
-def ring_of_views(where: np.ndarray) -> list[np.ndarray]:
-    return [look_at(4.0 * d, np.zeros(3)) for d in where]
+    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+    return [look_at(4.0 * d, np.zeros(3)) for d in directions]
 
 
 def camera(pose: np.ndarray) -> Camera:
@@ -54,7 +51,7 @@ def as_trimesh(mesh: meshes.Mesh) -> trimesh.Trimesh:
 def test_surface_is_closed_outward_and_within_a_voxel(name: str) -> None:
     """Both directions of the Hausdorff distance, so that neither extra nor missing surface passes."""
     shape = SHAPES[name]
-    poses = ring_of_views(directions(12))
+    poses = ring_of_views(12)
     depths = [ref.depth_map(shape, p, FOCAL, SIZE) for p in poses]
     fused = fuse(depths, poses)
     mesh = meshes.extract_mesh(fused)
@@ -76,7 +73,7 @@ def test_surface_is_closed_outward_and_within_a_voxel(name: str) -> None:
 def test_matches_the_float64_specification() -> None:
     """Two objects, one hiding the other, a view with a hole in it, and one that sees only part of the box."""
     shape = ref.union(ref.sphere((0.2, 0, 0.3), 0.6), ref.box((0, 0.1, -0.7), (0.9, 0.8, 0.15)))
-    poses = ring_of_views(directions(9)[1:])
+    poses = ring_of_views(9)[1:]
     poses[3][:3, 3] += np.array([1.5, 0.5, 0])
     depths = [ref.depth_map(shape, p, FOCAL, SIZE) for p in poses]
     depths[2][40:50, 40:50] = 0
@@ -95,7 +92,7 @@ def test_matches_the_float64_specification() -> None:
 
 def test_one_leaking_view_drills_no_tunnel() -> None:
     """A hole in the alpha of one of 24 views would otherwise carve through the whole object."""
-    poses = ring_of_views(directions(24))
+    poses = ring_of_views(24)
     depths = [ref.depth_map(SHAPES["sphere"], p, FOCAL, SIZE) for p in poses]
     depths[5][44:52, 44:52] = 0
     fused = fuse(depths, poses)
@@ -134,7 +131,7 @@ def test_objects_cut_by_the_box_get_a_lid() -> None:
 
 def test_nothing_seen_is_an_empty_mesh() -> None:
     """All-background, NaN depth, and no views at all."""
-    poses = ring_of_views(directions(2))
+    poses = ring_of_views(2)
     for value in (0.0, np.nan, np.inf):
         depth, alpha = (dr.full(mi.Float, x, SIZE * SIZE) for x in (value, 1.0 if value else 0.0))
         fused = tsdf.fuse([depth] * 2, [alpha] * 2, [camera(p) for p in poses], BOX, 16)
@@ -145,7 +142,7 @@ def test_nothing_seen_is_an_empty_mesh() -> None:
 
 def test_all_views_share_one_kernel() -> None:
     """Other poses, image sizes, boxes and views compile nothing; generators are read once."""
-    pose = ring_of_views(directions(7))
+    pose = ring_of_views(7)
 
     def views(size: int, count: int) -> Iterator[Camera]:
         for p in pose[:count]:

@@ -13,6 +13,7 @@ from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import occlusion as ref
 from tests.helpers import unit, vector
+from tests.scenes.integrator import joined
 
 GRID = 64
 HALF = 1.3
@@ -48,10 +49,6 @@ def mirror_rays(shape: ref.Shape, count: int) -> tuple[np.ndarray, np.ndarray, n
     return point[facing], normal[facing], (view - 2 * cosine * normal)[facing]
 
 
-def point3(x: np.ndarray) -> "mi.Point3f":
-    return mi.Point3f(np.ascontiguousarray(x.T, np.float32))
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_mirror_rays_against_the_true_shape(name: str) -> None:
     """Points up to half a voxel off the surface, either side, noisy mesh: few false or missed occlusions."""
@@ -61,7 +58,7 @@ def test_mirror_rays_against_the_true_shape(name: str) -> None:
     point, normal, mirror = mirror_rays(shape, 30000)
     truth = ref.visible(shape, point, mirror, 1e-4)
     shift = np.random.default_rng(6).uniform(-0.5, 0.5, (len(point), 1)) * mesh.voxel
-    answer = occluder.visible(point3(point + shift * normal), vector(mirror), vector(normal))
+    answer = occluder.visible(mi.Point3f(vector(point + shift * normal)), vector(mirror), vector(normal))
     seen = np.array(answer) == 1
     grazing = np.sum(mirror * normal, axis=1) < 0.2
     false_occlusion, missed = np.mean(truth & ~seen), np.mean(~truth & seen)
@@ -77,7 +74,7 @@ def test_offset_is_what_prevents_self_occlusion(monkeypatch: pytest.MonkeyPatch)
     mesh = extracted(shape)
     occluder = Occluder(mesh)
     point, normal, mirror = mirror_rays(shape, 2000)
-    args = point3(point - mesh.voxel * normal), vector(mirror), vector(normal)
+    args = mi.Point3f(vector(point - mesh.voxel * normal)), vector(mirror), vector(normal)
     assert dr.all(occluder.visible(*args) == 1)
     steep = np.sum(mirror * normal, axis=1) > 0.6
     assert np.array(occluder.visible(args[0], args[1]))[steep].all()
@@ -102,9 +99,7 @@ def test_updates_in_place_compile_nothing() -> None:
     origin, direction = mi.Point3f(0, 0, [-5, -5, 5]), mi.Vector3f(0, 0, [1, -1, 1])
 
     def answer(radius: float, level: int) -> list[float]:
-        ball = trimesh.creation.icosphere(level, radius)
-        vertices, faces = np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32)
-        occluder.update(Mesh(vertices, faces, 0.1 * radius))
+        occluder.update(joined(0.1 * radius, trimesh.creation.icosphere(level, radius)))
         return np.array(occluder.visible(origin, direction, direction)).tolist()
 
     assert answer(1.0, 2) == [0, 1, 1]

@@ -22,8 +22,6 @@ from mi_refgs.io.files import resource_dir
 from tests.helpers import ROOT, imported_packages, run_process
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-
-
 LEFT_OUT = {".git", ".venv", "runs", "data", "site", "build", "dist"}
 """Folders of a checkout that are no part of the project."""
 

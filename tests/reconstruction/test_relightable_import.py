@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -21,23 +20,15 @@ from mi_refgs.formats.orbits import shots_around
 from mi_refgs.io.images import read_png, straight_srgb
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.reconstruction import relightable_import
-from tests.helpers import refused
+from tests.helpers import contents, refused
+from tests.scenes import splat_file
 from tests.scenes.layouts import ply_bytes
-from tests.scenes.splat_file import (
-    PRESET,
-    RADIUS,
-    SIZE,
-    VIEWS,
-    ball_columns,
-    render_few_views,
-    write_ball,
-    write_long_method,
-)
+from tests.scenes.splat_file import PRESET, RADIUS, SIZE, VIEWS, ball_columns, write_ball
 
 
 @pytest.fixture(autouse=True)
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    render_few_views(monkeypatch)
+    splat_file.render_few_views(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -47,23 +38,17 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_long_method(tmp_path_factory.mktemp("method"))
+    return splat_file.write_long_method(tmp_path_factory.mktemp("method"))
 
 
 @pytest.fixture(scope="module")
 def imported(ball: Path, method: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A relightable import; do not change it."""
     run = tmp_path_factory.mktemp("runs") / "run"
-    mi.set_variant("llvm_ad_rgb")
     with pytest.MonkeyPatch.context() as patch:
-        render_few_views(patch)
+        splat_file.render_few_views(patch)
         mi_refgs.import_relightable(ball, run, method=method, preset=PRESET, progress=Progress())
     return run
-
-
-def tree(folder: Path) -> dict[Path, bytes]:
-    files = (path for path in folder.rglob("*.*") if path.is_file() and path.suffix)
-    return {path.relative_to(folder): path.read_bytes() for path in files}
 
 
 def test_views_are_the_images_of_the_file(imported: Path, ball: Path) -> None:
@@ -140,7 +125,7 @@ def test_command_writes_the_same_views_and_fits_the_method_for_relighting(
     monkeypatch.setattr(methods, "for_purpose", for_purpose)
     argv = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET]
     assert main(argv) == 0
-    assert tree(run / "data") == tree(imported / "data")
+    assert contents(run / "data") == contents(imported / "data")
     for_purpose.assert_called_once_with("relighting")
 
 

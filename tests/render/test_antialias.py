@@ -10,21 +10,15 @@ import numpy as np
 import pytest
 
 from mi_refgs.kernels.device import upload
-from mi_refgs.reference.camera import look_at
 from mi_refgs.reference.image import bilinear_map
 from mi_refgs.render.antialias import averaged
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.shading import Shading
-from mi_refgs.splat import Camera
 from tests.helpers import refused
+from tests.scenes.splats import seen_from
 
 WIDTH, HEIGHT = 9, 7
 NODES = np.polynomial.legendre.leggauss(2)[0] / 2  # the Gauss-Legendre rule's two, pixels from the centre
-
-
-def camera(size: int, focal: float) -> Camera:
-    pose = look_at(np.array([0.0, 0.3, 3.0]), np.zeros(3), up=(0, 1, 0))
-    return Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose)
 
 
 @pytest.fixture
@@ -48,7 +42,7 @@ def radiance(points: ShadingPoints) -> RadianceTerms:
 
 
 def found(normal: list[mi.Float], alpha: mi.Float, seen: mi.Float, interpolate: bool = True) -> mi.Color3f:
-    view = replace(camera(WIDTH, 8.0), height=HEIGHT)
+    view = replace(seen_from(0.0, 0.3, 3.0, size=WIDTH), height=HEIGHT)
     points = ShadingPoints(mi.Vector3f(*normal), -dr.normalize(view.rays()), visibility=seen)
     return averaged(radiance, points, alpha, view, None, interpolate).specular
 
@@ -75,7 +69,7 @@ def test_interpolation_against_the_reference(maps: dict[str, np.ndarray]) -> Non
 
 def test_points_integrate_cubic_radiance_exactly() -> None:
     """With x in pixels, the mean of x² over a pixel is that at its centre and 1/12 more."""
-    view = camera(5, 4.0)
+    view = seen_from(0.0, 0.3, 3.0, size=5, focal=4.0)
     rays, alpha = view.rays(), dr.ones(mi.Float, 25)
 
     def cubic(points: ShadingPoints) -> RadianceTerms:

@@ -44,15 +44,11 @@ def test_derivatives_of_open_scene_are_those_of_float64(case: tuple[str, str, fl
     start = np.linalg.inv(moved_pose(np.eye(4), MOTION.astype(np.float64))) @ pair.case.camera.to_world
     eye = exact.fast_camera(pair.case).moved(start)
 
-    def define(at: np.ndarray) -> float:
-        maps, _ = pair.truth(pair.values, moved_pose(start, at))
-        return sum(float(np.sum(w * maps[key])) for key, w in pair.weights.items())
-
     def total(leaf: mi.Float) -> mi.Float:
         params = {name: upload_tensor(x) for name, x in pair.values.items()}
         return weighted(pair.planes(params, displaced(eye, leaf)), pair.weights)
 
-    require_slopes(total, define, MOTION)
+    require_slopes(total, lambda at: pair.loss(pair.values, moved_pose(start, at)), MOTION)
 
 
 def test_normals_of_depth_turn_with_camera() -> None:

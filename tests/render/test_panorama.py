@@ -7,27 +7,16 @@ from mi_refgs.render.panorama import panorama
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
-from mi_refgs.surfels import init
-from mi_refgs.surfels.table import Surfels
+from tests.scenes.splats import opaque
 
 CENTRE = np.array([0.3, -0.2, 0.5])
 HEIGHT = 32
 
 
-def discs(points: np.ndarray, normals: np.ndarray, colours: np.ndarray, sizes: list[float]) -> Surfels:
-    """Opaque discs with one colour each."""
-    made = init.from_points(
-        points, normals, colours, rng=np.random.default_rng(0), attributes=["radiance_sh"], opacity=0.99
-    )
-    raw = made.to_numpy()
-    raw["scale"][:] = np.log(sizes)[:, None]
-    return Surfels.from_numpy(raw)
-
-
 def test_background_map_is_seen_as_it_is() -> None:
     """In the orientation of `EnvironmentLight`, wherever the centre is; nothing is near."""
     wave = 0.5 + 0.3 * map_directions(HEIGHT)
-    far = discs(np.array([[0.0, 0.0, -900.0]]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)), [1e-3])
+    far = opaque(np.array([[0.0, 0.0, -900.0]]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)), [1e-3])
     seen = panorama(Surroundings(far, EnvironmentLight.from_radiance(wave)), CENTRE, HEIGHT, 0.01)
     np.testing.assert_allclose(seen.radiance, wave, atol=0.02)  # the far disc is a part of a pixel
     assert not seen.nearness.any()
@@ -41,7 +30,7 @@ def test_surfels_have_their_radiance_and_distance(axis: int, sign: int) -> None:
     towards = sign * np.eye(3)[axis]
     colour = np.array([[0.2, 0.5, 0.8]])
     points, normals = CENTRE + np.outer([0.5, 2], towards), -np.stack([towards, towards])
-    both = discs(points, normals, np.concatenate([0 * colour, colour]), [0.05, 9.0])  # one nearer
+    both = opaque(points, normals, np.concatenate([0 * colour, colour]), [0.05, 9.0])  # one nearer
     seen = panorama(Surroundings(both), CENTRE, HEIGHT, 1.0)
     directions = map_directions(HEIGHT)
     central = directions @ towards > 0.9
@@ -54,15 +43,11 @@ def test_surfels_have_their_radiance_and_distance(axis: int, sign: int) -> None:
 def test_large_gaussians_nearby_do_not_cover_all_directions() -> None:
     """Beside one of half its distance's size, small ones all around keep their colours."""
     directions = map_directions(12)[1:-1].reshape(-1, 3)
-    rng, colour = np.random.default_rng(0), np.array([0.2, 0.5, 0.8])
+    colour, sizes = np.array([0.2, 0.5, 0.8]), [*[0.7] * len(directions), 0.25]
     beside = directions[[40]]
     colours = np.concatenate([np.broadcast_to(colour, directions.shape), [[1.0, 0.0, 0.0]]])
     directions = np.concatenate([directions, beside])
     points = CENTRE + np.append(np.full(len(directions) - 1, 4.0), 0.5)[:, None] * directions
-    how = {"attributes": ["radiance_sh"], "opacity": 0.99, "primitive": "gaussian"}
-    made = init.from_points(points, -directions, colours, rng=rng, **how)  # type: ignore[arg-type]
-    raw = made.to_numpy()
-    raw["scale"][:] = np.log(0.7)
-    raw["scale"][-1] = np.log(0.25)
-    seen = panorama(Surroundings(Surfels.from_numpy(raw)), CENTRE, HEIGHT, 0.1)
+    cloud = opaque(points, -directions, colours, sizes, "gaussian")
+    seen = panorama(Surroundings(cloud), CENTRE, HEIGHT, 0.1)
     np.testing.assert_allclose(seen.radiance, np.broadcast_to(colour, seen.radiance.shape), atol=0.03)

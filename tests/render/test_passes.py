@@ -18,7 +18,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import arrays_of
+from tests.helpers import arrays_of, slow
 from tests.scenes import integrator as scenes
 
 FEW = 512  # samples of a pass in these tests: two rows of pixels or more of 4 × 4 samples
@@ -76,9 +76,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film, "DERIVATIVE_SAMPLES", FEW)
 
 
-@pytest.mark.parametrize(
-    "kind", ["open", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("surfel", "antialias"))]
-)
+@pytest.mark.parametrize("kind", ["open", slow("surfel"), slow("antialias")])
 def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,18 +20,13 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.scenes import splats
 from tests.scenes.integrator import HEIGHT, WIDTH, raw_channels
+from tests.scenes.splats import seen_from
 
 COLOUR = Shading(at="surfel", reflectance="radiance")
 
 
 def discs(**channels: Any) -> Surfels:
     return Surfels.from_numpy(splats.discs(**channels))
-
-
-def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:
-    """A camera of size × size pixels that looks at the origin."""
-    pose = look_at(np.array(origin), np.zeros(3), up=(0, 1, 0))
-    return Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose)
 
 
 def channel(frame: Frame, name: str) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -12,6 +13,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import Run
+from mi_refgs.surfels.table import Surfels
 
 SIZE = 24
 METHOD = """
@@ -70,9 +72,9 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
     return ball_data(size, focal, ((direction, colour) for direction in outward))
 
 
-def small_method(folder: Path) -> Method:
+def small_method(folder: Path, text: str = METHOD) -> Method:
     path = folder / "small.toml"
-    path.write_text(METHOD)
+    path.write_text(text)
     return load_resolved(path)
 
 
@@ -94,6 +96,13 @@ def step_to(trainer: Trainer, iteration: int) -> Trainer:
         trainer.step()
     dr.sync_thread()
     return trainer
+
+
+def set_rows(table: Any, name: str, rows: Any, value: float) -> None:
+    """Give rows of a table of a fit another raw value."""
+    raw = table.surfels.to_numpy()
+    raw[name][rows] = value
+    table.replace(Surfels.from_numpy(raw))
 
 
 def require_same_state(expected: Trainer, found: Trainer) -> dict[str, np.ndarray]:

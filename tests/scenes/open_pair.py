@@ -71,6 +71,11 @@ class Pair:
         image = oracle.render(replace(scene, around=others, background=values["background"]))
         return image.maps, image.band
 
+    def loss(self, values: dict[str, np.ndarray], pose: np.ndarray | None = None) -> float:
+        """The weighted sum of the maps in float64."""
+        maps, _ = self.truth(values, pose)
+        return sum(float(np.sum(w * maps[name])) for name, w in self.weights.items())
+
     @cached_property
     def weights(self) -> dict[str, np.ndarray]:
         """Random numbers for each value of each map, 0 near a declared discontinuity."""

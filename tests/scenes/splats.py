@@ -11,6 +11,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.reference import splat as reference
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat import Camera, Composited, splat
+from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 
 MAX_LEFT_OUT = 0.05  # share of the covered pixels that may lie in the band around declared discontinuities
@@ -110,6 +111,22 @@ def discs(**channels: Any) -> dict[str, Any]:
         "radiance_sh": np.zeros((count, 3)),
     }
     return raw | channels
+
+
+def opaque(
+    points: np.ndarray, normals: np.ndarray, colours: Any, sizes: list[float], primitive: str = "surfel"
+) -> Surfels:
+    """Surfels, or Gaussians, of these sizes that nearly hide what lies behind, with one colour each."""
+    options: dict[str, Any] = {"attributes": ["radiance_sh"], "opacity": 0.99, "primitive": primitive}
+    raw = from_points(points, normals, colours, rng=np.random.default_rng(0), **options).to_numpy()
+    raw["scale"][:] = np.log(sizes)[:, None]
+    return Surfels.from_numpy(raw)
+
+
+def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:
+    """A camera of size × size pixels that looks at the origin."""
+    pose = look_at(np.array(origin), np.zeros(3), up=(0, 1, 0))
+    return Camera.from_pose(size, size, -focal, -focal, size / 2, size / 2, pose)
 
 
 def quaternion_to(normal: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.latlong import environment_image
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.shade.light.lobe_matrices import map_directions
-from tests.helpers import refused
+from tests.helpers import refused, unit
 
 Captured = pytest.CaptureFixture[str]
 SIZE = 32  # pixels of a face
@@ -30,8 +30,7 @@ HALF = np.float16
 
 def marked(direction: Any) -> np.ndarray:
     """Radiance of one place by direction in Mitsuba's frame: each axis has a colour of its own."""
-    unit = np.stack(np.broadcast_arrays(*direction), -1)
-    return np.asarray(0.5 + 0.4 * unit / np.linalg.norm(unit, axis=-1, keepdims=True), np.float32)
+    return np.asarray(0.5 + 0.4 * unit(np.stack(np.broadcast_arrays(*direction), -1)), np.float32)
 
 
 def faces() -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refgs.surfels.attributes import ATTRIBUTES
-from tests.helpers import ROOT, run_python
+from tests.helpers import ROOT, run_python, slow
 from tests.scenes.integrator import COUNT, lit_scene, plane_mesh, raw_channels, scene, sky
 
 BAD = (np.nan, np.inf, -np.inf, 1e38, -1e38)
@@ -59,11 +59,10 @@ KINDS: dict[str, dict[str, Any]] = {
     "pixel": {},
     "mesh": {"traced_bounces": 0},
 }
-SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("pixel", "mesh")]
 
 
 @pytest.mark.filterwarnings("ignore:refgs:RuntimeWarning")
-@pytest.mark.parametrize("kind", ["surfel", "bounces", *SLOW])
+@pytest.mark.parametrize("kind", ["surfel", "bounces", slow("pixel"), slow("mesh")])
 def test_surfel_with_unusable_value_is_ignored(kind: str, tmp_path: Path) -> None:
     raw = raw_channels()
     mesh: Any = {"mesh": plane_mesh(tmp_path)} if "traced_bounces" in KINDS[kind] else {}

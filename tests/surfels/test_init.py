@@ -10,6 +10,7 @@ from scipy.stats import kstest
 from mi_refgs.errors import InputError
 from mi_refgs.surfels import init
 from mi_refgs.surfels.attributes import SH_DC, Attribute, sigmoid
+from tests.helpers import unit
 
 
 def test_from_points(rng: np.random.Generator) -> None:
@@ -19,9 +20,7 @@ def test_from_points(rng: np.random.Generator) -> None:
     degree = {"radiance_sh": 1}
     surfels = init.from_points(points, normals, colours, rng=rng, degree=degree, opacity=0.2, roughness=0.3)
     surfels.validate()
-    np.testing.assert_allclose(
-        np.array(surfels.frame()[2]).T, normals / np.linalg.norm(normals, axis=1)[:, None], atol=1e-6
-    )
+    np.testing.assert_allclose(np.array(surfels.frame()[2]).T, unit(normals), atol=1e-6)
     squared = np.sort(np.sum((points[:, None] - points[None]) ** 2, axis=-1), axis=1)[:, 1:4]
     np.testing.assert_allclose(np.array(surfels.scale())[0], np.sqrt(squared.mean(axis=1)), rtol=1e-5)
     constant = np.array(surfels.value("radiance_sh")[0]).T

@@ -24,7 +24,6 @@ from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.kernels.device import upload, upload_tensor
-from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import GAIN, LOSS_WEIGHTS, POSE, DataOptions, Method
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.display import displayed, image_array
@@ -368,10 +367,8 @@ def pose_errors(trainer: Trainer, true: np.ndarray) -> tuple[float, float]:
 
 def test_disturbed_cameras_are_recovered(tmp_path: Path, rng: np.random.Generator) -> None:
     """0.5° and 0.5 % of the distance, together with discs that learn, too."""
-    path = tmp_path / "radiance.toml"
-    path.write_text(RADIANCE)
     data, surfels, true = disturbed_discs(rng)
-    trainer = Trainer(load_resolved(path), data)
+    trainer = Trainer(small_method(tmp_path, RADIANCE), data)
     trainer.fit.tables[0].replace(surfels, tuple(surfels.raw))
     before = pose_errors(trainer, true)
     after = pose_errors(step_to(trainer, trainer.method.iterations), true)
@@ -394,12 +391,12 @@ def test_averaged_images_align(rng: np.random.Generator, monkeypatch: pytest.Mon
 
 def test_exact_cameras_stay(tmp_path: Path, rng: np.random.Generator) -> None:
     """The images of exact surfels, from poses 0.05 pixels off."""
-    path, said = tmp_path / "radiance.toml", list[str]()
-    path.write_text(RADIANCE)
+    said = list[str]()
     data, surfels, true = disturbed_discs(rng)
     nearly = [0.95 * pose + 0.05 * view.to_world for view, pose in zip(data.views, true, strict=True)]
     views = [replace(view, to_world=pose) for view, pose in zip(data.views, nearly, strict=True)]
-    trainer = Trainer(load_resolved(path), replace(data, views=tuple(views)), tell=said.append)
+    method = small_method(tmp_path, RADIANCE)
+    trainer = Trainer(method, replace(data, views=tuple(views)), tell=said.append)
     trainer.fit.tables[0].replace(surfels, tuple(surfels.raw))
     step_to(trainer, 3)
     assert POSE not in trainer.fit.params

@@ -8,7 +8,7 @@ import pytest
 from mi_refgs.fitting.events.resets import OPACITY
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.surfels.attributes import sigmoid
-from tests.scenes.highlight import ball, small_method, step_to
+from tests.scenes.highlight import ball, set_rows, small_method, step_to
 
 
 @pytest.fixture
@@ -37,9 +37,7 @@ def changed(trainer: Trainer, event: str, iteration: int) -> tuple[set[str], dic
 
 
 def test_reset_lowers_opacity_and_lifts_metallic_only(trainer: Trainer) -> None:
-    raw = trainer.surfels.to_numpy()
-    raw["metallic"][:40] = -5
-    trainer.fit.tables[0].replace(type(trainer.surfels).from_numpy(raw))
+    set_rows(trainer.fit.tables[0], "metallic", slice(40), -5)
     moved, found = changed(trainer, "reset_opacity", 14)
     assert moved == {"opacity", "metallic"}
     np.testing.assert_allclose(found["opacity"], OPACITY, rtol=1e-5)
