@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -212,7 +212,7 @@ def renderer(
     fitted: TrainedScene, truth: Truth, case: Case, samples: int, scale: np.ndarray
 ) -> Callable[[Camera], Frame]:
     """As `TrainedScene.renderer`, with a light scaled per channel (3,)."""
-    true, given = case.true, fitted.shading.settings()
+    true, given = case.true, asdict(fitted.shading)
     if case.bounces is not None:
         given["traced_bounces"] = case.bounces
     lit = given | {"diffuse": "irradiance", "ambient_rays": RAYS}

@@ -16,7 +16,7 @@ from benchmarks.common.setup import ALBEDO, Setup, path_tracer
 from benchmarks.common.view import BUILT_IN, ROOT, Light, Look, Points
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.reflectance.split_sum import shade
+from mi_refgs.shade.reflectance.split_sum import SplitSum
 
 MESHES = ROOT / "scenes" / "meshes"
 
@@ -88,7 +88,7 @@ FULL_DEPTH = 8
 def split_sum(points: Points, material: dict[str, Any], light: Any, dominant: bool = False) -> Any:
     """Outgoing radiance (mi.Color3f) as the product shades it."""
     options = ShadingOptions(diffuse="irradiance", dominant=dominant)
-    return shade(ShadingPoints(points.normal, points.view, **material), light, options).total()
+    return SplitSum().shade(ShadingPoints(points.normal, points.view, **material), light, options).total()
 
 
 @dataclass(frozen=True)

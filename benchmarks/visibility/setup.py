@@ -19,7 +19,7 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.pipeline import SurfelScene, render
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance import TraceContext
-from mi_refgs.shade.reflectance.split_sum import shade
+from mi_refgs.shade.reflectance.split_sum import SplitSum
 from mi_refgs.shade.reflection import reflection
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
@@ -77,7 +77,7 @@ class Setup(setup.Setup):
         at = self.seen(self.points, rule)
         if indirect is not None:
             at = at.replaced(indirect=mi.Color3f(np.ascontiguousarray(indirect.T, np.float32)))
-        shaded = shade(at, self.light, rule.options())
+        shaded = SplitSum().shade(at, self.light, rule.options())
         return rows(shaded.total())
 
     def reference(self, depth: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.view import View
 from mi_refgs.evaluation.metrics import environment
 from mi_refgs.fitting.image_error import displayed_image
+from mi_refgs.io.exr import LUMINANCE
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.render.display import image_array
 from mi_refgs.render.pipeline import Frame
@@ -26,7 +27,6 @@ CELL_MIN = 128  # pixels: smaller images are enlarged by a whole factor
 MARGIN = 4  # pixels between images
 TITLE_MIN, TITLE_MAX, TITLE_PART = 10, 22, 14  # heights of titles, pixels, and widths of images per height
 BESIDE_GREYS = np.array([0.80, 0.87, 0.95])  # pale blue: on white, a metallic of 1 would not be visible
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # luminance of the linear sRGB primaries (ITU-R BT.709)
 
 
 def displayed_over(rgba: np.ndarray, background: np.ndarray, scale: np.ndarray | float = 1.0) -> np.ndarray:

@@ -11,9 +11,10 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.errors import InputError
-from mi_refgs.fitting.image_error import displayed_image, psnr
+from mi_refgs.fitting.image_error import displayed_image, squared_error
 from mi_refgs.fitting.initial import converted, with_columns
 from mi_refgs.fitting.train import Trainer
+from mi_refgs.io.images import psnr_of
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import APART, AROUND, LIGHT, Method
@@ -186,8 +187,11 @@ def run(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
 def validation_psnr(trainer: Trainer) -> float:
     """Mean PSNR (dB) of the present state on the validation views; waits for the device."""
     assert trainer.validation is not None
-    frames = ((trainer.view(view.camera(), aovs=False), view) for view in trainer.validation.views)
-    return float(np.mean([psnr(displayed_image(frame, view, trainer.data), view) for frame, view in frames]))
+    errors = []
+    for view in trainer.validation.views:
+        shown = displayed_image(trainer.view(view.camera(), aovs=False), view, trainer.data)
+        errors.append(float(squared_error(shown, view).mean()))
+    return float(np.mean([psnr_of(error) for error in errors]))
 
 
 def record(trainer: Trainer, row: Row, verdict: str = "") -> None:

@@ -12,7 +12,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.exposure import fitted_gain
 from mi_refgs.data.registration import registered
 from mi_refgs.data.view import View
-from mi_refgs.io.images import blocks_within, psnr_of
+from mi_refgs.io.images import blocks_within
 from mi_refgs.render.display import composited, displayed, image_array
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import supersampled
@@ -58,8 +58,3 @@ def aligned(
 def squared_error(image: np.ndarray, view: View) -> np.ndarray:
     """Squared error (H, W, 3) of a display-encoded image (H, W, 3) of a view, both clipped to [0, 1]."""
     return np.square(np.clip(image, 0, 1) - np.clip(view.load().displayed, 0, 1))
-
-
-def psnr(image: np.ndarray, view: View) -> float:
-    """PSNR (dB) of a display-encoded image (H, W, 3) of a view."""
-    return psnr_of(float(squared_error(image, view).mean()))

@@ -128,20 +128,16 @@ def objective(inputs: LossInputs, weights: Mapping[str, LossWeight], iteration: 
     """Weighted sum of the losses (width 1), and the squared error of each pixel (H*W,), detached."""
     image, target = inputs.image, inputs.target
     dr.eval(image, inputs.frame.radiance)  # once, for all losses and their adjoints
-    # A weight that changes from step to step is opaque: a literal would be compiled into each step's kernels.
-    factors = {
-        name: dr.opaque(mi.Float, weight) if window.rise else weight
-        for name, window in weights.items()
-        if (weight := window.at(iteration))
-    }
     loss = None
-    for name, registered in LOSSES.items():
-        if name in factors and (value := registered.value(inputs)) is not None:
+    for registered in losses_in_use(weights):
+        name, weight = registered.name, weights[registered.name].at(iteration)
+        if weight and (value := registered.value(inputs)) is not None:
             if not dr.is_diff_v(value) or dr.width(value) != 1:
                 found = f"{dr.width(value)} of type {type(value).__name__}, from which nothing learns"
                 raise InputError(found, f"loss.{name}", remedy="return one mi.Float, as dr.mean does")
             inputs.terms[name] = dr.detach(value)
-            value = factors[name] * value
+            # A changing weight is opaque: a literal would be compiled into each step's kernels.
+            value = value * (dr.opaque(mi.Float, weight) if weights[name].rise else weight)
             loss = value if loss is None else loss + value
     if loss is None:
         raise InputError(f"none in iteration {iteration}", "loss", remedy="give one a weight, as l1 = 0.8")

@@ -219,7 +219,7 @@ class FitState:
                 state[name] = np.frombuffer(json.dumps(value).encode(), np.uint8)
         if self.photographed is not None:
             state |= {f"{PHOTOGRAPHED}{name}": x for name, x in self.photographed.arrays().items()}
-        if (mesh := self.occluder.mesh()) is not None:
+        if (mesh := self.occluder.mesh) is not None:
             state |= {f"{MESH}vertices": mesh.vertices, f"{MESH}faces": mesh.faces}
             state[f"{MESH}voxel"] = np.array(mesh.voxel)
         if self.occluder.vertex_surfels is not None:

@@ -22,7 +22,7 @@ from mi_refgs.io.progress import note
 
 EXR_MAGIC = b"\x76\x2f\x31\x01"  # first bytes of every EXR file
 SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of R, G, B, white (BT.709)
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of R, G, B (BT.709)
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear R, G, B (ITU-R BT.709)
 _lock = threading.Lock()
 _processes: dict[int, subprocess.Popen[bytes]] = {}
 """The process that reads files, by the id of the one that has started it: forks do not share it."""

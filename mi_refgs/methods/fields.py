@@ -4,8 +4,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from mi_refgs.registry import Registry
-
 Metadata = dict[str, Any]
 """Of a field. "allowed": a test of values that are not None, and a text that completes "give …"."""
 ITERATIONS: Metadata = {"unit": "iterations"}  # of a field that counts iterations, which a preset scales
@@ -21,16 +19,6 @@ def at_least(low: float) -> Metadata:
 def between(low: float, high: float) -> Metadata:
     """Metadata of a number from `low` to `high`, both included."""
     return {"allowed": (lambda value: low <= value <= high, f"a number from {low:g} to {high:g}")}
-
-
-def by_name(registry: Registry[Any]) -> Metadata:
-    """Metadata of a `dict[str, Any]`: its table NAME becomes the dataclass registered as NAME, if it is."""
-    return {"by_name": registry}
-
-
-def by_kind(registry: Registry[Any], default: str) -> Metadata:
-    """Metadata of a field whose table becomes the registered dataclass that its key `kind` names."""
-    return {"by_kind": (registry, default)}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.methods.extensions import EVENTS, INITIALISERS, LOSSES, Event
-from mi_refgs.methods.fields import FLAT, ITERATIONS, Window, at_least, between, by_kind, by_name
+from mi_refgs.methods.fields import FLAT, ITERATIONS, Window, at_least, between
 from mi_refgs.registry import load_again
 from mi_refgs.shade.light.kind import LIGHTS, LightKind
 from mi_refgs.shade.options import ShadingOptions
@@ -230,10 +230,10 @@ class Method:
     stage: dict[str, Stage]  # by name
     about: About = About()
     surfels: SurfelOptions = SurfelOptions()
-    light: LightKind | None = field(default=None, metadata=by_kind(LIGHTS, "learnt"))  # absent: no light
+    light: LightKind | None = field(default=None, metadata={"by_kind": (LIGHTS, "learnt")})  # absent: none
     surroundings: SurroundingsOptions | None = None  # absent: the object is everything
     # What happens beside gradient steps (`fitting.events`), by name; of an unregistered one the plain table.
-    event: dict[str, Event[Any]] = field(default_factory=dict, metadata=by_name(EVENTS))
+    event: dict[str, Event[Any]] = field(default_factory=dict, metadata={"by_name": EVENTS})
     loss: dict[str, LossWeight] = field(default_factory=LOSS_WEIGHTS.copy)  # by name
     rates: Rates = Rates()
     data: DataOptions = DataOptions()

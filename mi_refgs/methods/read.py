@@ -83,12 +83,7 @@ def _checked(table: dict[str, Any], where: str | Path) -> Method:
 
 def load_resolved(path: Path) -> Method:
     """Read the resolved `config.toml` of a run, unscaled; it has the losses in its file and no others."""
-    table = _read(path)
-    losses = table.get("loss")
-    if isinstance(losses, dict) and "l1" not in losses and isinstance(ssim := losses.get("ssim"), dict):
-        # A run from before these two had weights of their own.
-        losses |= {"l1": {"weight": 1 - ssim.get("weight", 0)}, "gain": DEFAULT_LOSSES["gain"]}
-    return _built(table, path, losses={})
+    return _built(_read(path), path, losses={})
 
 
 def _built(table: dict[str, Any], where: str | Path, losses: dict[str, Any] = DEFAULT_LOSSES) -> Method:

@@ -36,7 +36,7 @@ class Occluder:
     NAME = "occluder"
 
     def __init__(self, mesh: Mesh | None = None) -> None:
-        self._mesh: Mesh | None = None
+        self.mesh: Mesh | None = None  # the present one; None before the first `update`
         self._scene: Scene = None
         self._params: Any = None
         self._variant: str | None = None
@@ -45,13 +45,9 @@ class Occluder:
         if mesh is not None:
             self.update(mesh)
 
-    def mesh(self) -> Mesh | None:
-        """The present mesh, for checkpoints; None before the first `update`."""
-        return self._mesh
-
     def update(self, mesh: Mesh) -> None:
         """Replace the mesh. Vertex and face counts may change, to zero too; compiled kernels stay valid."""
-        self._mesh, self.vertex_surfels, self.ambient = mesh, None, None
+        self.mesh, self.vertex_surfels, self.ambient = mesh, None, None
         if not len(mesh.faces):
             return
         if self._scene is None or self._variant != mi.variant():
@@ -64,14 +60,14 @@ class Occluder:
     @property
     def empty(self) -> bool:
         """Whether there is nothing to hit."""
-        return self._mesh is None or not len(self._mesh.faces)
+        return self.mesh is None or not len(self.mesh.faces)
 
     def set_materials(self, surfels: Surfels) -> None:
         """Find the surfels around every vertex for `surface`, after `update` and when surfels move or their
         number changes. Raises InputError without any."""
         self.vertex_surfels = None
-        if self._mesh is not None and not self.empty:
-            self.vertex_surfels = VertexSurfels.of(self._mesh, surfels)
+        if self.mesh is not None and not self.empty:
+            self.vertex_surfels = VertexSurfels.of(self.mesh, surfels)
 
     def surface(self, surfels: Surfels, names: Sequence[str] = ()) -> Surface:
         """The mesh with present values of attributes of `surfels`, to look up where `closest` hits it. Raises
@@ -116,11 +112,11 @@ class Occluder:
 
     def _ray(self, origin: Point3f, direction: Vector3f, normal: Vector3f) -> tuple[Any, Bool]:
         """The ray that starts off the surface, and whether it can be traced."""
-        assert self._mesh is not None
+        assert self.mesh is not None
         if self._variant != mi.variant():
             variants = f"under {self._variant}, not under {mi.variant()}"
             raise RuntimeError(f"Occluder was made {variants}: call update again")
-        offset = OFFSET_VOXELS * dr.opaque(mi.Float, self._mesh.voxel)
+        offset = OFFSET_VOXELS * dr.opaque(mi.Float, self.mesh.voxel)
         d, active = _unit(mi.Vector3f(direction))
         away = d
         if normal is not None:

@@ -46,12 +46,15 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     if isinstance(seen, RotatedLight) or (light is None and seen is not None):
         height = DEFAULT_HEIGHT if light is None else light.height
         light = EnvironmentLight.from_radiance(lat_long(seen.radiance, height))
+    if not isinstance(integrator.behind, EnvironmentLight | None) and dr.any(integrator.behind != 0):
+        what = "background: a reconstruction has none of one colour, so it becomes transparent"
+        warnings.warn(what, RuntimeWarning, stacklevel=3)
     if (around := integrator.surroundings) is not None:
         around = Surroundings(Surfels(around.surfels.raw).detach(), around.background)
     return TrainedScene(
         integrator.surfels.detach(),
         None if light is None else EnvironmentLight(dr.detach(light.raw)),
-        mesh or (None if integrator.occluder is None else integrator.occluder.mesh()),
+        mesh or (None if integrator.occluder is None else integrator.occluder.mesh),
         integrator.shading,
         iteration=0,
         seconds=0.0,

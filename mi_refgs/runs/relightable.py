@@ -6,7 +6,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from mi_refgs.errors import SceneError
@@ -103,7 +102,6 @@ def outward(surfels: Surfels, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray
         out = position - np.average(position, axis=0, weights=surfels.opacity().numpy() + 1e-9)
     else:
         _, vertex = cKDTree(mesh.vertices).query(position)
-        scaled = (mesh.vertices - mesh.vertices[0]) / mesh.voxel
-        out = np.asarray(trimesh.Trimesh(scaled, mesh.faces, process=False).vertex_normals)[vertex]
+        out = mesh.normals()[vertex]
     turned = np.where(np.sum(normal * out, axis=1, keepdims=True) < 0, -normal, normal)
     return np.ascontiguousarray(turned, np.float32), vertex

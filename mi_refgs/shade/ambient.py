@@ -9,6 +9,7 @@ L being the light, in a lobe as wide as the part of the hemisphere per ray, and 
 where it blocks the ray, shaded with the ratios of the previous round, 1 in the first. The diffuse term is
 albedo × irradiance × ratio; ratios are detached."""
 
+from dataclasses import asdict
 from typing import Any
 
 import drjit as dr
@@ -46,14 +47,14 @@ def update_occluder_caches(
 
 def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: ShadingOptions) -> VertexColours:
     """Ratios of all vertices of a mesh whose materials are set, detached; see the head of this file."""
-    mesh = occluder.mesh()
+    mesh = occluder.mesh
     assert mesh is not None
     position = mi.Point3f(mesh.vertices.T)
     normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normal)
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     rays = dr.opaque(mi.UInt32, options.ambient_rays)
     blur = dr.opaque(mi.Float, ray_roughness(options.ambient_rays))
-    traced = ShadingOptions(**options.settings() | {"traced_bounces": 1, "diffuse": "irradiance"})
+    traced = ShadingOptions(**asdict(options) | {"traced_bounces": 1, "diffuse": "irradiance"})
     ratios: VertexColours | None = None  # the first round is unoccluded
     for _bounce in range(BOUNCES):
         scene = MeshRadiance(occluder, surfels, light, traced, ratios)

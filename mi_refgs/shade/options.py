@@ -48,10 +48,6 @@ class ShadingOptions:
                 what = f"{abbreviated(value)} is not allowed"
                 raise InputError(what, "shading", option.name, f"use {wanted}")
 
-    def settings(self) -> dict[str, Any]:
-        """All options by name."""
-        return {name: getattr(self, name) for name in TYPES}
-
     def chosen(self) -> list[str]:
         """Names of the QUALITY options that differ from their defaults."""
         return [name for name in QUALITY if getattr(self, name) != getattr(ShadingOptions, name)]

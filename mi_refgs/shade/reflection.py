@@ -116,8 +116,7 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
     if sampled:
         visibility, indirect = _average(points, context, scene, start, options)
     elif scene is None:
-        with dr.suspend_grad():
-            visibility = occluder.visible(point, mirror, facing, seen)
+        visibility = occluder.visible(point, mirror, facing, seen)
         dr.eval(visibility)  # now, once: every kernel of the adjoint that reads it would trace the rays again
     else:
         hit = scene.trace(point, mirror, facing, seen, bounces)

@@ -1,7 +1,7 @@
 """Shading options that fit together, and the light and attributes that they require."""
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from mi_refgs.errors import InputError
@@ -59,9 +59,9 @@ class Shading(ShadingOptions):
     @staticmethod
     def resolve(options: ShadingOptions, mesh: bool) -> "Shading":
         """The options of a stage: occluded if `traceable` and there is a `mesh`; else without TRACED ones."""
-        untraced = Shading(**options.settings() | UNTRACED)
+        untraced = Shading(**asdict(options) | UNTRACED)
         traced = mesh and untraced.traceable
-        return Shading(**options.settings() | {"occlusion": True}) if traced else untraced
+        return Shading(**asdict(options) | {"occlusion": True}) if traced else untraced
 
     def relit(self, mesh: bool) -> "Shading | None":
         """The shading under another light, occluded by a `mesh` if there is one; None: the model has none."""
@@ -69,7 +69,7 @@ class Shading(ShadingOptions):
         options = self.model.relit(replace(self, at=at, **UNTRACED))
         if options is None:
             return None
-        given = options.settings()
+        given = asdict(options)
         traced = {name: rays for name, rays in RELIT_RAYS.items() if name in self.model.honoured}
         return Shading.resolve(ShadingOptions(**given | traced), mesh)
 

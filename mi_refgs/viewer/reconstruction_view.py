@@ -12,7 +12,7 @@ from mi_refgs.data.region import Region
 from mi_refgs.formats.orbits import sphere_around
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins.aovs import aov_planes, suffixes, values_of_planes
-from mi_refgs.render.display import display_image, srgb_from_linear
+from mi_refgs.render.display import composited, display_image, srgb_from_linear
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.samples import samples_per_axis, supersampled
@@ -113,21 +113,20 @@ class ReconstructionView:
 
     def frame(self, camera: Camera, look: DisplayOptions, settled: bool) -> Frame:
         """Render one sample per pixel, with ambient shadows that may be outdated unless it is `settled`:
-        nothing has moved for a while, so it may take longer."""
+        nothing has moved for a while, so it may take longer. Callers suspend derivatives."""
         light, scene = self.light, self.scene
-        with dr.suspend_grad():
-            shading, occluder = scene.shading, self._occluder
-            lacks_ambient = shading.ambient_rays and occluder.ambient is None
-            lacks_materials = shading.traced_bounces and occluder.vertex_surfels is None
-            if self._stale and (settled or lacks_ambient or lacks_materials):
-                update_occluder_caches(occluder, scene.surfels, light, shading)
-                self._stale = False
-            background = scene.surroundings if look.backdrop == BACKGROUND else None
-            own = self.environment is self.original.light and not self.turn
-            given = (light, occluder, background, scene.near if own else None)
-            rendered = SurfelScene(scene.surfels, shading, *given)
-            aovs = frozenset({look.what} - {IMAGE, "alpha"})
-            return render(rendered, camera, Request(aovs, forward_only=True))
+        shading, occluder = scene.shading, self._occluder
+        lacks_ambient = shading.ambient_rays and occluder.ambient is None
+        lacks_materials = shading.traced_bounces and occluder.vertex_surfels is None
+        if self._stale and (settled or lacks_ambient or lacks_materials):
+            update_occluder_caches(occluder, scene.surfels, light, shading)
+            self._stale = False
+        background = scene.surroundings if look.backdrop == BACKGROUND else None
+        own = self.environment is self.original.light and not self.turn
+        given = (light, occluder, background, scene.near if own else None)
+        rendered = SurfelScene(scene.surfels, shading, *given)
+        aovs = frozenset({look.what} - {IMAGE, "alpha"})
+        return render(rendered, camera, Request(aovs, forward_only=True))
 
     def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Float]:
         """Render planes of `planes_of`."""
@@ -154,12 +153,10 @@ def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light |
     """Planes (H*W,) to average over samples: premultiplied image with what is behind, or AOV; alpha."""
     if look.what != IMAGE:
         return aov_planes(look.what, frame, camera)
-    behind = frame.background
-    if behind is None and look.backdrop == ENVIRONMENT and light is not None:
-        behind = light.radiance(dr.normalize(camera.rays()))
-    if behind is None:
-        return [*frame.radiance, frame.alpha]
-    return [*(frame.radiance + (1 - frame.alpha) * mi.Color3f(behind)), mi.Float(1)]
+    if frame.background is None and look.backdrop == ENVIRONMENT and light is not None:
+        frame = replace(frame, background=light.radiance(dr.normalize(camera.rays())))
+    radiance, alpha = composited(frame)
+    return [*radiance, alpha]
 
 
 def displayed_planes(planes: list[Float], look: DisplayOptions, depths: tuple[float, float]) -> list[Float]:

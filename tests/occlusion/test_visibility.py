@@ -90,7 +90,7 @@ def test_no_mesh_is_visible_and_traces_nothing() -> None:
         answer = occluder.visible(origin, direction)
         assert dr.detail.launch_stats()[0] == before
         assert dr.width(answer) == 5 and dr.all(answer == 1)
-    assert Occluder().mesh() is None
+    assert Occluder().mesh is None
 
 
 def test_updates_in_place_compile_nothing() -> None:
@@ -112,7 +112,7 @@ def test_updates_in_place_compile_nothing() -> None:
     after = dr.detail.launch_stats()
     assert after[1:] == (before[1], before[2]), "recompiled"
     assert occluder._scene is scene
-    saved = occluder.mesh()
+    saved = occluder.mesh
     assert saved is not None
     assert np.array(Occluder(saved).visible(origin, direction, direction)).tolist() == [0, 1, 1]
 

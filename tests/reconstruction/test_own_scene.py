@@ -57,6 +57,9 @@ def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) 
         expected = mi.render(scene, spp=1).numpy()
         found = Reconstruction.from_params(scene).render(camera)
         np.testing.assert_allclose(found[..., :3], expected[..., :3], atol=0.03 * expected.max())
+    surfels = {"type": "refgs", **balls.trained.surfels.raw, "light": turned, "background": mi.Color3f(1)}
+    with pytest.warns(RuntimeWarning, match="background: "):
+        Reconstruction.from_params(mi.load_dict(surfels))
 
 
 def test_other_states_are_refused(balls: Reconstruction) -> None:

@@ -116,7 +116,7 @@ def test_filtering_does_not_turn_light_negative() -> None:
 def test_finer_maps_are_averaged(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """With levels capped at 16 rows a map of 64 is filtered like its own average."""
     monkeypatch.setattr(lobe_matrices, "LEVEL_MAX_HEIGHT", (16,) * 7)
-    monkeypatch.setattr(prefilter, "_operator", prefilter._operator.__wrapped__)
+    monkeypatch.setattr(prefilter, "operator", prefilter.operator.__wrapped__)
     fine = lobe_matrices.resample(rng.uniform(0, 1, (8, 16, 3)), 64)
     coarse = lobe_matrices.resample(fine, 16)
     lights = (EnvironmentLight.from_radiance(x).prefilter() for x in (fine, coarse))
@@ -126,7 +126,7 @@ def test_finer_maps_are_averaged(rng: np.random.Generator, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("height", [8, 12, 64])
 def test_prefilter_of_a_gpu_is_that_of_the_host(height: int, rng: np.random.Generator) -> None:
-    op = prefilter.operator(height)
+    op = prefilter.operator(mi.variant(), height)
     kernels = Kernels(height, op.shapes, op.matrix, op.texels)
     radiance = rng.uniform(size=(height, 2 * height, 3)).astype(np.float32)
     δ = rng.normal(size=(op.texels, 4)).astype(np.float32)
@@ -139,7 +139,7 @@ def test_prefilter_of_a_gpu_is_that_of_the_host(height: int, rng: np.random.Gene
 @pytest.mark.parametrize("height", [8, 12, 64])
 def test_prefilter_adjoint_and_tangent(height: int, rng: np.random.Generator) -> None:
     """⟨y, P x⟩ = ⟨Pᵀ y, x⟩ with every entry of Pᵀ seen, and the tangent of a linear operator is itself."""
-    op = prefilter.operator(height)
+    op = prefilter.operator(mi.variant(), height)
     x = rng.normal(size=6 * height**2).astype(np.float32)
     δ = rng.normal(size=4 * op.texels).astype(np.float32)
     δ[3::4] = 0

@@ -21,7 +21,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, register, unregister
-from mi_refgs.shade.reflectance.split_sum import shade
+from mi_refgs.shade.reflectance.split_sum import SplitSum
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
@@ -163,7 +163,7 @@ def test_the_dominant_direction_comes_closer_to_the_integral(roughness: float) -
     points = points_of({"normal": np.tile(normal, (5, 1)), "view": view, **metal})
     light = EnvironmentLight.from_radiance(map_).prefilter()
     mirror, dominant = (
-        np.linalg.norm(shade(points, light, options).specular.numpy()[0] - truth)
+        np.linalg.norm(SplitSum().shade(points, light, options).specular.numpy()[0] - truth)
         for options in (PLAIN, replace(PLAIN, dominant=True))
     )
     assert dominant < (0.8 if roughness < 0.6 else 0.5) * mirror

@@ -1,6 +1,7 @@
 """CONTRIBUTING's recipe "add a reflectance model", followed: Phong's, by one attribute and one class."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -127,8 +128,11 @@ def test_it_shades_what_traced_rays_hit() -> None:
     assert all(np.allclose(x, albedo + SHARE, rtol=1e-4) or np.allclose(x, albedo, rtol=1e-4) for x in lit)
 
 
-def test_textures_are_baked_and_compared() -> None:
-    """What a model says of itself reaches textures, and the maps that evaluations compare."""
+@pytest.mark.parametrize("aov", ["Y", ""])
+def test_textures_are_baked_and_compared(aov: str) -> None:
+    """What a model says of itself reaches textures and the maps that evaluations compare, shown or not."""
+    attributes.ATTRIBUTES.unregister("shininess")
+    attributes.register(replace(SHININESS, aov=aov))
     raw = {name: x for name, x in known_surfels().raw.items() if name != "metallic"}
     raw["shininess"] = raw.pop("roughness")
     light, shading = EnvironmentLight.constant(0.5, 8), Shading(reflectance="phong", diffuse="irradiance")

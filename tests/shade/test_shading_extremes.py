@@ -8,7 +8,7 @@ import pytest
 
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
-from mi_refgs.shade.reflectance.split_sum import shade
+from mi_refgs.shade.reflectance.split_sum import SplitSum
 from tests.helpers import AXES, slow, unit
 from tests.scenes.shading_points import exact_light, exact_terms, points_of, shading_values
 
@@ -75,7 +75,7 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
         keys = ("albedo", "metallic", "radiance", "roughness", "normal")
         leaves = {key: getattr(made, key) for key in keys}
         dr.enable_grad(*leaves.values())
-        terms = shade(made, prefiltered, options)
+        terms = SplitSum().shade(made, prefiltered, options)
         found = np.stack([np.broadcast_to(getattr(terms, t).numpy(), (3, N)).T for t in TERMS], 1)
         expected = exact_terms(values, exact, options)
         limit = 1e-4 * max(np.abs(expected).max(), 1e-3)
@@ -109,7 +109,7 @@ def test_energy_under_a_constant_light_of_1(dominant: bool) -> None:
     values |= {"albedo": np.repeat(albedo[:, None], 3, 1), "metallic": metallic, "roughness": roughness}
     light = EnvironmentLight.constant(1.0, 16).prefilter()
     options = ShadingOptions(diffuse="irradiance", dominant=dominant)
-    terms = shade(points_of(values), light, options)
+    terms = SplitSum().shade(points_of(values), light, options)
     total = terms.total().numpy()[0]
     assert total.min() >= 0 and total.max() <= 1 + 1e-3
     white = (albedo == 1) & (metallic == 0)

@@ -19,7 +19,7 @@ from mi_refgs.shade.ggx_sampling import Lobe
 from mi_refgs.shade.light.envmap import EnvironmentLight, PrefilteredLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
-from mi_refgs.shade.reflectance.split_sum import MATERIALS, shade
+from mi_refgs.shade.reflectance.split_sum import MATERIALS, SplitSum
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import slow, unit, vector
 from tests.scenes import corner as scenes
@@ -261,6 +261,6 @@ def test_degenerate_pixels_stay_finite() -> None:
         prefiltered = EnvironmentLight(raw).prefilter()
         found = scenes.seen(points, place, chosen, surfels, prefiltered, occluder=occluder)
         assert dr.all((found.visibility >= 0) & (found.visibility <= 1))
-        total = shade(found, prefiltered, replace(chosen, diffuse="irradiance")).total()
+        total = SplitSum().shade(found, prefiltered, replace(chosen, diffuse="irradiance")).total()
         dr.backward(dr.sum(total.x + total.y + total.z))
         assert dr.all(dr.isfinite(total), axis=None) and dr.all(dr.isfinite(dr.grad(raw)), axis=None)

@@ -77,7 +77,8 @@ def _product(matrix: csc_matrix, coefficients: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=4)
-def _operator(variant: str, height: int) -> Operator:
+def operator(variant: str, height: int) -> Operator:
+    """The prefilter for maps (height, 2·height), built once per variant of Mitsuba (64 rows: 1 s)."""
     built, values, rows, columns, first = build_levels(height), [], [], [], 0
     for weights in built:
         i, k, m = np.nonzero(weights)
@@ -95,15 +96,10 @@ def _operator(variant: str, height: int) -> Operator:
     return Operator(height, matrix, info, shapes, texels, kernels)
 
 
-def operator(height: int) -> Operator:
-    """The prefilter for maps (height, 2·height), built once per height and variant (64 rows: 1 s)."""
-    return _operator(mi.variant(), height)
-
-
 def prefilter(radiance: TensorXf) -> tuple[Operator, Any]:
     """Operator and levels (flat RGBA, under AD) of a radiance tensor (h, 2h, 3), h a multiple of 4."""
     shape = tuple(radiance.shape)
-    found = operator(shape[0])
+    found = operator(mi.variant(), shape[0])
     if found.kernels is not None:
         return found, linear(radiance.array, found.kernels.apply, found.kernels.apply_transposed)
 

@@ -42,45 +42,6 @@ def lookup_direction(normal: Vector3f, view: Vector3f, roughness: Float, options
     return safe_normalize(dr.lerp(normal, mirror, mirrored))
 
 
-def shade(points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
-    """Outgoing radiance towards the camera, as separate terms.
-
-    With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected direction
-    r (`lookup_direction`): specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and diffuse =
-    (1 - metallic) radiance ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ambient ("irradiance"; see
-    `shade.ambient`). A point seen from behind keeps its mirror direction, with the reflectance at grazing
-    incidence. Under a constant light of 1 no more than 1 leaves with "irradiance".
-
-    Finite for every finite input. Raises InputError for "sh" without a radiance."""
-    # Directional reflectance, and the light in the specular lobe.
-    normal, view = safe_normalize(points.normal), safe_normalize(points.view)
-    f0 = base_reflectance(points)
-    scale, bias = split_sum(dr.dot(normal, view), points.roughness)
-    reflectance = dr.fma(f0, scale, bias)
-    direction = lookup_direction(normal, view, points.roughness, options)
-    specular = light.specular(direction, points.roughness) * reflectance
-
-    # Visibility of that light, and what blocks it.
-    indirect = None
-    visibility, blocking = points.get("visibility"), points.get("indirect")
-    if visibility is not None:
-        specular *= visibility
-        if blocking is not None:
-            indirect = (1 - visibility) * blocking * reflectance
-
-    # Diffuse base under the specular layer.
-    if options.diffuse == "irradiance":
-        # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
-        transmitted = dr.maximum(1 - reflectance, 0)
-        incident = light.irradiance(normal)
-        if (ambient := points.get("ambient")) is not None:
-            incident *= ambient
-        diffuse = transmitted * (1 - points.metallic) * points.albedo * incident
-    else:
-        diffuse = (1 - points.metallic) * points.radiance
-    return RadianceTerms(diffuse, specular, indirect)
-
-
 class SplitSum(Reflectance):
     """The split sum, with what mirror rays find (`shade.reflection`)."""
 
@@ -103,7 +64,42 @@ class SplitSum(Reflectance):
         return values
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
-        return shade(points, light, options)
+        """Outgoing radiance towards the camera, as separate terms.
+
+        With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected
+        direction r (`lookup_direction`): specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and
+        diffuse = (1 - metallic) radiance ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ambient
+        ("irradiance"; see `shade.ambient`). A point seen from behind keeps its mirror direction, with the
+        reflectance at grazing incidence. Under a constant light of 1 no more than 1 leaves with "irradiance".
+
+        Finite for every finite input. Raises InputError for "sh" without a radiance."""
+        # Directional reflectance, and the light in the specular lobe.
+        normal, view = safe_normalize(points.normal), safe_normalize(points.view)
+        f0 = base_reflectance(points)
+        scale, bias = split_sum(dr.dot(normal, view), points.roughness)
+        reflectance = dr.fma(f0, scale, bias)
+        direction = lookup_direction(normal, view, points.roughness, options)
+        specular = light.specular(direction, points.roughness) * reflectance
+
+        # Visibility of that light, and what blocks it.
+        indirect = None
+        visibility, blocking = points.get("visibility"), points.get("indirect")
+        if visibility is not None:
+            specular *= visibility
+            if blocking is not None:
+                indirect = (1 - visibility) * blocking * reflectance
+
+        # Diffuse base under the specular layer.
+        if options.diffuse == "irradiance":
+            # The table, extrapolated, exceeds 1 by up to 1e-4: no negative light from that.
+            transmitted = dr.maximum(1 - reflectance, 0)
+            incident = light.irradiance(normal)
+            if (ambient := points.get("ambient")) is not None:
+                incident *= ambient
+            diffuse = transmitted * (1 - points.metallic) * points.albedo * incident
+        else:
+            diffuse = (1 - points.metallic) * points.radiance
+        return RadianceTerms(diffuse, specular, indirect)
 
     def lobe(self, points: ShadingPoints) -> tuple[Float, Color3f]:
         return points.roughness, base_reflectance(points)
