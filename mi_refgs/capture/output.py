@@ -14,11 +14,9 @@ import numpy as np
 from mi_refgs.capture import colmap
 from mi_refgs.capture.photographs import Photograph, mask_pixels
 from mi_refgs.data.colmap_model import MODELS, Camera
-from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.lens import Undistortion, undistortion
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import make_folder, read_json, replace_file
-from mi_refgs.io.images import exif_tags, open_image, positive
 from mi_refgs.io.progress import with_bar
 
 QUALITY = 95  # quality of JPEG files; lower ones make a fit reproduce their block edges
@@ -108,9 +106,7 @@ def write_images(
             jpeg = photograph.path.suffix.lower() in (".jpg", ".jpeg")
             kind = {"format": "JPEG", "quality": QUALITY, "subsampling": 0} if jpeg else {"format": "PNG"}
             pixels, exif = Image.fromarray(camera.resample(np.asarray(photograph.load()))), Image.Exif()
-            with open_image(photograph.path) as original:
-                found = exif_tags(original)[1]
-            exif[0x8769] = {tag: found[tag] for tag in EXPOSURE if positive(found.get(tag)) is not None}
+            exif[0x8769] = dict(photograph.exposure)
             replace_file(image, lambda path: pixels.save(path, exif=exif, **kind))
         if masks:
             mask = camera.resample(mask_pixels(masks[photograph.name], photograph))[..., 0]

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import laplace
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
+from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted, require_package
 from mi_refgs.io.images import exif_tags, image_size, open_image, positive, read_mask, to_8_bits
@@ -36,6 +37,7 @@ class Photograph:
     size: tuple[int, int]  # width and height as displayed, pixels
     focal: float | None  # focal length over the image's diagonal, where EXIF tells it
     device: str  # camera and lens: photographs with the same one share intrinsics
+    exposure: Mapping[int, Any]  # EXIF's tags that tell it
     plain: bool = True  # colour or grey without alpha
     orientation: int = 1  # EXIF's: how the stored pixels are turned for display
     lying: bool = False  # rotated by 90° anticlockwise in the data set, to have the sensor of the others
@@ -146,7 +148,8 @@ def _photograph(path: Path) -> Photograph:
     device = f"{exif.get(MAKE, '')} {exif.get(MODEL, '')} {own or equivalent or ''}"
     focal = None if equivalent is None else equivalent / 43.2666  # mm, diagonal of 36 mm × 24 mm
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return Photograph(path, path.name, digest, size, focal, device, plain, orientation)
+    exposure = {tag: detail[tag] for tag in EXPOSURE if positive(detail.get(tag)) is not None}
+    return Photograph(path, path.name, digest, size, focal, device, exposure, plain, orientation)
 
 
 def find_masks(folder: Path, photographs: Sequence[Photograph]) -> dict[str, Path]:

@@ -21,13 +21,13 @@ from mi_refgs.capture.photographs import Photograph, find_masks, find_photograph
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.images import MASK
 from mi_refgs.data.object_region import support_planes
-from mi_refgs.data.region import Region, write_region
+from mi_refgs.data.region import REGION_FILE, Region, read_region, write_region
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import read_json, replace_file, write_json
 from mi_refgs.io.images import image_size
 from mi_refgs.io.progress import command_line, with_bar
 
-PLOT = "capture.png"
+PLOT, OLD_REGION = "capture.png", "region.old.json"
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
 FIRST_MODEL = "SIMPLE_RADIAL"  # lens with which images are registered: few matches determine its parameter
 LEAST_PLACED = 0.5  # fraction of the photographs that must be registered in one group
@@ -45,7 +45,8 @@ def capture(
 ) -> dict[str, Any]:
     """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`.
     `camera`: COLMAP's lens model, or None for the simplest of three that fits. `region`: in the data set's
-    world. Returns the content of capture.json. Raises InputError for unusable input, and without pycolmap."""
+    world, by default what a user saved there, else estimated. Returns the content of capture.json. Raises
+    InputError for unusable input, and without pycolmap."""
     # Photographs and options.
     pycolmap = colmap.load()
     if camera not in (None, *MODELS):
@@ -60,8 +61,14 @@ def capture(
     copies = {photograph.copy: photograph for photograph in photographs}
     # Cameras of the largest group, transformed to an upright world.
     work, given = folder / WORK, _hash(inputs)
-    mark = work / "key"
-    if not mark.is_file() or mark.read_text() != given:
+    mark, drawn = work / "key", read_region(folder)
+    known = mark.is_file() and mark.read_text() == given
+    if region is None and drawn is not None and not drawn.estimated:  # a user's, of the last capture's world
+        region = drawn if known else None
+        if not known:
+            (folder / REGION_FILE).rename(folder / OLD_REGION)
+            tell(f"{folder / REGION_FILE}: moved to {OLD_REGION}, as its cameras are replaced")
+    if not known:
         shutil.rmtree(work)
         work.mkdir()
         mark.write_text(given)
@@ -74,7 +81,8 @@ def capture(
     model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), shift))
     world = Solved.of(model)
     found = region or Region((0.0, 0.0, 0.0), 1.0, estimated=True)
-    found = replace(found, planes=support_planes(world.points, world.origin, found))
+    if region is None or region != drawn:
+        found = replace(found, planes=support_planes(world.points, world.origin, found))
     # Undistorted images and COLMAP's files, unless the last capture wrote the same.
     mask_digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in mask_files.values()]
     key, last = _hash([inputs, repr(straight), mask_digests]), folder / REPORT

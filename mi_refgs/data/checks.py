@@ -175,6 +175,13 @@ class Sight:
             scale = max(scale, float(np.median(np.linalg.norm(self.data.points.position - middle, axis=1))))
         return {"spread": spread}, 2 * (spread <= ONE_PLACE * scale), ()
 
+    def within(self) -> Measured | None:
+        if self.data.region is None:
+            return None
+        inside = np.flatnonzero(self.data.region.contains(self.origins))
+        level = (len(inside) > 0) + (2 * len(inside) > len(self.views))
+        return {"count": len(inside)}, level, [self.views[i] for i in inside]
+
     def ahead(self) -> Measured | None:
         if self.tracks:
             share = 1 - float(np.isnan(np.concatenate([distance for _, distance in self.tracks])).mean())
@@ -255,6 +262,7 @@ class Sight:
 WRONG = "another model's images file; images turned by EXIF, resized or cropped"
 CHECKS: tuple[tuple[str, Callable[[Sight], Measured | None], str], ...] = (
     ("cameras", Sight.one_place, "{which} in one place show no shape; add images from other sides"),
+    ("region", Sight.within, "{which} are inside of it, as the object would be; make its radius smaller"),
     ("views", lambda sight: ({"count": (count := len(sight.views))}, count < FEW_VIEWS, ()),
      "only {count} training views; others may look wrong"),
     ("points", Sight.ahead, "{share:.0%} are in front of their cameras; correct the axes of the poses"),

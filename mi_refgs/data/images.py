@@ -262,7 +262,8 @@ def mask_in(folder: Path, name: str) -> Path:
     """The mask of an image in a folder of masks: of `a.jpg` `a.jpg.png`, `a.png`, `a_mask.png` and so on."""
     if found := _mask_file(folder, name, MARKS):
         return found
-    raise InputError("missing", folder / f"{name}.png", "mask", "add it, or remove the folder of masks")
+    wanted = folder / Path(name).with_suffix(".png")
+    raise InputError("missing", wanted, "mask", "add it, or remove the folder of masks")
 
 
 def _mask_file(folder: Path, name: str, marks: Sequence[str]) -> Path | None:

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from mi_refgs.capture import colmap, output
+from mi_refgs.capture import colmap, output, pipeline
 from mi_refgs.capture.colmap import EXHAUSTIVE, Solved, pairs_to_match
 from mi_refgs.capture.frame import region_of_interest, up_direction
 from mi_refgs.capture.photographs import find_masks, find_photographs, folder_of, mask_pixels
@@ -138,6 +138,11 @@ def test_second_capture_computes_nothing(captured: Path, monkeypatch: pytest.Mon
     assert main([*command, "--region", "0.1", "0.2", "0.3", "0.5"]) == 0
     region = json.loads((data / "region.json").read_text())
     assert (region["centre"], region["radius"]) == ([0.1, 0.2, 0.3], 0.5) and "estimated" not in region
+    # What a user saved stays.
+    (data / "region.json").write_text(json.dumps(region | {"radius": 0.75, "planes": [[0, 0, 1, -2]]}))
+    assert main(command) == 0
+    kept = json.loads((data / "region.json").read_text())
+    assert (kept["radius"], kept["planes"]) == (0.75, [[0, 0, 1, -2]])
 
 
 @pytest.mark.slow
@@ -217,6 +222,12 @@ def test_other_lens_rewrites_images(captured: Path, tmp_path: Path, monkeypatch:
     assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
     assert (data / "images" / NAMES[0]).stat().st_ino != inode
     assert [view.name for view in read_loaded(data, "test").views] == [NAMES[3]]
+    # A region that a user saved is of the cameras that it was saved with.
+    (data / "region.json").write_text('{"centre": [0, 0, 0], "radius": 2}')
+    monkeypatch.setattr(pipeline, "VERSION", 0)
+    monkeypatch.setattr(pipeline, "_solve", stopped)
+    assert main(command) == 130 and not (data / "region.json").exists()
+    assert json.loads((data / "region.old.json").read_text())["radius"] == 2
 
 
 @needs_colmap
@@ -370,7 +381,7 @@ def test_masks_match_photographs_by_name_and_size(tmp_path: Path) -> None:
     masks = _made(tmp_path / "m")
     Image.fromarray(mask).save(masks / "a.png")
     Image.fromarray(mask.astype(np.uint16) * 100).save(masks / "b.jpg.png")  # 16 bits, not used in full
-    refused(lambda: find_masks(masks, photographs), "c.jpg.png: mask: missing; add it")
+    refused(lambda: find_masks(masks, photographs), "m/c.png: mask: missing; add it")
     Image.fromarray(np.dstack([np.full((4, 6, 3), 9, dtype=np.uint8), mask])).save(masks / "c.png")
     found = find_masks(masks, photographs)
     for photograph in photographs:  # white where the object is; where an image is cut out, its alpha

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mi_refgs.cli import main
 from mi_refgs.data.checks import Finding, examine, heed
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
+from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png, write_png
 from tests.helpers import refused
@@ -99,6 +101,17 @@ def test_contradictory_cameras_need_force(tmp_path: Path, monkeypatch: pytest.Mo
     refused([*command, "--force"], "forced: True")
     behind = found_in(write_model(tmp_path / "behind", mirror=-1))["points"]
     assert (behind.level, behind.numbers["share"]) == ("refused", 0.0)
+
+
+@pytest.mark.parametrize(("inside", "level"), [(0, "fine"), (1, "said"), (7, "said"), (8, "refused")])
+def test_cameras_are_outside_of_the_region(inside: int, level: str, tmp_path: Path) -> None:
+    data = read_dataset(write_model(tmp_path), "train")
+    normal = np.array([0.8, 0.0, 0.6])
+    heights = np.sort([view.to_world[:3, 3] @ normal for view in data.views])[::-1]
+    plane = (0.8, 0.0, 0.6, float(heights[inside] + 1e-6))  # above it are so many of 14 cameras
+    region = Region((0.0, 0.0, 0.0), 9.0, (plane,))
+    found = {one.name: one for one in examine(replace(data, region=region))}["region"]
+    assert (found.level, found.numbers["count"], len(found.numbers["views"])) == (level, inside, inside)
 
 
 def over_white(image: np.ndarray) -> np.ndarray:

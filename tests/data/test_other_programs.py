@@ -170,7 +170,7 @@ def test_masks_become_alpha(write: Callable[[Path], Path], pattern: str, tmp_pat
     assert ("7 images: a mask was found" in notes) == (pattern not in PLAIN)
     if not pattern.startswith("images/"):
         (tmp_path / pattern.format("b")).unlink()
-        refused(lambda: read_dataset(tmp_path, "train"), f"{pattern.split('/')[0]}/b.png.png: mask: missing")
+        refused(lambda: read_dataset(tmp_path, "train"), f"{pattern.split('/')[0]}/b.png: mask: missing")
 
 
 def test_masks_of_other_images_are_not_used(tmp_path: Path) -> None:
@@ -186,7 +186,7 @@ def test_masks_of_other_images_are_not_used(tmp_path: Path) -> None:
     named("train/{}")(tmp_path)
     assert read_dataset(tmp_path, "train").has_alpha
     masks.rename(tmp_path / "masks")
-    refused(lambda: read_dataset(tmp_path, "train"), "masks/train/b.png.png: mask: missing")
+    refused(lambda: read_dataset(tmp_path, "train"), "masks/train/b.png: mask: missing")
 
 
 def test_first_layout_that_is_whole_is_read(tmp_path: Path) -> None:
