@@ -7,6 +7,7 @@ import inspect
 import json
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -123,12 +124,16 @@ def _run(argv: list[str]) -> int:
 
 @contextlib.contextmanager
 def _standard_output_to_error() -> Iterator[None]:
-    """Redirect what libraries print, C++ included, so that only the result goes to standard output."""
+    """Redirect what libraries print, C++ included, so that only the result goes to standard output; warnings
+    are sentences there."""
+    from mi_refgs.io.progress import warn
+
     sys.stdout.flush()
     saved = os.dup(1)
     try:
         os.dup2(2, 1)
-        with contextlib.redirect_stdout(sys.stderr):
+        with contextlib.redirect_stdout(sys.stderr), warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: warn(str(message))
             yield
     finally:
         os.dup2(saved, 1)

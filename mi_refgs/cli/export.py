@@ -31,7 +31,8 @@ class Export:
         from mi_refgs.runs.trained_scene import TrainedScene
 
         names = separated(self.to)
-        options = {name: value for name, value in vars(self.format).items() if value not in (None, False)}
+        given = vars(self.format).items()
+        options = {name: value for name, value in given if value is not None and value is not False}
         if options and not names:
             option = f"--{next(iter(options)).replace('_', '-')}"
             raise InputError("belongs to a format", option, remedy="name it with --to")

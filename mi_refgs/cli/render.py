@@ -9,9 +9,6 @@ from tyro.conf import Positional, arg
 from mi_refgs.cli.command import Cameras, Flag, Output, Rendering, Result, optional, separated
 from mi_refgs.errors import InputError, counted, require_between
 
-MAPS = "albedo, metallic, confidence, roughness, normal, depth, alpha, visibility"
-AOVS = f"{MAPS}, diffuse, specular, indirect"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
@@ -28,7 +25,9 @@ class Render:
     object: Flag = False  # render the object without its background, on transparency
     samples: Annotated[int | None, optional("N")] = None
     """samples per pixel (default: those of the scene's sampler)"""
-    aov: Annotated[tuple[str, ...], optional("NAME …", help=f"more channels of the EXR: {AOVS}")] = ()
+    aov: Annotated[tuple[str, ...], optional("NAME …")] = ()
+    """more channels of the EXR: albedo, metallic, confidence, roughness, normal, depth, alpha, visibility,
+    diffuse, specular, indirect"""
     common: Rendering = Rendering()
 
     def run(self) -> Result:
@@ -108,6 +107,9 @@ def write(scene: Any, sensor: Any, spp: int, path: Path) -> list[str]:
         pixels = np.array(bitmap).reshape(*bitmap.size()[::-1], -1)
         write_exr_layers(path, {name: pixels[..., index] for index, name in enumerate(names)})
         return names
+    if not {*"RGB"} <= {*names}:
+        what = f"the film has {', '.join(names)}, no red, green and blue"
+        raise InputError(what, path, "output", "write an EXR file, or give the film pixel_format rgb")
     count = 4 if "A" in names else 3
     pixels = np.array(image, dtype=np.float32)[..., :count]
     write_png(path, straight_srgb(pixels) if count == 4 else srgb_from_linear(pixels))

@@ -294,7 +294,7 @@ def read_dataset(
         with contextlib.suppress(InputError):  # a relit data set has none
             training = reader.read(path, "train", replace(options, truth=False, said={})).views
     # Alpha without a transparent pixel, as of photographs saved as RGBA, is ignored, but not that of masks.
-    if _opaque(views) and (split == "train" or _opaque(training)):
+    if _opaque(views) and (split == "train" or _opaque(training) or not any(map(_own_alpha, training))):
         which = f"{sum(map(_own_alpha, views))} of {len(views)} images have alpha"
         notes = (*notes, f"{which}, but no pixel is transparent: alpha is ignored")
         views = tuple(replace(v, pixels=v.pixels.without_alpha()) if _own_alpha(v) else v for v in views)
@@ -305,7 +305,7 @@ def read_dataset(
     # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training)
     views = tuple(_moved(view, offset) for view in views)
-    views = tuple(replace(view, near=NEAR_EXTENTS * _extent(views)) for view in views)
+    views = tuple(replace(view, near=NEAR_EXTENTS * _extent(training)) for view in views)
     if (region := read_region(path)) is not None:
         region = region.moved(-offset)
     elif without:

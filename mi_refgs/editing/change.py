@@ -68,7 +68,8 @@ def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> tuple[TrainedSc
     if not (materials or made or cut):
         raise InputError("nothing to do", "edit", remedy="give --set, --cut or another change")
     if materials:
-        scene = replace(relightable(scene), surroundings=scene.surroundings, near=scene.near)
+        light = {name: getattr(scene, name) for name in ("surroundings", "near", "turntable")}
+        scene = replace(relightable(scene), **light)
     chosen = select(scene, Selection(**{f.name: given[f.name] for f in fields(Selection) if f.name in given}))
     changed = apply(scene, chosen, made, cut)
     counts = {"selected": int(chosen.sum()), "of": len(chosen), "surfels": changed.surfels.count}

@@ -22,7 +22,8 @@ class Selection:
     where: Annotated[str | None, optional(metavar="CONDITION")] = None
     """such as "metallic > 0.5 and z < 0": comparisons with a number, between `and` and `or`, of x y z,
     opacity, size (the largest standard deviation), normal.x … .z (outwards), materials such as albedo.r, or
-    colour.r … .b (the fitted radiance, its SH term of degree 0); an unknown name lists the known ones"""
+    colour.r … .b (the fitted radiance, its SH term of degree 0; of imported splats it is display-encoded);
+    an unknown name lists the known ones"""
     box: Annotated[Sequence[float] | None, optional(constructor=Six, metavar="X0 Y0 Z0 X1 Y1 Z1")] = None
     """centres inside an axis-aligned box"""
     invert: Flag = False

@@ -27,7 +27,7 @@ from mi_refgs.kernels.device import machine
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.render.samples import samples_per_axis
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import EXPOSURE, Run
+from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.light_file import read_radiance
@@ -77,10 +77,13 @@ def evaluate(
     errors, budget = Decomposition(), ErrorBudget()
     render, maps_of = fitted.renderer(samples=samples, turning=True), material_maps(fitted, samples)
     plain = fitted.renderer(aovs=False, samples=samples, turning=True)
-    around, corrected = fitted.surroundings is not None, bool(run.cameras())
-    aligns = corrected or not views.has_alpha
+    around, corrected = fitted.surroundings is not None, (run.path / CAMERAS).is_file()
+    gains = (run.path / EXPOSURE).is_file()
+    aligns = corrected or gains or not views.has_alpha
     object_only = replace(fitted, surroundings=None).renderer(samples=samples) if around else None
     in_sheet = evenly_spread(len(views.views), SHEET_VIEWS)
+    for stale in (run.path / FOLDER).glob("[0-9][0-9][0-9]_*.png"):  # of another data set
+        stale.unlink()
     scores: list[dict[str, Any]] = []
     shown: list[tuple[RenderedView, View, Maps]] = []  # in the sheet, with more images
     for index, view in enumerate(with_bar(views.views, "eval", unit="view", disable=not progress)):
@@ -111,7 +114,7 @@ def evaluate(
     result |= surface_scores(fitted.mesh, surface, views.views)
     result |= {
         "caption": caption(size),
-        "exposure": (run.path / EXPOSURE).is_file(),
+        "exposure": gains,
         "cameras": corrected,
         "train_seconds": fitted.seconds,
         "iterations": fitted.iteration,
@@ -145,7 +148,7 @@ def _means(per_view: list[dict[str, Any]]) -> dict[str, Any]:
         ("region", "psnr_region", "the data set has no region of interest"),
         ("object", "psnr_object", "the data set has neither masks nor a true surface"),
         ("normal", "normal_mae_deg", "the data set has no ground-truth normals"),
-        ("aligned", "psnr_aligned", "images have alpha, and the fit did not correct its cameras"),
+        ("aligned", "psnr_aligned", "images have alpha, and the fit corrected neither cameras nor exposure"),
     ):
         result[f"{name}_reason"] = reason if result[key] is None else None
     return result

@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -117,7 +118,7 @@ def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> 
     if choice.method is not None:
         return sized(load_method(choice.method, choice.preset, choice.settings), data, say)
     # Settings of anything but images may be those of the other method.
-    of_images = [text for text in methods.assignments(choice.settings) if text.startswith("data.")]
+    of_images = [text for text in methods.assignments(choice.settings) if re.match(r"\s*data\s*[.=]", text)]
     named = choice.named()
     reads, views = sized(load_method(named, choice.preset, of_images), data, say)
     name = _for_images(named, reads, views)
@@ -186,7 +187,7 @@ def begin(
         if changed := [name for name in known | now if known.get(name) != now.get(name)]:
             what = f"not as when {run.path} began: {len(changed)} of {len(known | now)} images or cameras"
             raise InputError(what, views.path, changed[0], "restore them, or choose another -o")
-    views = with_region(views, run.region(), tell)
+    views = with_region(views, run.region(began=True), tell)
     state, found = run.load_checkpoint() if resumed else None, list[checks.Finding]()
     if resumed and state is None and (run.path / MODEL).is_file():
         what = "none, but a scene that was edited, imported or copied, which a fit would replace"

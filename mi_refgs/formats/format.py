@@ -97,7 +97,7 @@ def write(
         own_folder(output, owner)
     for made in chosen:
         target = output
-        if several or output.is_dir() or (made.suffix and not output.suffix):
+        if several or (made.suffix and (output.is_dir() or not output.suffix)):
             target = output / f"{made.name}{made.suffix}"
         elif made.suffix and output.suffix.lower() != made.suffix:
             raise InputError(f"{made.name} writes {made.suffix}", output, "suffix", "name the file so")

@@ -153,6 +153,7 @@ class FilmImage:
         dr.traverse(mode)
         found = dr.detach(dr.grad(end))
         dr.eval(found)
-        self.film.prepare(self.aovs)  # restore the image before
-        self.film.put_block(mi.ImageBlock(before, self.film.crop_offset()))
+        if before.shape[2] == count:  # restore the image before, unless another integrator made it
+            self.film.prepare(self.aovs)
+            self.film.put_block(mi.ImageBlock(before, self.film.crop_offset()))
         return found

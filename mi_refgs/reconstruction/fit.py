@@ -19,6 +19,7 @@ from mi_refgs.io.progress import progress_bar, say, warn
 from mi_refgs.kernels.device import require_supported_variant
 from mi_refgs.methods.method import Method
 from mi_refgs.reconstruction.reconstruction import Reconstruction, load
+from mi_refgs.runs.run import Run
 
 
 def fit(
@@ -79,9 +80,9 @@ def fit(
         named = str(method) if isinstance(method, Path) else method
         choice = runner.Choice(named, preset, settings, purpose, force)
         runner.fit(source, Path(output), choice, resume=resume, progress=listener)
-    except KeyboardInterrupt:
-        if temporary is not None:
-            temporary.remove.detach()  # keeps the checkpoints, from which the fit can be resumed
+    except (KeyboardInterrupt, InputError):
+        if temporary is not None and Run(temporary.path).checkpoints():  # from which it can be resumed
+            temporary.remove.detach()
         raise
     return replace(load(output), _temporary=temporary)
 
@@ -141,7 +142,7 @@ class ProgressBar(Progress):
         if trainer.run is not None and is_due:
             # The first training view and the environment map.
             view = trainer.data.views[0].load()
-            rendered = RenderedView.of(trainer.view(view.camera()), trainer.data, view)
+            rendered = RenderedView.of(trainer.view(trainer.camera(0)), trainer.data, view)
             map_ = None if trainer.fit.light is None else trainer.fit.light.environment()
             light = None if map_ is None else light_panels(map_.radiance().numpy())
             image = contact_sheet([panels(rendered, view)], light)

@@ -1,6 +1,7 @@
 """The method and data set that a reconstruction was fitted with, and their cameras."""
 
 import os
+import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,6 @@ from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.formats import Shot
 from mi_refgs.formats.orbits import shots_around
-from mi_refgs.io.files import read_json
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import TrainedScene
@@ -34,11 +34,9 @@ class Provenance:
     @staticmethod
     def of(run: Run) -> "Provenance":
         """Read a run folder; raises InputError if it is none, or has a record that cannot be used."""
-        method, (edits, exposure) = run.method(), (run.path / name for name in (EDITS, EXPOSURE))
-        made = read_json(edits).get("edits", []) if edits.is_file() else []
-        records = {CAMERAS: cameras} if (cameras := run.cameras()) else {}
-        records |= {EXPOSURE: read_json(exposure)} if exposure.is_file() else {}
-        return Provenance(method, run.dataset(), run.region(), tuple(made), records)
+        made = run.record(EDITS).get("edits", [])
+        records = {name: record for name in (CAMERAS, EXPOSURE) if (record := run.record(name))}
+        return Provenance(run.method(), run.dataset(), run.region(), tuple(made), records)
 
     def with_data(self, folder: Path | None) -> "Provenance":
         """Replace the data set, unless `folder` is None; raises InputError for a path that is no folder."""
@@ -50,32 +48,35 @@ class Provenance:
     def has_data(self) -> bool:
         return self.data is not None and self.data.is_dir()
 
-    def views(self, split: str) -> Dataset:
+    def views(self, split: str, truth: bool = True) -> Dataset:
         """Read a split of the data set; raises InputError for one that is unknown, missing or unreadable."""
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(gone, "views", split, "use cameras(), or restore the data set")
-        views = with_region(read_views(self.method, self.data, split), self.region)
+        views = with_region(read_views(self.method, self.data, split, truth), self.region)
         return with_poses(views, self.records.get(CAMERAS, {}))
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
-        """Return the named cameras of some splits, without images; around the surfels without a data set."""
+        """Return the named cameras of some splits, without images; around the surfels without a data set. Of
+        several splits one that cannot be read is left out, with a warning."""
         if self.data is None or not self.has_data:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
-        relative, shots = (lambda path: Path(os.path.relpath(path, self.data))), []
+        relative, shots = (lambda path: Path(os.path.relpath(path, self.data))), list[Shot]()
         for split in splits:
-            data = read_views(self.method, self.data, split, truth=False)
-            views, originals = with_poses(data, self.records.get(CAMERAS, {})).views, data.views
-            if (self.method.data.downscale or 1) > 1:  # image files are those on disk
-                originals = read_views(self.method.downscaled(1), self.data, split, truth=False).views
-            for view, original in zip(views, originals, strict=True):
-                file = original.file
-                if file is not None:  # paths are relative to the data set
+            try:
+                data = read_views(self.method, self.data, split, truth=False)
+            except InputError as error:
+                if split == splits[-1] and not shots:
+                    raise
+                warnings.warn(f"{split} views are left out: {error}", RuntimeWarning, stacklevel=3)
+                continue
+            for view in with_poses(data, self.records.get(CAMERAS, {})).views:
+                if (file := view.file) is not None:  # paths are relative to the data set
                     mask = file.mask and replace(file.mask, path=relative(file.mask.path))
                     file = replace(file, path=relative(file.path), mask=mask)
                 shots.append(Shot(view.name, split, view.camera(), file))
         return shots
 
     def first_camera(self, trained: TrainedScene) -> Camera:
-        """Return the camera of the first test view; without a data set, the first around the surfels."""
-        return self.shots(trained, "test")[0].camera
+        """Return the camera of the first view; without a data set, the first around the surfels."""
+        return self.shots(trained, "test", "train")[0].camera

@@ -212,7 +212,7 @@ class Reconstruction:
         """Write a run folder without checkpoints, which every command reads, and load it.
 
         It renders the same images, bit for bit. Raises InputError for a folder that has other files."""
-        source, camera = self.provenance, self.cameras()[0]
+        source, camera = self.provenance, self.provenance.first_camera(self.trained)
         records = source.records | ({EDITS: {"edits": source.edits}} if source.edits else {})
         options: dict[str, Any] = {"data": source.data, "region": source.region, "records": records}
         save(self.trained, Path(folder), source.method, camera, **options)

@@ -64,7 +64,7 @@ def relight(
     fitted = load(run.path)
     fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
     provenance, requested, true_views, no_truth = fitted.provenance, light, None, NO_TRUTH
-    views = provenance.views("test") if provenance.has_data else None
+    views = provenance.views("test", truth=False) if provenance.has_data else None
     if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
         try:
             true_views, light = _true_views(provenance.method, known[0], views), known[1]

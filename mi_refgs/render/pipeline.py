@@ -53,7 +53,8 @@ class SurfelScene:
     @property
     def all_aovs(self) -> frozenset[str]:
         """Names of all AOVs that a frame of this scene may have."""
-        materials = {name for name in self.surfels.raw if attribute(name).aov}
+        inputs = {x for x in self.shading.required_attributes if not attribute(x).harmonics}
+        materials = {name for name in self.surfels.raw if attribute(name).aov or name in inputs}
         return frozenset({*materials, *TERMS, "visibility", "normal", "depth"})
 
     def light_at(self, position: Point3f) -> Light | None:

@@ -71,9 +71,8 @@ def fresh(run: Run, method: Method) -> TrainedScene | None:
         if state is not None and int(state["iteration"]) > shown:
             return TrainedScene.from_state(method, state)
     if not model.is_file():
-        remedy = f"train it with `refgs train DATA -o {run.path} --resume`"
-        if run.busy():
-            remedy = f"wait for the first of the fit that runs, after {method.checkpoint_every} iterations"
+        first = f"wait for the first of a fit that runs, after {method.checkpoint_every} iterations"
+        remedy = f"train it with `refgs train DATA -o {run.path} --resume`, or {first}"
         raise InputError("none yet", run.path, "checkpoints", remedy)
     return None
 

@@ -24,7 +24,7 @@ from mi_refgs.registry import load_again
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"  # the folder of the data set, and its region of interest
-CAMERAS = "cameras.json"  # the decision about camera corrections, and the corrected poses
+CAMERAS = "cameras.json"  # corrected poses of the training views, where they were corrected
 DECISIONS = "decisions.json"  # about components of the method
 EXPOSURE = "exposure.json"  # gains of the training views
 LOCK = ".refgs.lock"  # exists, and is locked, while a process changes the run
@@ -54,14 +54,6 @@ class Run:
         busy = "another process trains this run or writes it; wait until it ends, or choose another folder"
         return files.locked(self.path / LOCK, f"{self.path}: run folder: {busy}", wait)
 
-    def busy(self) -> bool:
-        """Whether another process has locked the run."""
-        try:
-            with self.alone():
-                return False
-        except files.BusyError:
-            return True
-
     def create(
         self,
         method: Method,
@@ -81,7 +73,9 @@ class Run:
     ) -> None:
         """Record the folder of the data set, its region, and digests of its images, by default as before."""
         record: dict[str, Any] = {"path": dataset, "images": self.images() if images is None else images}
-        record |= {} if region is None else {"region": region.content}
+        if region is not None:
+            began = self.record(DATASET).get("began", region.content)  # before it followed the object
+            record |= {"region": region.content, "began": began}
         files.write_bytes(self.path / DATASET, json.dumps(record).encode())
 
     def write_method(self, method: Method) -> None:
@@ -96,16 +90,17 @@ class Run:
             raise InputError("missing", self.path, CONFIG, remedy)
         return load_resolved(self.path / CONFIG)
 
-    def _record(self, name: str) -> dict[str, Any]:
+    def record(self, name: str) -> dict[str, Any]:
+        """The content of a JSON file of the run; {} without it."""
         return files.read_json(self.path / name) if (self.path / name).is_file() else {}
 
     def images(self) -> dict[str, str]:
         """Digests of the images and cameras that the run began with, by name; none of older runs."""
-        return dict(self._record(DATASET).get("images") or {})
+        return dict(self.record(DATASET).get("images") or {})
 
     def dataset(self) -> Path | None:
         """Folder of the data set that the run was fitted to, if it records one; raises InputError if not."""
-        if (path := self._record(DATASET).get("path")) is None:
+        if (path := self.record(DATASET).get("path")) is None:
             return None
         try:
             os.path.realpath(path)
@@ -114,14 +109,10 @@ class Run:
             remedy = "write the folder of the data set there"
             raise InputError(f"cannot be used ({error})", self.path / DATASET, "path", remedy) from error
 
-    def region(self) -> Region | None:
-        """The region of interest that the run was started with; raises InputError if it cannot be used."""
-        found = self._record(DATASET).get("region")
+    def region(self, began: bool = False) -> Region | None:
+        """The region of interest, or that of the first step; raises InputError if it cannot be used."""
+        found = self.record(DATASET).get("began" if began else "region")
         return None if found is None else Region.of(found, self.path / DATASET)
-
-    def cameras(self) -> dict[str, Any]:
-        """The decision about camera corrections, with corrected poses by view; {} for none."""
-        return self._record(CAMERAS)
 
     def decisions(self) -> list[dict[str, Any]]:
         """The decisions about components of the method so far; raises InputError if they cannot be read."""

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.region import REGION_FILE, Region
+from mi_refgs.data.region import REGION_FILE, Region, read_region
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import write_json
 from mi_refgs.io.progress import command_line
@@ -71,8 +71,8 @@ class RegionPanel:
 def save_region(region: Region, data: Dataset, again: bool = False) -> str:
     """Write a region in the coordinates of a data set's files; return what the user does next. Raises
     InputError for a region.json that is there, unless it is an estimate or this page saves it `again`."""
-    estimated = data.region is not None and data.region.estimated
-    if (data.path / REGION_FILE).exists() and not (estimated or again):
+    there = read_region(data.path)
+    if there is not None and not (there.estimated or again):
         remedy = "move it away, or correct it by hand"
         raise InputError("exists, and is no estimate", data.path / REGION_FILE, "output", remedy)
     moved = replace(region, estimated=False).moved(np.array(data.offset))

@@ -10,7 +10,7 @@ from mi_refgs.data.dataset import Dataset
 from mi_refgs.errors import InputError
 from mi_refgs.io.progress import say
 from mi_refgs.runs.export import newest
-from mi_refgs.runs.run import DATASET, Run
+from mi_refgs.runs.run import CAMERAS, DATASET, Run
 from mi_refgs.runs.views import views_of_run, with_poses
 from mi_refgs.viewer import resolution
 from mi_refgs.viewer.page import Page
@@ -46,7 +46,7 @@ def splits_of(run: Run, data: Path | None) -> dict[str, Dataset]:
     if data is not None or (run.path / DATASET).is_file():
         for split in ("train", "test"):
             try:
-                found[split] = with_poses(views_of_run(run, method, split, data), run.cameras())
+                found[split] = with_poses(views_of_run(run, method, split, data), run.record(CAMERAS))
             except InputError as error:
                 if data is not None:
                     raise

@@ -148,6 +148,10 @@ def test_render_writes_an_image(finished: Path, tmp_path: Path, capsys: pytest.C
     shown = np.clip(srgb_from_linear(channels["G"] / np.maximum(channels["A"], 1e-8)), 0, 1)
     seen = channels["A"] > 0.1
     assert seen.any() and np.abs(pixels[..., 1] - shown)[seen].max() < 0.51 / 255
+    shutil.copytree(finished, tmp_path / "grey")
+    scene = tmp_path / "grey" / "scene.xml"
+    scene.write_text(scene.read_text().replace('value="rgba"', 'value="luminance"'))
+    refused(["render", scene, "-o", png], "output: the film has Y, no red, green and blue; write an EXR file")
 
 
 def test_aovs_are_appended(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

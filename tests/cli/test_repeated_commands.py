@@ -130,7 +130,7 @@ def test_second_process_on_a_run_is_refused(
     kept = [run / "checkpoints", run / "model.json"]
     for path in kept:
         path.rename(tmp_path / path.name)
-    refused(["render", run, "-o", tmp_path / "a.exr"], "none yet; wait for the first")
+    refused(["render", run, "-o", tmp_path / "a.exr"], "none yet; train it with", "or wait for the first")
     for path in kept:
         (tmp_path / path.name).rename(path)
     process.send_signal(signal.SIGKILL)

@@ -151,6 +151,9 @@ def test_opaque_alpha_is_ignored(images: str, tmp_path: Path) -> None:
         assert found.region is not None and "no pixel is transparent" in found.notes[-1]
     assert not survey(data)["with alpha"]
     if images == "png":
+        for path in data.glob("train/r_?.png"):  # while those of test stay RGBA
+            write_png(path, read_png(path)[..., :3])
+        assert not read_dataset(data, "test").has_alpha
         for path in data.glob("*/r_?.png"):
             write_png(path, read_png(path)[..., :3])
             write_png(path.with_name(f"{path.stem}_alpha.png"), np.ones((20, 20, 3)))

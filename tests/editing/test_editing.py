@@ -146,6 +146,8 @@ def test_the_background_stays(change: Any) -> None:
     scene = replace(with_background(balls(), 0.3), near=near)
     edited = edit(scene, **change)[0]
     assert edited.near is near
+    turned = replace(balls(diffuse="irradiance"), turntable=mi.TensorXf(np.eye(3)))
+    assert edit(turned, **change)[0].turntable is turned.turntable
     before, after = image(scene), image(edited)
     alone = [image(replace(x, surroundings=None))[:, 3] for x in (scene, edited)]
     away = alone[0] + alone[1] == 0

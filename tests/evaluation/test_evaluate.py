@@ -22,7 +22,7 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods import load_resolved
 from mi_refgs.render.display import displayed
 from mi_refgs.render.pipeline import render
-from mi_refgs.runs.run import CAMERAS, Run
+from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import measured_views, read_views
 from mi_refgs.surfels.ply import write_ply
@@ -91,11 +91,15 @@ def test_trainer_metrics(run: Run, trainer: Trainer, views: Dataset, monkeypatch
 
 
 def test_one_half_of_a_view_is_aligned_and_the_other_scored(run: Run, data: Path, tmp_path: Path) -> None:
-    """Where the fit corrected its cameras. What is darker in the scored half has no influence on the gain."""
+    """Where the fit corrected cameras or exposure. What is darker in the scored half changes no gain."""
     plain = evaluate(run)
-    assert plain["psnr_aligned"] is None and "did not correct" in plain["aligned_reason"]
+    assert plain["psnr_aligned"] is None and "corrected neither" in plain["aligned_reason"]
+    run.write_json(EXPOSURE, {"gain": {}})
+    with_gains = evaluate(run)
+    (run.path / EXPOSURE).unlink()
     run.write_json(CAMERAS, {"to_world": {}})
     whole = evaluate(run)
+    assert with_gains["psnr_aligned"] == whole["psnr_aligned"]
     assert whole["psnr"] == pytest.approx(plain["psnr"], abs=1e-4) and whole["aligned_reason"] is None
     assert whole["psnr_aligned"] > whole["psnr"] + 0.5
     parts = [f"psnr_aligned{part}" for part in ("", "_object")]

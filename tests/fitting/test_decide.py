@@ -15,7 +15,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import decide
 from mi_refgs.fitting.decide import Decision, as_decided, differences, fork
 from mi_refgs.fitting.events.densify import fill
-from mi_refgs.fitting.runner import begin
+from mi_refgs.fitting.runner import Choice, Settings, begin, chosen
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.method import LIGHT, Method
 from mi_refgs.runs.run import Run
@@ -130,6 +130,12 @@ def test_components_stay_by_their_gain_alone(
     assert written == trainer.method and written.name == method.name
 
 
+@pytest.mark.parametrize("given", [{"data": {"downscale": 2}}, [" data.downscale=2"], ["data={downscale=2}"]])
+def test_settings_of_images_are_those_of_the_first_read(given: Settings, tmp_path: Path) -> None:
+    method, views = chosen(write_data(tmp_path / "ball", truth=False), Choice(None, "20:60", given))
+    assert method.data.downscale == views.downscale == 2
+
+
 def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> None:
     """Those of tables that the other method has not are left out; what Python changed is kept."""
     given = ["loss.ssim=0.3", "light.height=16", "event.mesh.resolution=9", "stage.deferred.traced_bounces=1"]
@@ -137,13 +143,13 @@ def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> No
     own = replace(own.downscaled(3), seed=5)
     (decision,) = (x for name, x in own.event.items() if name == "colour_alone")
     assert isinstance(decision, Decision)
-    chosen = decision.chosen(own, "colour_alone")
-    assert chosen.loss["ssim"].weight == 0.3 and chosen.light is None and not chosen.has_mesh
-    assert (chosen.seed, chosen.data.downscale, chosen.iterations, chosen.name) == (5, 3, 12, "own")
-    assert {*chosen.event} == {"densify", "more_surfels"} and chosen.surfels.max_count == 60
+    found = decision.chosen(own, "colour_alone")
+    assert found.loss["ssim"].weight == 0.3 and found.light is None and not found.has_mesh
+    assert (found.seed, found.data.downscale, found.iterations, found.name) == (5, 3, 12, "own")
+    assert {*found.event} == {"densify", "more_surfels"} and found.surfels.max_count == 60
     rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x", "metal")]
     decided = as_decided(own, rows)
-    assert decided == replace(chosen, surfels=replace(chosen.surfels, capacity=2.0))
+    assert decided == replace(found, surfels=replace(found.surfels, capacity=2.0))
     assert as_decided(decided, rows) == decided
     with pytest.raises(InputError, match="light: it is given"):
         decision.chosen(methods.load(file, "quick", [*SETTINGS, "light.turntable=true"]), "colour_alone")

@@ -337,6 +337,11 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
     assert run.region() == REGION
     begin(method, read_dataset(folder, "train"), run, said.append)
     assert not any("changed" in text for text in said) and views_of_run(run, method, "test").region == REGION
+    smaller = replace(REGION, radius=0.3)
+    run.write_dataset(str(folder), smaller)  # it followed the object: cameras turn about the first one
+    assert begin(method, read_dataset(folder, "train"), run).setup.data.region == REGION
+    assert run.region() == smaller == views_of_run(run, method, "test").region
+    run.write_dataset(str(folder), REGION)
     for text in ('{"centre": [0, 0, 0.1], "radius": 0.7}', '{"centre": [0, 0, 0], "radius": 0.5}', None):
         file = folder / REGION_FILE
         file.unlink()

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -49,6 +50,8 @@ def test_registered_format_is_a_choice_of_the_command(
     assert trained.surfels.count > 0 and [shot.split for shot in shots] == ["test"] * 2 + ["train"] * 3
     assert main(["export", "--help"]) == 0
     assert "plain         a number" in capsys.readouterr().out
+    assert main(["export", str(finished), "--to", "plain", "-o", str(target), "--level", "0"]) == 0
+    assert target.read_text() == "0"  # given, and no default
 
 
 def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: Path, tmp_path: Path) -> None:
@@ -59,6 +62,9 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
     assert files == {MARK, "plain.txt", "cameras", "exr.exr", "3dgs-ply.ply", "gltf-splats.glb"}
     assert (tmp_path / "out" / "plain.txt").read_text() == "3"
     assert (tmp_path / "out" / "cameras" / "transforms.json").is_file()
+    for _ in range(2):  # a folder again
+        assert main(["export", str(finished), "--to", "cameras", "-o", str(tmp_path / "one")]) == 0
+    assert (tmp_path / "one" / "transforms.json").is_file() and not (tmp_path / "one" / "cameras").exists()
 
 
 @pytest.mark.parametrize(
@@ -81,6 +87,22 @@ def test_bad_export_arguments_are_refused(
 ) -> None:
     words = [word.replace("OUT", str(tmp_path / "out")) for word in arguments]
     refused(["export", finished, *words], message)
+
+
+def test_splats_need_no_test_images(
+    run: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = shutil.copytree(data, tmp_path / "data")
+    for path in other.glob("test/r_*"):
+        path.unlink()
+    given = Provenance.of(Run(run)).with_data(other)
+    refused(lambda: given.shots(TrainedScene.read(run), "test"), "missing")
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        target = tmp_path / "splats.ply"
+        assert main(["export", str(run), "--data", str(other), "--to", "3dgs-ply", "-o", str(target)]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert target.is_file() and any(x.startswith("refgs: warning: test views are left out: ") for x in said)
 
 
 @pytest.mark.parametrize("record", [None, '{"path": "gone"}'])

@@ -66,7 +66,7 @@ def image(of: mi.Scene, **arguments: object) -> np.ndarray:
     return mi.render(of, **arguments).numpy()
 
 
-def joined(voxel: float, *parts: trimesh.Trimesh) -> Mesh:
+def joined(voxel: float, *parts: Any) -> Mesh:
     whole: Any = trimesh.util.concatenate(parts)
     return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.uint32), voxel)
 

@@ -61,6 +61,8 @@ def test_a_region_of_others_is_not_replaced(data: Dataset) -> None:
     file = data.path / "region.json"
     before = file.read_text()
     refused(lambda: save_region(FITTED, data), str(file))
+    run_of_before = replace(data, region=replace(REGION, estimated=True))  # the file came later
+    refused(lambda: save_region(FITTED, run_of_before), str(file))
     assert file.read_text() == before
 
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from mi_refgs.data.view import View, evenly_spread
 from mi_refgs.fitting.decide import Row, conclude, run
 from mi_refgs.fitting.image_error import displayed_image, squared_error
+from mi_refgs.fitting.per_view import gains_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload
@@ -48,8 +49,8 @@ class Metal(Event[Trainer]):
         began, steps = time.perf_counter(), min(self.trial, trainer.method.iterations)
         trainer.tell(f"begins as dielectric and as metal, {steps} iterations each")
         fits = [_begun(trainer, metallic, steps) for metallic in (DIELECTRIC, METAL)]
-        views = [trainer.data.views[i] for i in evenly_spread(len(trainer.data.views), JUDGED_VIEWS)]
-        errors = [[_squared_error(fit, view) for view in views] for fit in fits]
+        judged = evenly_spread(len(trainer.data.views), JUDGED_VIEWS)
+        errors = [[_squared_error(fit, i) for i in judged] for fit in fits]
         dielectric, metal = (psnr_of(float(np.mean([error.mean() for error in one]))) for one in errors)
         gain = METAL_GAIN * max(MANY_VIEWS / len(trainer.data.views), 1) ** 0.5
         is_metal = metal >= dielectric + gain
@@ -59,6 +60,7 @@ class Metal(Event[Trainer]):
         # Each surfel starts as what has the smaller error around it.
         excess = [one - 10 ** (gain / 10) * other for one, other in zip(*errors, strict=True)]
         raw = trainer.surfels.to_numpy()
+        views = [trainer.data.views[i] for i in judged]
         metals = _sum_around(raw["position"], _attributed(trainer.surfels, views, excess)) > 0
         raw["metallic"] = np.where(metals[:, None], logit(METAL), logit(DIELECTRIC)).astype(np.float32)
         trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("metallic",))
@@ -79,9 +81,11 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
     return run(copy, steps, trainer)
 
 
-def _squared_error(trainer: Trainer, view: View) -> np.ndarray:
+def _squared_error(trainer: Trainer, index: int) -> np.ndarray:
     """Squared error (H, W) of a displayed training image, mean over its channels."""
-    shown = displayed_image(trainer.view(view.camera(), aovs=False), view, trainer.data)
+    view, gains = trainer.data.views[index], gains_of(trainer.fit.params)
+    frame = trainer.view(trainer.camera(index), aovs=False)
+    shown = displayed_image(frame, view, trainer.data, None if gains is None else gains[index])
     return np.asarray(squared_error(shown, view).mean(axis=-1))
 
 

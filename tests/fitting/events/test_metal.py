@@ -12,6 +12,8 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.events import metal as event
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.train import Trainer
+from mi_refgs.kernels.device import upload_tensor
+from mi_refgs.methods.method import GAIN as GAIN_ROWS
 from mi_refgs.runs.run import Run
 from mi_refgs.splat import splat
 from mi_refgs.surfels.attributes import sigmoid
@@ -127,6 +129,15 @@ def test_images_of_a_fit_decide(
     assert trainer.iteration == again.iteration == 4
     for name, raw in trainer.surfels.raw.items():
         np.testing.assert_array_equal(raw.numpy(), again.surfels.raw[name].numpy(), name)
+
+
+def test_errors_are_those_of_images_with_gains(views: Dataset, tmp_path: Path) -> None:
+    trainer = Trainer(methods.load(str(write_method(tmp_path)), "quick", SETTINGS), views)
+    plain, log = event._squared_error(trainer, 1), np.zeros((VIEWS, 3), np.float32)
+    log[1] = 1.0
+    trainer.fit.params[GAIN_ROWS] = upload_tensor(log)
+    other = event._squared_error(trainer, 1)
+    assert plain.shape == other.shape and np.abs(plain - other).max() > 1e-3
 
 
 def test_what_cannot_be_tried_is_refused() -> None:

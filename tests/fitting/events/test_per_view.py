@@ -275,11 +275,11 @@ def test_fit_resumes_bit_for_bit(
     assert second.setup.groups(second.fit.params)[POSE].begin == AFTER
     poses = [second.camera(i).pose().tolist() for i in range(len(data.views))]
     run.write_json(CAMERAS, {"to_world": dict(zip((view.name for view in data.views), poses, strict=True))})
-    for i, view in enumerate(with_poses(data, run.cameras()).views):
+    for i, view in enumerate(with_poses(data, run.record(CAMERAS)).views):
         np.testing.assert_array_equal(view.to_world, second.camera(i).pose())
     fewer = replace(data, views=data.views[1:])
     for others in (fewer, replace(data, split="test")):
-        assert with_poses(others, run.cameras()) is others
+        assert with_poses(others, run.record(CAMERAS)) is others
     for name, other, width in ((GAIN, POSE, 3), (POSE, GAIN, 6)):
         one = {key: values for key, values in state.items() if key != f"params/{other}"}
         words = f"{name}: it has (6, {width}), a fit", f"(5, {width})"
