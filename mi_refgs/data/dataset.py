@@ -305,7 +305,8 @@ def read_dataset(
     # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training)
     views = tuple(_moved(view, offset) for view in views)
-    views = tuple(replace(view, near=NEAR_EXTENTS * _extent(training)) for view in views)
+    extent = _extent(views if len(views) > 1 else training)
+    views = tuple(replace(view, near=NEAR_EXTENTS * extent) for view in views)
     if (region := read_region(path)) is not None:
         region = region.moved(-offset)
     elif without:
