@@ -8,9 +8,8 @@ import numpy as np
 import trimesh
 
 from mi_refgs.data.dataset import Dataset
-from mi_refgs.data.region import REGION_FILE, Region, read_region
+from mi_refgs.data.region import REGION_FILE, Region, read_region, write_region
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import write_json
 from mi_refgs.io.progress import command_line
 from mi_refgs.viewer.page import Page
 
@@ -76,7 +75,7 @@ def save_region(region: Region, data: Dataset, again: bool = False) -> str:
         remedy = "move it away, or correct it by hand"
         raise InputError("exists, and is no estimate", data.path / REGION_FILE, "output", remedy)
     moved = replace(region, estimated=False).moved(np.array(data.offset))
-    write_json(data.path / REGION_FILE, moved.content)
+    write_region(data.path, moved)
     return f"saved `{data.path / REGION_FILE}`; next: `{command_line('train', data.path, '-o', 'RUN')}`"
 
 
