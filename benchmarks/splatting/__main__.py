@@ -86,7 +86,7 @@ def compare(workload: Workload, size: int) -> dict[str, float]:
     share of the pixels in the float64 reference's declared band; image: largest error of radiance and alpha;
     gradient_…: of each class of parameters."""
     around = crop(workload, size, MARGIN)
-    lists = list_by_tile(project(around.surfels(), around.camera()), around.camera())
+    lists = list_by_tile(project([around.surfels()], around.camera()), around.camera())
     near = np.unique(np.array(lists.surfel_from_pair))
     raw = {name: values[near] for name, values in workload.raw.items()}
     raw["radiance_sh"] = workload.features[near, :3] - 0.5

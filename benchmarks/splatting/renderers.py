@@ -56,13 +56,13 @@ class Ours:
     def forward(self) -> list[Any]:
         """Every map."""
         with dr.suspend_grad():
-            return _maps(splat(Surfels(self.raw), self.columns, self.camera))
+            return _maps(splat([Surfels(self.raw)], self.columns, self.camera))
 
     def both(self) -> list[Any]:
         """Every map, and the gradients of every parameter for fixed adjoints of the maps."""
         raw, columns = dr.detach(self.raw), dr.detach(self.columns)
         dr.enable_grad(raw, columns)
-        maps = _maps(splat(Surfels(raw), columns, self.camera))
+        maps = _maps(splat([Surfels(raw)], columns, self.camera))
         for image, weight in zip(maps, self.weights, strict=True):
             dr.set_grad(image, weight)
         dr.enqueue(dr.ADMode.Backward, maps)
@@ -71,7 +71,7 @@ class Ours:
 
     def counts(self) -> Counts:
         """Walk the lists as `splat.composite` does, and count; waits for the device."""
-        camera, footprints = self.camera, project(Surfels(dr.detach(self.raw)), self.camera)
+        camera, footprints = self.camera, project([Surfels(dr.detach(self.raw))], self.camera)
         lists, (width, height) = list_by_tile(footprints, camera), camera.tile
         if not lists.pairs:
             return Counts(0, 0, 0)

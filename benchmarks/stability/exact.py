@@ -13,7 +13,7 @@ from mi_refgs.reference.light import Light, dense_filter, filtered
 from mi_refgs.reference.occlusion import mirror_visibility
 from mi_refgs.shade import brdf
 from mi_refgs.shade.light import lobe_matrices
-from mi_refgs.splat import Camera, list_by_tile, project, surfel_count
+from mi_refgs.splat import Camera, list_by_tile, project
 from mi_refgs.surfels.table import Surfels
 
 
@@ -53,7 +53,7 @@ def product_order(case: Case, pixels: Array, around: dict[str, Array] | None = N
     `around`: raw attributes of a background, which is numbered after the surfels of the case."""
     camera = fast_camera(case)
     tables = [Surfels.from_numpy(raw) for raw in (case.raw, around) if raw is not None]
-    count = surfel_count(tables)
+    count = sum(table.count for table in tables)
     lists = list_by_tile(project(tables, camera), camera)
     listed, begin, end = (
         np.array(x).astype(int) for x in (lists.surfel_from_pair, lists.pair_begin, lists.pair_end)

@@ -30,7 +30,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_basis
-from mi_refgs.splat import Camera, Tables, splat, surfel_count
+from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 from mi_refgs.surfels.ply import write_ply as write_surfels
 from mi_refgs.surfels.table import Surfels
@@ -131,8 +131,9 @@ class _BlendedView:
     alpha: Float  # (H*W,)
 
     @staticmethod
-    def of(tables: Tables, colours: Sequence[np.ndarray], camera: Camera) -> "_BlendedView":
-        inputs = [*(upload(plane) for plane in colours), dr.opaque(mi.Float, 0, surfel_count(tables))]
+    def of(tables: Sequence[Surfels], colours: Sequence[np.ndarray], camera: Camera) -> "_BlendedView":
+        count = sum(table.count for table in tables)
+        inputs = [*(upload(plane) for plane in colours), dr.opaque(mi.Float, 0, count)]
         dr.enable_grad(inputs)
         blended = splat(tables, inputs, camera)
         return _BlendedView(inputs, list(blended.features), dr.detach(blended.alpha))
@@ -179,7 +180,7 @@ class _ColourFit:
         render = self.trained.renderer(aovs=False)
         for camera in self.cameras:
             basis = self._basis(camera)
-            view = _BlendedView.of(self.table, [np.zeros(count, np.float32)] * 3, camera)
+            view = _BlendedView.of([self.table], [np.zeros(count, np.float32)] * 3, camera)
             frame = render(camera)
             encoded = display_image(list(frame.radiance), frame.alpha, [0.0] * 3)
             images = [dr.minimum(x, frame.alpha) - 0.5 * view.alpha for x in encoded]
@@ -199,7 +200,7 @@ class _ColourFit:
         out = self.ridge[:, :, None] * coefficients
         for camera in self.cameras:
             basis = self._basis(camera)
-            view = _BlendedView.of(self.table, [*np.einsum("nk,nkc->cn", basis, coefficients)], camera)
+            view = _BlendedView.of([self.table], [*np.einsum("nk,nkc->cn", basis, coefficients)], camera)
             *sums, _ = view.weighted_sums([dr.detach(plane) for plane in view.planes[:3]])
             out += basis[:, :, None] * np.stack(sums, axis=1)[:, None]
         return out

@@ -28,8 +28,8 @@ from mi_refgs.shade.light.near_field import LocalLight, NearField
 from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace
-from mi_refgs.splat import Camera, splat, splat_compact
-from mi_refgs.splat.composite import inverse_alpha
+from mi_refgs.splat import Camera, list_by_tile, project, splat
+from mi_refgs.splat.composite import composite_compact, inverse_alpha
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
@@ -137,7 +137,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
 
 def render_depth(surfels: Surfels, camera: Camera, around: Surfels | None = None) -> tuple[Float, Float]:
     """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with those around them."""
-    blended = splat(surfels if around is None else (surfels, around), [], camera)
+    blended = splat([surfels] if around is None else [surfels, around], [], camera)
     return blended.depth * inverse_alpha(blended.alpha), blended.alpha
 
 
@@ -180,7 +180,8 @@ class _View:
         values = features(slots)
         if self.request.forward_only:
             depth = "depth" in self.asked or self.scene.near is not None
-            blended = splat_compact(self.geometry, values, self.camera, depth, features(turns))
+            lists = list_by_tile(project(self.geometry, self.camera), self.camera, values, features(turns))
+            blended = composite_compact(lists, depth)
         else:
             if self.request.attribution is not None:
                 values.insert(few, self.request.attribution)

@@ -6,20 +6,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.splat import Tables, list_by_tile, project, splat, surfel_count, tables_of
+from mi_refgs.splat import list_by_tile, project, splat
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.composite import inverse_alpha
+from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
 
 def blended_weights(
-    surfels: Tables, camera: Camera, maps: Sequence[Float | float] = (1.0,), depth: bool = False
+    surfels: Sequence[Surfels], camera: Camera, maps: Sequence[Float | float] = (1.0,), depth: bool = False
 ) -> list[np.ndarray]:
     """Sums Σ w m (N,) float64 of blending weights, for each map m (H·W,): gradients of Σ m Σ w f by f. A map
     of 1 gives pixels; with `depth`, the last one is the expected depth of the view."""
-    features = [dr.opaque(mi.Float, 0, surfel_count(surfels)) for _ in range(len(maps) + depth)]
+    count = sum(table.count for table in surfels)
+    features = [dr.opaque(mi.Float, 0, count) for _ in range(len(maps) + depth)]
     dr.enable_grad(features)
-    blended = splat([table.detach() for table in tables_of(surfels)], features, camera)
+    blended = splat([table.detach() for table in surfels], features, camera)
     if depth:
         maps = [*maps, dr.detach(blended.depth * inverse_alpha(blended.alpha))]
     total = dr.sum(sum(m * image for m, image in zip(maps, blended.features, strict=True)))
@@ -28,8 +30,8 @@ def blended_weights(
     return [np.array(dr.grad(feature), dtype=np.float64) for feature in features]
 
 
-def listed_tiles(surfels: Tables, camera: Camera) -> np.ndarray:
+def listed_tiles(surfels: Sequence[Surfels], camera: Camera) -> np.ndarray:
     """Tiles (N,) of an image in whose lists each of N surfels is: what it costs, wherever it is hidden."""
     with dr.suspend_grad():
         lists = list_by_tile(project(surfels, camera), camera)
-    return np.bincount(np.array(lists.surfel_from_pair), minlength=surfel_count(surfels))
+    return np.bincount(np.array(lists.surfel_from_pair), minlength=sum(table.count for table in surfels))

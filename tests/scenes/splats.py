@@ -38,7 +38,7 @@ class Scene:
 
     def splat(self, surfels: Surfels, columns: list) -> Composited:
         count = self.features.shape[1]
-        return splat(surfels, columns[:count], self.fast_camera(), columns[count:])
+        return splat([surfels], columns[:count], self.fast_camera(), columns[count:])
 
     def exact(self, raw: dict[str, np.ndarray] | None = None) -> reference.Maps:
         return reference.splat(raw or self.raw, self.features, self.camera, turns=self.turns)

@@ -11,6 +11,7 @@ import pytest
 
 from mi_refgs import splat
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render import pipeline
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
@@ -96,8 +97,8 @@ def test_nothing_in_view_is_black() -> None:
 @pytest.mark.parametrize("at", ["surfel", "pixel"])
 @pytest.mark.parametrize("name", ["", *sorted(ALL)])
 def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    composite = Mock(wraps=splat.composite_compact)
-    monkeypatch.setattr(splat, "composite_compact", composite)
+    composite = Mock(wraps=pipeline.composite_compact)
+    monkeypatch.setattr(pipeline, "composite_compact", composite)
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
     scene = SurfelScene(things(), shading, shading.light_of(light), Occluder(two_balls()))
@@ -114,7 +115,7 @@ def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pyt
 
 def test_compacted_pixels_contain_each_pixel_of_chosen_patches_once() -> None:
     view = camera_at(30.0, (3, 2))
-    footprints = splat.project(things(), view)
+    footprints = splat.project([things()], view)
     lists = splat.list_by_tile(footprints, view)
     chosen = Lanes.filled(lists)
     assert 0 < dr.width(chosen) < Grid(view).patches
@@ -122,7 +123,7 @@ def test_compacted_pixels_contain_each_pixel_of_chosen_patches_once() -> None:
     there, raster = np.array(pixels.there), np.array(pixels.raster)
     back = raster[np.array(pixels.index)[there]]
     np.testing.assert_array_equal(back, np.flatnonzero(there))
-    alpha = np.array(splat.splat(things(), [], view).alpha)
+    alpha = np.array(splat.splat([things()], [], view).alpha)
     assert not alpha[~there].any() and alpha[there].any()
 
 

@@ -161,7 +161,7 @@ def test_tile_lists_hold_what_contributes_and_little(kind: Primitive, seed: int,
     scene.raw["scale"][:, 0] += 2 * (thinness < 1)
     scene.raw["scale"][:, 1] += np.log(thinness)
     camera = scene.fast_camera()
-    lists = list_by_tile(project(scene.surfels(), camera), camera)
+    lists = list_by_tile(project([scene.surfels()], camera), camera)
     begin, end, surfel = (x.numpy() for x in (lists.pair_begin, lists.pair_end, lists.surfel_from_pair))
     listed = {(int(i), tile) for tile in range(len(begin)) for i in surfel[begin[tile] : end[tile]]}
     assert len(listed) == lists.pairs, "a pair is listed twice"
@@ -181,7 +181,7 @@ def test_tile_lists_hold_what_contributes_and_little(kind: Primitive, seed: int,
 def test_tile_lists_are_in_the_oracles_order(kind: Primitive, seed: int, tile: tuple[int, int]) -> None:
     scene = kind.make(seed)
     camera = scene.fast_camera()
-    lists = list_by_tile(project(scene.surfels(), camera), camera)
+    lists = list_by_tile(project([scene.surfels()], camera), camera)
     pixels = np.arange(camera.width * camera.height)
     order = oracle.sorted_rows([scene.raw], scene.camera, pixels).reshape(-1, camera.height, camera.width)
     surfel, compared = lists.surfel_from_pair.numpy(), 0
@@ -270,7 +270,7 @@ def test_second_view_compiles_nothing() -> None:
 def test_candidates_in_parts_give_the_same_lists(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scenes.make_scene(13)
     camera = scene.fast_camera()
-    footprints = project(scene.surfels(), camera)
+    footprints = project([scene.surfels()], camera)
     whole = list_by_tile(footprints, camera)
     monkeypatch.setattr(tiles, "CHUNK", chunk)
     assert len(list(tiles._candidates(footprints, camera))) > (1 if chunk < 20_000 else 0)
@@ -288,7 +288,7 @@ def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: 
     raw = scenes.discs(position=position, scale=np.full((count, 2), 4.0))
     camera = Camera.from_pose(1024, 1024, -500, -500, 512, 512, np.eye(4))
     with pytest.raises(InputError, match=r"65,536 tiles of 1024 × 1024 pixels; render fewer pixels"):
-        splat(Surfels.from_numpy(raw), [], camera)
+        splat([Surfels.from_numpy(raw)], [], camera)
 
 
 @pytest.mark.parametrize("opacity", [0.9, 0.3, 0.05])
@@ -303,7 +303,7 @@ def test_the_cut_biases_gradients_by_what_is_documented(opacity: float) -> None:
         surfels.enable_grad()
         centre = (size / 2 + x / places, size / 2 + y / places)
         camera = Camera.from_pose(size, size, -focal, -focal, *centre, np.eye(4))
-        total = dr.sum(splat(surfels, [], camera).alpha)
+        total = dr.sum(splat([surfels], [], camera).alpha)
         dr.backward(total)
         mass += float(total[0]) / places**2
         by_size += dr.grad(surfels.raw["scale"]).numpy().sum() / places**2

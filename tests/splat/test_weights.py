@@ -21,9 +21,9 @@ def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) 
     surfels = Surfels.from_numpy(raw_channels())
     view = camera((0, -4, 1))
     values = rng.random(24 * 24).astype(np.float32)
-    weight, weighted, deep = blended_weights(surfels, view, [mi.Float(1), mi.Float(values)], depth=True)
+    weight, weighted, deep = blended_weights([surfels], view, [mi.Float(1), mi.Float(values)], depth=True)
     features = [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)]
-    blended = splat(surfels, features, view)
+    blended = splat([surfels], features, view)
     images = np.array([image.numpy() for image in blended.features], np.float64)
     assert images.any()
     np.testing.assert_allclose(weight, images.sum(axis=1), rtol=1e-4, atol=1e-5)
@@ -35,17 +35,17 @@ def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) 
 def test_surfels_behind_the_camera_have_no_weights() -> None:
     surfels = Surfels.from_numpy(raw_channels())
     away = Camera.look_at((0, -4, 1), (0, -8, 1), fov=40, size=24)
-    assert not blended_weights(surfels, away)[0].any()
-    assert not listed_tiles(surfels, away).any()
+    assert not blended_weights([surfels], away)[0].any()
+    assert not listed_tiles([surfels], away).any()
 
 
 def test_surfels_are_listed_in_the_tiles_that_they_cover(rng: np.random.Generator) -> None:
     """A surfel contributes to the pixels of no other tile; behind others it costs as much."""
     surfels, view = Surfels.from_numpy(raw_channels()), camera((0, -4, 1))
-    tiles = listed_tiles(surfels, view)
+    tiles = listed_tiles([surfels], view)
     width, height = view.tile
     for index in range(surfels.count):
-        alone = surfels.gather(mi.UInt32(index))
+        alone = [surfels.gather(mi.UInt32(index))]
         alpha = splat(alone, [], view).alpha.numpy().reshape(24, 24) > 0
         rows, columns = np.nonzero(alpha)
         shown = {(row // height, column // width) for row, column in zip(rows, columns, strict=True)}

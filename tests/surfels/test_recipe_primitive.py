@@ -152,12 +152,12 @@ def test_balls_are_splatted_and_differentiated() -> None:
     rng, surfels = np.random.default_rng(1), balls()
     feature, weights = rng.uniform(size=30), rng.normal(size=(3, 20, 24))
     raw = {name: values.astype(np.float64) for name, values in surfels.to_numpy().items()}
-    maps = splat(surfels, [upload(feature)], camera())
+    maps = splat([surfels], [upload(feature)], camera())
     found = np.stack([np.array(m).reshape(20, 24) for m in (maps.features[0], maps.depth, maps.alpha)])
     np.testing.assert_allclose(found, in_numpy(raw, feature), atol=2e-5)
 
     def loss() -> Any:
-        maps = splat(surfels, [upload(feature)], camera())
+        maps = splat([surfels], [upload(feature)], camera())
         values = (maps.features[0], maps.depth, maps.alpha)
         return sum((dr.sum(v * upload(w)) for v, w in zip(values, weights, strict=True)), mi.Float(0))
 

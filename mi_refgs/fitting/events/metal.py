@@ -93,7 +93,7 @@ def _attributed(surfels: Surfels, views: list[View], errors: list[np.ndarray]) -
     """The error (N,) that each surfel is responsible for: Σ w e over the pixels of maps (H, W) of views."""
     total = np.zeros(surfels.count)
     for view, error in zip(views, errors, strict=True):
-        total += blended_weights(surfels, view.camera(), [upload(error)])[0]
+        total += blended_weights([surfels], view.camera(), [upload(error)])[0]
     return total
 
 

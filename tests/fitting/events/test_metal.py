@@ -99,7 +99,7 @@ def test_errors_are_attributed_by_blending_weights(views: Dataset, tmp_path: Pat
     surfels, view = trainer.surfels.detach(), views.views[0]
     error = np.random.default_rng(0).random((SIZE, SIZE))
     found = event._attributed(surfels, [view, view], [error, 2 * error])
-    alpha = splat(surfels, [], view.camera()).alpha.numpy().reshape(SIZE, SIZE)
+    alpha = splat([surfels], [], view.camera()).alpha.numpy().reshape(SIZE, SIZE)
     assert found.shape == (surfels.count,) and found.min() >= 0
     np.testing.assert_allclose(found.sum(), 3 * (error * alpha).sum(), rtol=1e-4)
 
