@@ -73,8 +73,7 @@ def region_of_interest(solved: Solved) -> Region:
     if np.count_nonzero(near) >= 50:  # with fewer, the cameras alone determine the radius
         reach = weighted_quantile(offset[near], solved.length[near], 0.9)
         radius = max(reach, 0.5 * radius)  # points are only where the object has texture
-    x, y, z = (float(c) for c in focus)
-    sphere, seen = Region((x, y, z), radius), partial(seen_share, solved)
+    sphere, seen = Region(tuple(map(float, focus)), radius), partial(seen_share, solved)
     found = object_region(sphere, solved.origin, solved.points, seen)
     nearest = float(np.linalg.norm(solved.origin - np.array(found.centre), axis=1).min())
     return replace(found, radius=min(found.radius, CAMERA_SHARE * nearest))  # a fit encloses what is outside

@@ -94,8 +94,7 @@ def support_planes(
             up = across * np.sign(across @ up)
             level = float(up @ middle)
         level += PLANE_MARGIN * radius
-        x, y, z = map(float, up)
-        found.append((x, y, z, level))
+        found.append((*map(float, up), level))
         points = points[points @ up > level]
     return tuple(found)
 
@@ -143,10 +142,9 @@ def enclosed(points: np.ndarray, region: Region, origins: np.ndarray) -> Region:
         if np.all(height >= lowest):
             i = int(np.argmin(np.where(height < 0, height - nearest, np.inf)))
             lowest[i] = CAMERA_SHARE * height[i] if height[i] >= nearest[i] else nearest[i]
-    x, y, z = map(float, centre)
-    offsets = normals @ centre + lowest
-    hull = [(a, b, c, d) for a, b, c, d in np.column_stack([normals, offsets]).tolist()]
-    return replace(region, centre=(x, y, z), radius=(1 + MARGIN) * radius, planes=(*region.planes, *hull))
+    middle = tuple(map(float, centre))
+    hull = map(tuple, np.column_stack([normals, normals @ centre + lowest]).tolist())
+    return replace(region, centre=middle, radius=(1 + MARGIN) * radius, planes=(*region.planes, *hull))
 
 
 def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatter) -> np.ndarray:

@@ -23,14 +23,14 @@ CAMERA_SHARE = 0.8  # its largest radius over the nearest camera's distance: cam
 SAME = 1e-6  # difference of two regions, in radii, up to which they are the same: last digits of solvers
 SMALLEST = 1e-6  # least radius over the largest coordinate of a camera: float32 resolves no smaller lengths
 
-Plane = tuple[float, float, float, float]  # unit normal (a, b, c) and offset d of a x + b y + c z ≥ d
+Plane = tuple[float, ...]  # unit normal (a, b, c) and offset d of a x + b y + c z ≥ d
 
 
 @dataclass(frozen=True)
 class Region:
     """A sphere, or the part of it that is above planes."""
 
-    centre: tuple[float, float, float]  # world
+    centre: tuple[float, ...]  # (3,) world
     radius: float  # scene units, positive
     planes: tuple[Plane, ...] = ()
     estimated: bool = field(default=False, compare=False)  # from cameras and points, not given by a user
@@ -50,10 +50,8 @@ class Region:
             length = 0.0 if plane is None else float(np.linalg.norm(plane[:3]))
             if plane is None or not length >= 1 / MAX_NUMBER:
                 raise InputError("not [a, b, c, d] of a x + b y + c z ≥ d each", source, "planes", remedy)
-            a, b, c, d = (number / length for number in plane)
-            planes.append((a, b, c, d))
-        x, y, z = centre
-        return Region((x, y, z), radius[0], tuple(planes), given.get("estimated") is True)
+            planes.append(tuple(number / length for number in plane))
+        return Region(tuple(centre), radius[0], tuple(planes), given.get("estimated") is True)
 
     @property
     def content(self) -> dict[str, Any]:
@@ -73,9 +71,8 @@ class Region:
         return self.planes
 
     def moved(self, offset: np.ndarray) -> Region:
-        x, y, z = (float(c) for c in np.array(self.centre) + offset)
         planes = tuple((a, b, c, d + float(np.dot((a, b, c), offset))) for a, b, c, d in self.planes)
-        return replace(self, centre=(x, y, z), planes=planes)
+        return replace(self, centre=tuple(map(float, np.add(self.centre, offset))), planes=planes)
 
     def is_close(self, other: Region) -> bool:
         """Whether two regions are the same but for the last digits."""
@@ -131,8 +128,7 @@ def region_of(views: Sequence[View]) -> Region:
     if 2 * sum(ahead) <= len(views) or not radius > SMALLEST * float(np.abs(origins).max()):
         what = "they do not look at one point in front of them"
         raise InputError(what, "views", "cameras", "give a region.json")
-    x, y, z = (float(c) for c in focus)
-    return Region((x, y, z), radius, estimated=True)
+    return Region(tuple(map(float, focus)), radius, estimated=True)
 
 
 def region_radius(distance: np.ndarray, half_angle: np.ndarray) -> float:

@@ -36,7 +36,7 @@ def of_diffuse_colour(η: Float, params: Params, name: str) -> Float:
 class ByDistance:
     """Rows of positions learn at the rate times their distance from the centre, in this unit."""
 
-    centre: tuple[float, float, float]
+    centre: tuple[float, ...]  # (3,)
     unit: float
 
     def __call__(self, η: Float, params: Params, name: str) -> Float:

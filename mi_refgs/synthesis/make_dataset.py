@@ -103,8 +103,7 @@ def around_object(
     cameras = Cameras(given, centre, radius, farthest, about)
     if not about:
         return cameras, shapes, None
-    x, y, z = (float(c) for c in centre)
-    region = Region((x, y, z), REGION_MARGIN * radius, estimated=True)  # fits look for what supports it
+    region = Region(tuple(map(float, centre)), REGION_MARGIN * radius, estimated=True)  # fits seek a support
     if cameras.distance[0] <= region.radius:
         what = f"{cameras.distance[0]:.4g} is inside of the region around the object"
         raise InputError(f"{what}, whose radius is {region.radius:.4g}", scene, "--distance", "give more")

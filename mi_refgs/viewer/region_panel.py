@@ -85,8 +85,7 @@ def adjusted(region: Region, centre: np.ndarray, radius: float, heights: Sequenc
     for a, b, c, d in region.planes[len(heights) :]:
         inward = d - float(np.dot((a, b, c), region.centre))
         planes.append((a, b, c, float(np.dot((a, b, c), centre)) + radius / region.radius * inward))
-    x, y, z = map(float, centre)
-    return Region((x, y, z), radius, tuple(planes))
+    return Region(tuple(map(float, centre)), radius, tuple(planes))
 
 
 def border(region: Region) -> trimesh.Trimesh:
