@@ -5,7 +5,7 @@ and other photographs or options begin anew."""
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from mi_refgs.data.region import REGION_FILE, Region, read_region, write_region
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import read_json, replace_file, write_json
 from mi_refgs.io.images import image_size
-from mi_refgs.io.progress import command_line, with_bar
+from mi_refgs.io.progress import Tell, command_line, with_bar
 
 PLOT, OLD_REGION = "capture.png", "region.old.json"
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
@@ -41,7 +41,7 @@ def capture(
     masks: Path | None = None,
     camera: str | None = None,
     region: Region | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = lambda _: None,
 ) -> dict[str, Any]:
     """Reconstruct the cameras of the photographs in folder `source` and write the data set `folder`.
     `camera`: COLMAP's lens model, or None for the simplest of three that fits. `region`: in the data set's
@@ -117,9 +117,7 @@ def _hash(inputs: list[Any]) -> str:
     return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:12]
 
 
-def _solve(
-    source: Path, work: Path, copies: dict[str, Photograph], camera: str | None, tell: Callable[[str], None]
-) -> None:
+def _solve(source: Path, work: Path, copies: dict[str, Photograph], camera: str | None, tell: Tell) -> None:
     """Write work/model: the reconstruction of the largest group."""
     images, database, names = work / "pictures", work / "features.db", sorted(copies)
     # Features of working copies.

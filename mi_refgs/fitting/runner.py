@@ -4,7 +4,7 @@ import hashlib
 import itertools
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from mi_refgs.fitting.per_view import gains_of
 from mi_refgs.fitting.state import decisions_of
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import resource_dir
-from mi_refgs.io.progress import command_line
+from mi_refgs.io.progress import Tell, command_line
 from mi_refgs.methods.method import POSE, Method
 from mi_refgs.registry import plugin_options
 from mi_refgs.runs.export import write_if_stale
@@ -33,7 +33,6 @@ from mi_refgs.runs.views import read_views, sized, with_region
 from mi_refgs.shade.light.placed import PlacedLight
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
-Tell = Callable[[str], None]  # is called with sentences for the user
 Settings = Mapping[str, object] | Sequence[str]
 """Changes of a method: {"loss.ssim": 0.1}, or as on the command line, ["loss.ssim=0.1"]."""
 

@@ -2,11 +2,12 @@
 
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
+Tell = Callable[[str], None]  # is called with sentences for the user
 _NOTED: set[tuple[Path, str]] = set()
 
 

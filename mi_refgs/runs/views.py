@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from mi_refgs.data.dataset import Dataset, read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
+from mi_refgs.io.progress import Tell
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.run import DATASET, Run
@@ -19,9 +20,7 @@ from mi_refgs.runs.run import DATASET, Run
 MEASURED = 640  # pixels along the longer side of scored photographs: larger ones differ in noise and focus
 
 
-def sized(
-    method: Method, path: Path | Dataset, tell: Callable[[str], None] = lambda _: None
-) -> tuple[Method, Dataset]:
+def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> tuple[Method, Dataset]:
     """The method with its image size decided, and training views without ground truth: `data.downscale`, or
     the least for its preset's pixels, which calls `tell`. Raises InputError as `read_dataset` does."""
     pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
@@ -85,9 +84,7 @@ def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:
     return replace(views, views=tuple(corrected))
 
 
-def with_region(
-    views: Dataset, region: Region | None, tell: Callable[[str], None] = lambda _: None
-) -> Dataset:
+def with_region(views: Dataset, region: Region | None, tell: Tell = lambda _: None) -> Dataset:
     """Replace the region of interest by a run's, if it has one; `tell` is called if they differ."""
     if region is None:
         return views
