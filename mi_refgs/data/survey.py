@@ -23,9 +23,8 @@ def survey(folder: Path) -> dict[str, Any]:
     """Survey the views of a data set in images about as large as a fit reads them."""
     train = read_dataset(folder, "train", pixels=PIXELS, truth=False)
     if train.downscale > 1:  # JPEG files are decoded smaller by a power of two, in a tenth of the time
-        train = read_dataset(
-            folder, "train", downscale=1 << (int(train.downscale) - 1).bit_length(), truth=False
-        )
+        power = 1 << (int(train.downscale) - 1).bit_length()
+        train = read_dataset(folder, "train", downscale=power, truth=False)
     first = train.views[0].file or train.views[0]
     findings, notes, views = examine(train), [*train.notes], [*train.views]
     try:
