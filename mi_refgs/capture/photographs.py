@@ -17,7 +17,7 @@ from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted, require_package
-from mi_refgs.io.images import exif_tags, image_size, open_image, positive, read_mask, to_8_bits
+from mi_refgs.io.images import exif_tags, image_header, open_image, positive, read_mask, to_8_bits
 
 VIDEOS = ".mp4 .mov .m4v .avi .mkv .webm .mts".split()
 FRAMES = 120  # of a video that are used, at most: with every pair matched, some minutes
@@ -159,7 +159,7 @@ def find_masks(folder: Path, photographs: Sequence[Photograph]) -> dict[str, Pat
         raise InputError("no such folder", folder, "--masks", "give one with a PNG file per photograph")
     for photograph in photographs:
         path, wanted = mask_in(folder, photograph.name), photograph.size
-        size = image_size(path)
+        size = image_header(path)[:2]
         if not is_copy(size, wanted) and not is_copy(size, photograph.stored_size):
             what = f"{size[0]} × {size[1]} pixels, but {photograph.name} has {wanted[0]} × {wanted[1]}"
             raise InputError(what, path, "--masks", "make masks of the photographs' size")

@@ -24,7 +24,7 @@ from mi_refgs.data.object_region import support_planes
 from mi_refgs.data.region import REGION_FILE, Region, read_region, write_region
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.files import read_json, replace_file, write_json
-from mi_refgs.io.images import image_size
+from mi_refgs.io.images import image_header
 from mi_refgs.io.progress import Tell, command_line, with_bar
 
 PLOT, OLD_REGION = "capture.png", "region.old.json"
@@ -162,7 +162,7 @@ def _groups(
         cameras.setdefault((photograph.kept_size, photograph.device, photograph.focal), []).append(photograph)
     groups = []
     for group in cameras.values():
-        size = image_size(images / group[0].copy)
+        size = image_header(images / group[0].copy)[:2]
         focal, parameters = group[0].focal, list[float]()
         if focal is not None:
             pixels = focal * float(np.hypot(*size))

@@ -19,7 +19,7 @@ from mi_refgs.data.lens import Lens, Undistortion, undistortion
 from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import FileCamera, View, evenly_spread
 from mi_refgs.errors import InputError, within
-from mi_refgs.io.images import image_size
+from mi_refgs.io.images import image_header
 from mi_refgs.registry import Registry
 
 HOLDOUT = 8  # every eighth image is a test view where a data set names none (LLFF, 3DGS, 2DGS)
@@ -170,7 +170,7 @@ def make_view(
     fx, fy, cx, cy = intrinsics
     file = FileCamera(image.path, *own, (fx, fy, cx, cy), lens, image.mask)
     if (mask := image.mask) is not None and mask.below is None:
-        if (masked := image_size(mask.path)) != own:
+        if (masked := image_header(mask.path)[:2]) != own:
             what = f"{mask.path} of {masked[0]} × {masked[1]} for {own[0]} × {own[1]} pixels"
             options.say("the mask is of another size, and resized", name, what)
         elif mask.path.parent.name not in (MASKS, image.path.parent.name):

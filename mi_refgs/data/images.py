@@ -23,7 +23,6 @@ from mi_refgs.io.images import (
     ENDINGS,
     box_downscale,
     image_header,
-    image_size,
     read_bytes,
     read_grey,
     read_mask,
@@ -68,7 +67,7 @@ class ImageFile:
     @classmethod
     def of(cls, path: Path, downscale: float, mask: Mask | None = None) -> "ImageFile":
         """The image in a file, of which only the header is read."""
-        width, height = image_size(path)
+        width, height, _ = image_header(path)
         if min(width, height) < downscale:
             what = f"{width} × {height} pixels are less than a block of {downscale}²"
             raise InputError(what, path, "downscale", "give a smaller number")

@@ -97,11 +97,6 @@ def image_header(path: Path) -> tuple[int, int, bool]:
         return *image.size, bool(image.has_transparency_data)
 
 
-def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of a PNG, JPEG or EXR file, from its header; raises InputError as its reader does."""
-    return image_header(Path(path))[:2]
-
-
 def read_png(path: str | Path) -> np.ndarray:
     """8-bit image file as float32 (H, W, 3 or 4) in [0, 1], sRGB encoded; raises InputError for others."""
     return read_bytes(path)[0].astype(np.float32) / np.float32(255)

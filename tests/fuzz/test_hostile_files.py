@@ -13,7 +13,7 @@ from trimesh.resolvers import FilePathResolver
 from mi_refgs.errors import abbreviated
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.files import read_json
-from mi_refgs.io.images import image_size, read_png
+from mi_refgs.io.images import image_header, read_png
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.surfels.ply import read_ply
@@ -68,16 +68,16 @@ def png(width: int, height: int) -> bytes:
 
 
 def test_images_with_huge_sizes_are_refused(tmp_path: Path) -> None:
-    for read in (read_png, image_size):
+    for read in (read_png, image_header):
         refuse_file(read, tmp_path / "a.png", png(12_000, 12_000), "12000 × 12000", "hold")
     write_exr(tmp_path / "b.exr", np.ones((4, 6, 3)))
     good = (tmp_path / "b.exr").read_bytes()
     window = struct.pack("<4i", 0, 0, 5, 3)
-    assert window in good and image_size(tmp_path / "b.exr") == (6, 4)
+    assert window in good and image_header(tmp_path / "b.exr") == (6, 4, False)
     large = "a.exr: size: 32768 × 8193 pixels are more than 268 million"
     for corner, words in (((2**15 - 1, 2**13), large), ((-5, 3), ""), ((2**31 - 1, 2**31 - 1), "")):
         other = good.replace(window, struct.pack("<4i", 0, 0, *corner)) + bytes(2**22)
-        for reader in (read_exr_image, image_size, EnvironmentLight.from_file):
+        for reader in (read_exr_image, image_header, EnvironmentLight.from_file):
             refuse_file(reader, tmp_path / "a.exr", other, words)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mi_refgs.io.exr import read_exr_image, write_exr
 from mi_refgs.io.files import replace_file, write_bytes
-from mi_refgs.io.images import image_size, linear_from_srgb, srgb_from_linear
+from mi_refgs.io.images import image_header, linear_from_srgb, srgb_from_linear
 from tests.helpers import read_exr, refused
 
 HEADER = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -61,7 +61,7 @@ def test_one_part_of_exr_is_read_and_deep_pixels_are_refused(
     OpenEXR.File(header, deep).write(str(tmp_path / "deep.exr"))
     assert (read_exr_image(tmp_path / "parts.exr") == np.full((2, 4, 3), 2)).all()
     assert "parts.exr: 3 parts, of which 'left' is read" in capsys.readouterr().err
-    refused(partial(image_size, tmp_path / "deep.exr"), "deep.exr: header: deep pixels; flatten")
+    refused(partial(image_header, tmp_path / "deep.exr"), "deep.exr: header: deep pixels; flatten")
 
 
 def test_files_are_written_atomically(tmp_path: Path) -> None:
