@@ -4,7 +4,6 @@ import hashlib
 import io
 import zipfile
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,15 +76,6 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
     for name in (*channels_of(params := part(state, PARAMS)), *channels_of(params, AROUND)):
         attribute(name)
     return state
-
-
-def read(path: Path) -> dict[str, np.ndarray]:
-    """The state in a file; raises as `decode`, and DamagedError for a file that cannot be read."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DamagedError(f"cannot be read: {error.strerror}") from error
-    return decode(data)
 
 
 def tensors(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:

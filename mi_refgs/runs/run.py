@@ -138,11 +138,12 @@ class Run:
         damaged = []
         for path in reversed(self.checkpoints()):
             try:
-                return checkpoint.read(path)
+                return checkpoint.decode(path.read_bytes())
             except UnknownNameError as error:
                 raise load_again(error, self.method().plugins).at(path) from error
-            except checkpoint.DamagedError as error:
-                damaged.append(f"{path}: damaged ({error})")
+            except (OSError, checkpoint.DamagedError) as error:
+                what = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else error
+                damaged.append(f"{path}: damaged ({what})")
                 print(f"refgs: warning: {damaged[-1]}; trying the one before", file=sys.stderr)
         if damaged:
             remedy = f"put a copy back, or remove {self.path / 'checkpoints'} to begin anew"

@@ -19,7 +19,7 @@ State = dict[str, np.ndarray]
 @pytest.fixture(scope="module")
 def state(finished: Path) -> State:
     """What a fit of the full method has saved."""
-    newest = checkpoint.read(Run(finished).checkpoints()[-1])
+    newest = checkpoint.decode(Run(finished).checkpoints()[-1].read_bytes())
     assert "mesh/faces" in newest and "params/light" in newest
     return newest
 
@@ -80,7 +80,8 @@ def test_resume_goes_on_from_checkpoint_before_and_says_so(
     assert main(["train", str(data), "-o", str(run), "--resume"]) == 0
     said = capsys.readouterr().err
     assert f"{newest}: damaged" in said and "resumed at iteration 3 of 6" in said
-    assert checkpoint.read(newest)["iteration"] == 6 and Run(run).checkpoints() == [before, newest]
+    assert checkpoint.decode(newest.read_bytes())["iteration"] == 6
+    assert Run(run).checkpoints() == [before, newest]
 
 
 def test_no_fit_begins_anew_over_damaged_checkpoints(run: Path, data: Path) -> None:
