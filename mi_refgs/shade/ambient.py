@@ -53,7 +53,7 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
     normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normal)
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     rays = dr.opaque(mi.UInt32, options.ambient_rays)
-    blur = dr.opaque(mi.Float, ray_roughness(options.ambient_rays))
+    blur = dr.opaque(mi.Float, (4 * options.ambient_rays) ** -0.25)  # 4 π α², its solid angle, is π / rays
     traced = ShadingOptions(**asdict(options) | {"traced_bounces": 1, "diffuse": "irradiance"})
     ratios: VertexColours | None = None  # the first round is unoccluded
     for _bounce in range(BOUNCES):
@@ -72,11 +72,6 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
         ratios = VertexColours(mesh, dr.clip(ratio, 0, BRIGHTEST).numpy().T)
     assert ratios is not None
     return ratios
-
-
-def ray_roughness(count: int) -> float:
-    """Roughness of the lobe around a mirrored ray whose solid angle at its middle, 4 π α², is π / count."""
-    return float((4 * count) ** -0.25)
 
 
 def ambient_direction(frame: Any, turn: UInt32, ray: UInt32, count: UInt32) -> Vector3f:
