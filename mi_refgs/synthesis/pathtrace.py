@@ -13,6 +13,7 @@ from numpy.random import Generator
 from mi_refgs.constants import GOLDEN_ANGLE, MAX_NUMBER
 from mi_refgs.data.poses import poses_around
 from mi_refgs.kernels.memory import BASE, PER_PATH, PER_STACKED_VALUE, require
+from mi_refgs.render.display import image_array
 from mi_refgs.shade.light.latlong import OVERSAMPLING, lat_long
 from mi_refgs.splat.camera import Camera
 from mi_refgs.synthesis.ground_truth import materials_at, triangles
@@ -176,11 +177,7 @@ class Tracer:
     def maps(self, pose: np.ndarray, image: np.ndarray) -> dict[str, np.ndarray]:
         """The maps of MAPS at pixel centres, where `image` shows something: not at hidden emitters."""
         self._look(pose)
-        width, height = self.width, self.height
-
-        def plane(array: Any) -> np.ndarray:
-            return np.broadcast_to(np.array(array, dtype=np.float64), width * height).reshape(height, width)
-
+        height, width = size = self.height, self.width
         with dr.suspend_grad():
             index = dr.arange(mi.UInt32, width * height)
             film = mi.Point2f((index % width + 0.5) / width, (index // width + 0.5) / height)
@@ -190,12 +187,11 @@ class Tracer:
             wanted = si.is_valid() if not self.objects else mi.Bool(False)
             for shape in self.objects:
                 wanted |= si.shape == mi.ShapePtr(shape)
-            hit = plane(wanted).astype(bool) & (image[..., 3] > 0 if image.shape[-1] == 4 else True)
+            hit = (image_array(wanted, *size) > 0) & (image[..., 3] > 0 if image.shape[-1] == 4 else True)
             depth = ((np.array(si.p).T - pose[:3, 3]) @ pose[:3, 2]).reshape(height, width)
-            found = {"normal": np.array(normal).T.reshape(height, width, 3), "depth": depth[..., None]}
+            found = {"normal": image_array(normal, *size), "depth": depth[..., None]}
             for name, (value, known) in materials_at(self.scene, si)._asdict().items():
-                planes = [plane(x) for x in (value if dr.depth_v(value) > 1 else [value])]
-                found[name] = np.stack([*planes, plane(known)], axis=-1)
+                found[name] = image_array([*(value if dr.depth_v(value) > 1 else [value]), known], *size)
         return {name: np.where(hit[..., None], array, 0) for name, array in found.items()}
 
     def _look(self, pose: np.ndarray) -> None:
