@@ -273,7 +273,7 @@ def _around_object(views: Dataset, surfaces: np.ndarray | None, tell: Tell, warn
 def finish(trainer: Trainer, run: Run) -> str | None:
     """Save the state if no checkpoint contains it, and write the artefacts; returns a warning, if any."""
     if not any(int(path.stem) == trainer.iteration for path in run.checkpoints()):
-        run.save_checkpoint(trainer.iteration, trainer.state())
+        run.save_checkpoint(trainer.iteration, trainer.fit.arrays())
     names = [view.name for view in trainer.data.views]
     if (gains := gains_of(trainer.fit.params)) is not None:
         run.write_json(EXPOSURE, {"gain": dict(zip(names, gains.round(5).tolist(), strict=True))})

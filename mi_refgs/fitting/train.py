@@ -91,10 +91,6 @@ class Trainer:
         self.setup, self.fit = FitSetup(method, self.data), other.fit
         self.health.checked = self.iteration
 
-    def state(self) -> dict[str, np.ndarray]:
-        """The content of a checkpoint."""
-        return self.fit.arrays()
-
     @property
     def method(self) -> Method:
         """The method; decisions may change it."""
@@ -192,7 +188,7 @@ class Trainer:
         """Write a checkpoint, if there is a run to write it into."""
         self.check()
         if self.run is not None:
-            self.run.save_checkpoint(self.iteration, self.state())
+            self.run.save_checkpoint(self.iteration, self.fit.arrays())
 
     def check(self) -> None:
         """Remove the surfels that made steps fail since the last check, and warn; see `Health.check`."""

@@ -158,13 +158,14 @@ def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> No
 def test_a_fork_keeps_common_parameters(method: Method, views: Dataset) -> None:
     trainer = step_to(Trainer(method, views), 3)
     before = {name: np.array(tensor.numpy()) for name, tensor in trainer.fit.params.items()}
-    history = trainer.state()["optimiser/radiance_sh/second"].reshape(-1, 12)
+    history = trainer.fit.arrays()["optimiser/radiance_sh/second"].reshape(-1, 12)
     rows = [{"component": "colour_alone", "stays": True}]
     poor = fork(trainer, as_decided(method, rows))
     assert {*poor.fit.params} == {"position", "rotation", "scale", "opacity", "radiance_sh"}
     assert poor.iteration == 3 and poor.run is None
     np.testing.assert_array_equal(poor.fit.params["position"].numpy(), before["position"])
-    harmonics, moments = poor.fit.params["radiance_sh"].numpy(), poor.state()["optimiser/radiance_sh/second"]
+    harmonics = poor.fit.params["radiance_sh"].numpy()
+    moments = poor.fit.arrays()["optimiser/radiance_sh/second"]
     np.testing.assert_array_equal(harmonics[:, :12], before["radiance_sh"])
     np.testing.assert_array_equal(moments.reshape(-1, 27)[:, :12], history)
     assert np.all(harmonics[:, 12:] == 0) and np.all(moments.reshape(-1, 27)[:, 12:] == 0)

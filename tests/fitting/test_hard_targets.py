@@ -74,7 +74,7 @@ def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
         trainer.fit.optimiser.reset(LIGHT)
     trainer.train()
     assert trainer.iteration == STEPS and trainer.health.skipped == 0
-    for key, values in trainer.state().items():
+    for key, values in trainer.fit.arrays().items():
         assert np.all(np.isfinite(values)), key
     frame = trainer.view(trainer.data.views[0].camera())
     assert all(np.all(np.isfinite(plane.numpy())) for plane in [*frame.radiance, frame.alpha])

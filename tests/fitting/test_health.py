@@ -74,7 +74,7 @@ def test_bad_surfels_are_removed_and_the_fit_goes_on(name: str, value: float, me
     trainer.train()
     assert "2 were removed" in said[0] and f"{name} not finite at surfels 3, 9" in said[0]
     assert trainer.iteration == 12 and np.isfinite(trainer.statistics()["loss"])
-    for found in trainer.state().values():
+    for found in trainer.fit.arrays().values():
         assert np.all(np.isfinite(found))
 
 

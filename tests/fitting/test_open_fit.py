@@ -87,7 +87,7 @@ def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None
     # The sky is 0.5 + 0.3 d in the direction d, encoded; what no view sees is grey.
     trainer = Trainer(method, data)
     assert [table.max_count for table in trainer.fit.tables] == [48, 142]  # a quarter of 190
-    scene = TrainedScene.from_state(method, trainer.state())
+    scene = TrainedScene.from_state(method, trainer.fit.arrays())
     assert scene.surroundings is not None and scene.surroundings.background is not None
     assert np.ptp(scene.surroundings.background.radiance().numpy(), axis=(0, 1)).max() < 1e-6
     assert scene.light is not None
@@ -245,7 +245,7 @@ def test_region_follows_object_once(data: Dataset, method: Method, monkeypatch: 
     assert fitted.call_count == len(said) == 1 and trainer.region == found and "0.5 units" in said[0]
     position = trainer.surfels.to_numpy()["position"]
     assert depth_outside(position, found).max() < 0.05
-    resumed = Trainer(method, guessed, state=trainer.state())
+    resumed = Trainer(method, guessed, state=trainer.fit.arrays())
     step_to(resumed, STEPS // 2)
     assert resumed.region == found and fitted.call_count == 1
     monkeypatch.setattr(open_scene, "fitted_region", lambda *_: None)
@@ -324,7 +324,7 @@ def test_nothing_faint_is_removed_soon_after_a_reset(data: Dataset, method: Meth
 def test_resume_repeats_straight_run_bit_for_bit(data: Dataset, method: Method, one_thread: None) -> None:
     """Both tables, the background and their history, across edits of the tables."""
     straight = step_to(Trainer(method, data), 5)
-    resumed = Trainer(method, data, state=straight.state())
+    resumed = Trainer(method, data, state=straight.fit.arrays())
     found = require_same_state(step_to(straight, STEPS), step_to(resumed, STEPS))
     assert "optimiser/surroundings/scale/first" in found
     assert len(found["params/surroundings/position"]) != 60  # it was edited
@@ -359,7 +359,7 @@ def test_resume_with_other_images_changes_nothing(data: Dataset, method: Method,
     closed = read_dataset(write_data(tmp_path / "alpha", truth=False), "train")
     for name, own, other in (("open", data, closed), ("closed", closed, data)):
         run = Run(tmp_path / name)
-        run.save_checkpoint(0, begin(method, own, run).state())
+        run.save_checkpoint(0, begin(method, own, run).fit.arrays())
         before = (run.path / "dataset.json").read_bytes()
         refused(["train", other.path, "-o", run.path, "--resume"], other.path, run.path)
         assert (run.path / "dataset.json").read_bytes() == before
@@ -372,13 +372,13 @@ def test_resume_with_other_images_changes_nothing(data: Dataset, method: Method,
 def test_fit_of_open_scene_improves(data: Dataset, method: Method) -> None:
     """Object, surroundings and background learn; whatever is of alpha has no part in it."""
     trainer = Trainer(replace(without(method), iterations=100), data)
-    start = {name: np.array(x) for name, x in trainer.state().items() if name.startswith("params/")}
+    start = {name: np.array(x) for name, x in trainer.fit.arrays().items() if name.startswith("params/")}
     errors = []
     for _ in range(80):
         trainer.step()
         errors.append(float(trainer.error[0]))
     assert np.mean(errors[-8:]) < 0.7 * np.mean(errors[:8])
-    end = trainer.state()
+    end = trainer.fit.arrays()
     for name in ("params/background", "params/light"):
         assert np.abs(end[name] - start[name]).max() > 1e-3, name
     assert trainer.health.skipped == 0 and all(np.isfinite(x).all() for n, x in end.items() if n in start)

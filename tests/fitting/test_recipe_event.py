@@ -71,7 +71,7 @@ def test_a_registered_event_happens(file: str, tmp_path: Path, one_thread: None)
     trainer = step_to(Trainer(method, data), 2)
     assert trainer.surfels.count == 80 and trainer.fit.tables[0].error_sum.numpy().any()
     assert step_to(trainer, 3).surfels.count == 96
-    again = Trainer(method, data, state=trainer.state())
+    again = Trainer(method, data, state=trainer.fit.arrays())
     require_same_state(step_to(trainer, 6), step_to(again, 6))
     assert again.surfels.count == 115
 

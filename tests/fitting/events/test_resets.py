@@ -19,7 +19,7 @@ def trainer(tmp_path: Path) -> Trainer:
 
 def moving(trainer: Trainer) -> set[str]:
     """The parameters with moments."""
-    state = trainer.state().items()
+    state = trainer.fit.arrays().items()
     return {name.split("/")[1] for name, value in state if name.endswith("/first") and np.any(value)}
 
 
