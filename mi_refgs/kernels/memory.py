@@ -22,22 +22,18 @@ PER_PLY_BYTE = 4  # of the vertices of a PLY file: read, checked, and as arrays
 CGROUPS, PROC = Path("/sys/fs/cgroup"), Path("/proc")
 
 
-def of_image(pixels: int, samples: int, surfels: int, channels: int, derivatives: bool = False) -> float:
-    """Bytes to render an image of so many channels and samples per pixel."""
+def require_image(
+    size: tuple[int, int], samples: int, surfels: int, channels: int, derivatives: bool = False
+) -> None:
+    """Raise InputError if an image of this size, of so many samples per pixel, would not fit into memory."""
+    pixels = size[0] * size[1]
     most, each, per_surfel = PASS_SAMPLES, PER_SAMPLE, PER_SHOWN_SURFEL
     if derivatives:
         most, each, per_surfel = DERIVATIVE_SAMPLES, PER_DERIVATIVE_SAMPLE, PER_DERIVATIVE_SURFEL
     together = min(pixels * samples, most)
     per_value = PER_VALUE if together == pixels * samples else PER_STACKED_VALUE
     image = per_value * channels * pixels
-    return BASE + image + (each + PER_CHANNEL * channels) * together + per_surfel * surfels
-
-
-def require_image(
-    size: tuple[int, int], samples: int, surfels: int, channels: int, derivatives: bool = False
-) -> None:
-    """Raise InputError if an image of this width and height would not fit into memory."""
-    needed = of_image(size[0] * size[1], samples, surfels, channels, derivatives)
+    needed = BASE + image + (each + PER_CHANNEL * channels) * together + per_surfel * surfels
     what = f"image: {size[0]} × {size[1]} pixels of {surfels:,} surfels"
     require(needed, what, "ask for fewer pixels or AOVs")
 
