@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mi_refgs.compare.jobs import FAILED, Job
 from mi_refgs.errors import InputError
+from mi_refgs.io.progress import say, warn
 from mi_refgs.registry import load_plugins
 from mi_refgs.runs.interrupt import TerminatedError
 from mi_refgs.runs.run import Run
@@ -56,13 +57,9 @@ def fit_and_measure(job: Job) -> None:
     run, data = job.run, Path(job.data)
     method = run.method() if run.exists() else job.method()
     views = read_views(method, data, "train", truth=False)
-
-    def warn(message: str) -> None:
-        print(f"refgs: warning: {message}", file=sys.stderr)
-
     trainer = begin(method, views, run, warn=warn)
     if trainer.iteration:
-        print(f"refgs: resumed at iteration {trainer.iteration} of {method.iterations}", file=sys.stderr)
+        say(f"resumed at iteration {trainer.iteration} of {method.iterations}")
     trainer.train()
     finish(trainer, run)
     evaluate(run, data)
@@ -78,7 +75,7 @@ def _end_with_parent() -> None:
 
 
 def _failed(folder: Path, reason: str) -> int:
-    print(f"refgs: {reason}", file=sys.stderr)
+    say(reason)
     Job.read(folder).run.write_json(FAILED, {"reason": reason})
     return FAILURE
 

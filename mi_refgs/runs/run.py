@@ -7,7 +7,6 @@ metrics.json  contact_sheet.png  eval/                                          
 import json
 import math
 import os
-import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError, UnknownNameError
 from mi_refgs.io import files
 from mi_refgs.io.ownership import RUN, own_folder, require_own
+from mi_refgs.io.progress import warn
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import dump, load_resolved
 from mi_refgs.registry import load_again
@@ -144,7 +144,7 @@ class Run:
             except (OSError, checkpoint.DamagedError) as error:
                 what = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else error
                 damaged.append(f"{path}: damaged ({what})")
-                print(f"refgs: warning: {damaged[-1]}; trying the one before", file=sys.stderr)
+                warn(f"{damaged[-1]}; trying the one before")
         if damaged:
             remedy = f"put a copy back, or remove {self.path / 'checkpoints'} to begin anew"
             raise InputError(f"{damaged[0]}, and no checkpoint before it is whole", remedy=remedy)
