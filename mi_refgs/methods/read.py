@@ -187,13 +187,17 @@ def _extended(path: Path, above: list[Path]) -> dict[str, Any]:
             parent.get("about", {}).pop(key, None)
     for key in dropped:
         *parents, last = key.split(".")
-        inner: Any = parent
-        for name in parents:
-            inner = inner.get(name) if isinstance(inner, dict) else None
-        if not isinstance(inner, dict) or last not in inner:
+        if (inner := table_at(parent, parents)) is None or last not in inner:
             raise InputError(f"no key '{key}' in the extended file", path, "drop", "remove it from `drop`")
         del inner[last]
     return _merge(parent, table)
+
+
+def table_at(table: object, keys: Sequence[str]) -> dict[str, Any] | None:
+    """The table inside a table; None if there is none."""
+    for key in keys:
+        table = table.get(key) if isinstance(table, dict) else None
+    return table if isinstance(table, dict) else None
 
 
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from mi_refgs.fitting.events.densify import fill
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import register_event
 from mi_refgs.methods.method import Method
+from mi_refgs.methods.read import table_at
 
 
 @register_event
@@ -32,22 +33,14 @@ class ColourAlone(Decision, Trial):
             raise InputError("it is given", field="light")
         preset = method.preset or f"{method.iterations}:{method.surfels.max_count}"
         plain = methods.plain(methods.load(self.method, preset))
-        fitting = [text for text in method.assignments if _has_table(plain, text)]
+        keys = [(text, text.partition("=")[0].strip().split(".")) for text in method.assignments]
+        fitting = [text for text, (*tables, _) in keys if table_at(plain, tables) is not None]
         other = methods.load(self.method, preset, fitting)
         kept = "iterations seed checkpoint_every preview_every log_every about name file preset assignments"
         own = {name: getattr(method, name) for name in kept.split()}
         data = replace(other.data, downscale=method.data.downscale, images=method.data.images)
         surfels = replace(other.surfels, max_count=method.surfels.max_count)
         return replace(other, data=data, surfels=surfels, **own)
-
-
-def _has_table(method: dict[str, object], assignment: str) -> bool:
-    """Whether a method has the table that `key=value` assigns to."""
-    *tables, _ = assignment.partition("=")[0].strip().split(".")
-    inner: object = method
-    for name in tables:
-        inner = inner.get(name) if isinstance(inner, dict) else None
-    return isinstance(inner, dict)
 
 
 @register_event
