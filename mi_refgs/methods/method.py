@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 from mi_refgs.constants import PATCH_EDGE
-from mi_refgs.errors import InputError, UnknownNameError
+from mi_refgs.errors import InputError, UnknownNameError, within
 from mi_refgs.methods.extensions import EVENTS, INITIALISERS, LOSSES, Event
 from mi_refgs.methods.fields import FLAT, ITERATIONS, Window, at_least, between
 from mi_refgs.registry import load_again
@@ -273,11 +273,9 @@ class Method:
         for name, stage in self.stages():
             _require_known(f"stage.{name}.restart", stage.restart, {*surfels.attributes} | others)
             _require_known(f"stage.{name}.rates", stage.rates, attributes | others)
-            try:
+            with within(field=f"stage.{name}"):
                 resolved = Shading.resolve(stage.shading, self.has_mesh)
                 resolved.require_inputs(attributes, self.light is not None)
-            except InputError as error:
-                raise error.at(field=f"stage.{name}") from error
             lit |= resolved.model.light != "none"
         if self.light is not None and not lit:
             raise InputError("no stage uses it", field="light", remedy="choose a method with materials")
@@ -296,10 +294,8 @@ class Method:
         except UnknownNameError as error:
             raise load_again(error, self.plugins) from None
         for name, event in self.event.items():
-            try:
+            with within(field=f"event.{name}"):
                 event.require(attributes)
-            except InputError as error:
-                raise error.at(field=f"event.{name}") from error
         for name, loss in losses.items():
             absent = [f"the attribute {one}" for one in loss.attributes if one not in attributes]
             absent += ["a stage at = pixel"] * (loss.maps and not deferred)

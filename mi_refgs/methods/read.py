@@ -4,7 +4,6 @@ import json
 import re
 import sys
 import tomllib
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import tomli_w
 
 from mi_refgs.constants import DEFAULT_PRESET
-from mi_refgs.errors import InputError, UnknownNameError, abbreviated
+from mi_refgs.errors import InputError, UnknownNameError, abbreviated, within
 from mi_refgs.io.files import is_file, resource_dir
 from mi_refgs.methods.build import build, plain, scaled, settings as keys_of
 from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method
@@ -57,7 +56,7 @@ def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | N
     """Read a method by name or TOML path, scaled to a preset; `assignments`, key=value, apply unscaled.
     Raises InputError that names the file and the key for anything unknown or of the wrong type."""
     path, chosen = _find(name, "--method", Path()), preset_of(preset)
-    method = _checked(_extended(path, []), path)
+    method = _built(_extended(path, []), path)
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
@@ -69,31 +68,25 @@ def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | N
         _assign(table, assignment)
     file = str(path.resolve()) if name.endswith(".toml") else name
     table |= {"name": path.stem, "file": file, "preset": preset, "assignments": [*(assignments or [])]}
-    return _checked(table, "--set" if assignments else path)
-
-
-def _checked(table: dict[str, Any], where: str | Path) -> Method:
-    method = _built(table, where)
-    try:
-        method.check()
-    except InputError as error:
-        raise error.at(where) from error
-    return method
+    return _built(table, "--set" if assignments else path)
 
 
 def load_resolved(path: Path) -> Method:
     """Read the resolved `config.toml` of a run, unscaled; it has the losses in its file and no others."""
-    return _built(_read(path), path, losses={})
+    return _built(_read(path), path, resolved=True)
 
 
-def _built(table: dict[str, Any], where: str | Path, losses: dict[str, Any] = DEFAULT_LOSSES) -> Method:
-    try:
-        return typing.cast(Method, build(Method, _merge({"loss": losses}, table)))
-    except UnknownNameError as error:  # the kind of light
-        files = table.get("plugins")
-        raise load_again(error, files if isinstance(files, list) else []).at(where) from error
-    except InputError as error:
-        raise error.at(where) from error
+def _built(table: dict[str, Any], where: str | Path, resolved: bool = False) -> Method:
+    """The method of a table: checked, or of a `resolved` file, taken as it is and without default losses."""
+    with within(where):
+        try:
+            method: Method = build(Method, _merge({"loss": {} if resolved else DEFAULT_LOSSES}, table))
+        except UnknownNameError as error:  # the kind of light
+            files = table.get("plugins")
+            raise load_again(error, files if isinstance(files, list) else []) from error
+        if not resolved:
+            method.check()
+        return method
 
 
 def dump(method: Method) -> str:
