@@ -166,7 +166,6 @@ def require_one_size(where: str, sizes: Mapping[str, list[int]], remedy: str) ->
 def require_same(job: Job) -> None:
     """Raise InputError if the job's folder has a run of another method or other data."""
     if not job.run.exists():
-        job.method()
         return
     remedy = "choose another -o, or remove that run"
     for key, (before, now) in differences(job.run, job.method()).items():

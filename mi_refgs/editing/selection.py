@@ -1,5 +1,6 @@
 """Selection of surfels by their values, such as `metallic > 0.5 and z < 0`, and their positions."""
 
+import contextlib
 import re
 from collections.abc import Callable
 from typing import Any
@@ -30,10 +31,8 @@ def parse_condition(text: str) -> Condition:
 
 def _comparison(text: str) -> tuple[str, str, float]:
     if match := COMPARISON.fullmatch(text):
-        try:
+        with contextlib.suppress(ValueError):
             return match[1], match[2], float(match[3])
-        except ValueError:
-            pass
     raise InputError("no comparison", "--where", abbreviated(text.strip()), "write it like metallic > 0.5")
 
 

@@ -50,9 +50,8 @@ def import_relightable(
     both do, for a file that shows no free object, and for a folder with another run or foreign files."""
     path, run = Path(path), Run(output)
     run.require_none()
-    if method is None:
-        method = methods.for_purpose(PURPOSE)
-    wanted = runner.load_method(None if method is None else str(method), preset)
+    method = str(methods.for_purpose(PURPOSE) if method is None else method)
+    wanted = runner.load_method(method, preset)
     made = import_splats(path, linear=linear, box=box)
     chosen = [(split, enumerate(held_out(cameras or (), split))) for split in VIEWS]
     given = [Shot(f"{split}/r_{i:03d}", split, camera) for split, some in chosen for i, camera in some]
