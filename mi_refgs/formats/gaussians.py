@@ -14,7 +14,7 @@ by conjugate gradients; W_i is the weight of a Gaussian in all views, l the degr
 preconditioner, whose solution is the first step, is the least-squares problem of each Gaussian by itself."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -30,11 +30,11 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.render.display import display_image
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.sh import sh_basis
-from mi_refgs.splat import Camera, splat
+from mi_refgs.splat import Camera
+from mi_refgs.splat.weights import BlendedView
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 from mi_refgs.surfels.ply import write_ply as write_surfels
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Float
 
 THIN = 0.01  # third standard deviation of a surfel relative to its shorter one: thicker ones widen outlines
 INSET = 0.8  # pixels of the training cameras by which surfels move inwards
@@ -106,7 +106,8 @@ def _inset(tables: Sequence[Surfels], cameras: Sequence[Camera]) -> np.ndarray:
     place = mi.Point3f(*(upload(column) for column in np.ascontiguousarray(position.T)))
     side, pixels, total = (np.zeros(len(position)) for _ in range(3))
     for camera in cameras:
-        weight = _BlendedView.of(tables, [], camera).weighted_sums([])[-1]
+        view = BlendedView.of(tables, camera, [0])
+        weight = view.sums([view.maps.alpha])[0]
         cosine = np.sum(normal * dr.normalize(camera.towards(place)).numpy().T, axis=1)
         side -= weight * np.sign(cosine)
         pixels += weight * np.maximum(camera.to_camera(place).z.numpy(), 0) / camera.focal
@@ -120,31 +121,6 @@ def _inset(tables: Sequence[Surfels], cameras: Sequence[Camera]) -> np.ndarray:
         outward[~seen] = np.sign(turned) * normal[~seen]
         distance[~seen] = distance[seen][nearest]
     return (position - distance[:, None] * outward).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class _BlendedView:
-    """Blended colours of a view, attached to the colours of the Gaussians."""
-
-    inputs: list[Float]  # (N,) each: colour planes, then one of zeros
-    planes: list[Float]  # (H*W,) each: blended
-    alpha: Float  # (H*W,)
-
-    @staticmethod
-    def of(tables: Sequence[Surfels], colours: Sequence[np.ndarray], camera: Camera) -> "_BlendedView":
-        count = sum(table.count for table in tables)
-        inputs = [*(upload(plane) for plane in colours), dr.opaque(mi.Float, 0, count)]
-        dr.enable_grad(inputs)
-        blended = splat(tables, inputs, camera)
-        return _BlendedView(inputs, list(blended.features), dr.detach(blended.alpha))
-
-    def weighted_sums(self, images: Sequence[Float]) -> list[np.ndarray]:
-        """Return Σ_p w_ip x_p (N,) float64 of images x (H*W,), one per colour plane, and of alpha."""
-        pairs = zip(self.planes, [*images, self.alpha], strict=True)
-        total = sum((dr.sum(plane * x) for plane, x in pairs), mi.Float(0))
-        if dr.grad_enabled(total):  # unless the view sees nothing
-            dr.backward(total)
-        return [np.array(dr.grad(plane), dtype=np.float64) for plane in self.inputs]
 
 
 class _ColourFit:
@@ -180,11 +156,11 @@ class _ColourFit:
         render = self.trained.renderer(aovs=False)
         for camera in self.cameras:
             basis = self._basis(camera)
-            view = _BlendedView.of([self.table], [np.zeros(count, np.float32)] * 3, camera)
+            view = BlendedView.of([self.table], camera, [0] * 4)
             frame = render(camera)
             encoded = display_image(list(frame.radiance), frame.alpha, [0.0] * 3)
-            images = [dr.minimum(x, frame.alpha) - 0.5 * view.alpha for x in encoded]
-            *sums, share = view.weighted_sums(images)
+            images = [dr.minimum(x, frame.alpha) - 0.5 * view.maps.alpha for x in encoded]
+            *sums, share = view.sums([*images, view.maps.alpha])
             own += (share[:, None] * basis)[:, :, None].astype(np.float32) * basis[:, None].astype(np.float32)
             right += basis[:, :, None] * np.stack(sums, axis=1)[:, None]
             weight += share
@@ -200,9 +176,9 @@ class _ColourFit:
         out = self.ridge[:, :, None] * coefficients
         for camera in self.cameras:
             basis = self._basis(camera)
-            view = _BlendedView.of([self.table], [*np.einsum("nk,nkc->cn", basis, coefficients)], camera)
-            *sums, _ = view.weighted_sums([dr.detach(plane) for plane in view.planes[:3]])
-            out += basis[:, :, None] * np.stack(sums, axis=1)[:, None]
+            colours = [upload(plane) for plane in np.einsum("nk,nkc->cn", basis, coefficients)]
+            view = BlendedView.of([self.table], camera, colours)
+            out += basis[:, :, None] * np.stack(view.sums(view.maps.features), axis=1)[:, None]
         return out
 
     def _basis(self, camera: Camera) -> np.ndarray:

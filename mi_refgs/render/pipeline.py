@@ -29,7 +29,7 @@ from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_norm
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace
 from mi_refgs.splat import Camera, list_by_tile, project, splat
-from mi_refgs.splat.composite import composite_compact, inverse_alpha
+from mi_refgs.splat.composite import composite_compact
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
@@ -138,7 +138,7 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
 def render_depth(surfels: Surfels, camera: Camera, around: Surfels | None = None) -> tuple[Float, Float]:
     """Expected camera-z depth (0 where nothing is seen) and alpha of surfels, with those around them."""
     blended = splat([surfels] if around is None else [surfels, around], [], camera)
-    return blended.depth * inverse_alpha(blended.alpha), blended.alpha
+    return blended.expected_depth, blended.alpha
 
 
 class _View:

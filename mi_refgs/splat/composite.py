@@ -49,6 +49,11 @@ class Composited:
         *maps, z, alpha = _blank(features + 2, camera)
         return Composited(maps, z if depth else None, alpha)
 
+    @property
+    def expected_depth(self) -> Float:
+        """Camera-z depth, 0 where nothing is seen."""
+        return self.depth * inverse_alpha(self.alpha)
+
 
 def inverse_alpha(alpha: Float) -> Float:
     """1/A where anything is seen (COVERAGE_FLOOR), else 0, with a finite gradient everywhere."""

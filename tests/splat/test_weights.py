@@ -7,7 +7,7 @@ import pytest
 
 from mi_refgs.splat import splat
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.weights import blended_weights, listed_tiles
+from mi_refgs.splat.weights import BlendedView, listed_tiles
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import raw_channels
 
@@ -21,7 +21,8 @@ def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) 
     surfels = Surfels.from_numpy(raw_channels())
     view = camera((0, -4, 1))
     values = rng.random(24 * 24).astype(np.float32)
-    weight, weighted, deep = blended_weights([surfels], view, [mi.Float(1), mi.Float(values)], depth=True)
+    seen = BlendedView.of([surfels], view, [0, 1, mi.Float(2)])
+    weight, weighted, deep = seen.sums([1, mi.Float(values), seen.maps.expected_depth])
     features = [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)]
     blended = splat([surfels], features, view)
     images = np.array([image.numpy() for image in blended.features], np.float64)
@@ -35,7 +36,7 @@ def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) 
 def test_surfels_behind_the_camera_have_no_weights() -> None:
     surfels = Surfels.from_numpy(raw_channels())
     away = Camera.look_at((0, -4, 1), (0, -8, 1), fov=40, size=24)
-    assert not blended_weights([surfels], away)[0].any()
+    assert not BlendedView.of([surfels], away, [0]).sums([1])[0].any()
     assert not listed_tiles([surfels], away).any()
 
 

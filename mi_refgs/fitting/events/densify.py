@@ -17,7 +17,7 @@ from mi_refgs.fitting.state import TableEdit
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import Window, at_least, between
-from mi_refgs.splat.weights import blended_weights, listed_tiles
+from mi_refgs.splat.weights import BlendedView, listed_tiles
 from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
@@ -84,7 +84,8 @@ class Densify(Event[Trainer]):
         for index in evenly_spread(len(views), WEIGHED_VIEWS):
             camera = views[index].camera()
             small = camera.resized(min(WEIGHED_SIZE, max(camera.width, camera.height)))
-            pixels, *depths = blended_weights(every, small, depth=len(every) > 1)
+            view = BlendedView.of(every, small, [0] * len(every))
+            pixels, *depths = view.sums([1, view.maps.expected_depth][: len(every)])  # beside a background
             weight += pixels
             for deep in depths:
                 before += pixels * (pixels * views[index].depth_of(position) < NEARER * deep)

@@ -20,7 +20,7 @@ from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import ITERATIONS, at_least
-from mi_refgs.splat.weights import blended_weights
+from mi_refgs.splat.weights import BlendedView
 from mi_refgs.surfels.attributes import logit
 from mi_refgs.surfels.table import Surfels
 
@@ -93,7 +93,7 @@ def _attributed(surfels: Surfels, views: list[View], errors: list[np.ndarray]) -
     """The error (N,) that each surfel is responsible for: Σ w e over the pixels of maps (H, W) of views."""
     total = np.zeros(surfels.count)
     for view, error in zip(views, errors, strict=True):
-        total += blended_weights([surfels], view.camera(), [upload(error)])[0]
+        total += BlendedView.of([surfels], view.camera(), [0]).sums([upload(error)])[0]
     return total
 
 

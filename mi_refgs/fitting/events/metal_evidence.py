@@ -24,7 +24,7 @@ from mi_refgs.methods.fields import Window
 from mi_refgs.render.display import composited, image_array
 from mi_refgs.shade.points import RadianceTerms
 from mi_refgs.shade.reflectance.split_sum import DIELECTRIC_F0
-from mi_refgs.splat.weights import blended_weights
+from mi_refgs.splat.weights import BlendedView
 from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
@@ -96,7 +96,8 @@ def moments(trainer: Trainer) -> np.ndarray:
         weight = np.square(slope) * counts
         maps = np.concatenate([counts, *(weight * value for value in (1, y, y * y, x * y, x * x))], axis=-1)
         planes = [upload(np.float32(plane).ravel()) for plane in np.moveaxis(maps, 2, 0)]
-        sums += [found[: sums.shape[1]] for found in blended_weights(tables, camera, planes)]
+        blended = BlendedView.of(tables, camera, [0] * len(planes))
+        sums += [found[: sums.shape[1]] for found in blended.sums(planes)]
     return sums
 
 
