@@ -39,7 +39,6 @@ from mi_refgs.occlusion.surface_materials import Surface, SurfaceSample, VertexS
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
@@ -228,11 +227,10 @@ def renderer(
         update_occluder_caches(occluder, fitted.surfels, filtered, lighted)
     scene = SurfelScene(fitted.surfels, shading, filtered, occluder, fitted.surroundings, fitted.near)
     once = partial(render, scene, request=Request(("normal",), forward_only=True))
-    averaged = partial(supersampled, once, samples=samples, maps=False)
 
     def draw(camera: Camera) -> Frame:
         with dr.suspend_grad():
-            return in_passes(averaged, camera, samples_per_axis(samples), shading.neighbours, fitted.count)
+            return in_passes(once, camera, samples, shading.neighbours, fitted.count, maps=False)
 
     return draw
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -11,10 +11,10 @@ import mitsuba as mi
 from mi_refgs.constants import PATCH_EDGE
 from mi_refgs.kernels.memory import PASS_SAMPLES, require_image
 from mi_refgs.kernels.trees import mapped
+from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.splat.camera import Camera
 from mi_refgs.types import Array
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,15 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
 
 
 def in_passes(
-    draw: Callable[[Camera], Result], camera: Camera, factor: int = 1, margin: int = 0, surfels: int = 0
-) -> Result:
-    """Call `draw` (factor² samples per pixel) per band and join its arrays, of one value per pixel or in all,
-    in lists, dictionaries and dataclasses; detached. Raises InputError for an image above the memory."""
-    require_image((camera.width, camera.height), factor**2, surfels, channels=24)  # with all maps, about
+    draw: Callable[[Camera], Frame], camera: Camera, samples: int, margin: int, count: int, maps: bool = True
+) -> Frame:
+    """A frame of `count` surfels, detached, as `supersampled` renders it by `draw`, but in bands whose arrays
+    are joined. Raises InputError for an image above the memory."""
+    factor = samples_per_axis(samples)
+    require_image((camera.width, camera.height), factor**2, count, channels=24)  # with all maps, about
     found = bands(camera, factor, margin)
     if found[0].camera is camera:
-        return draw(camera)
+        return supersampled(draw, camera, samples, maps)
     parts = []
     for band in found:
         arrays: list[Any] = []
@@ -75,7 +76,7 @@ def in_passes(
             arrays.append(band.kept(value))
             return arrays[-1]
 
-        parts.append(mapped(kept, draw(band.camera)))
+        parts.append(mapped(kept, supersampled(draw, band.camera, samples, maps)))
         dr.eval(arrays)  # or the samples of all bands would stay in memory
 
     def stacked(*values: Array) -> Array:

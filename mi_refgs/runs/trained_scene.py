@@ -18,7 +18,6 @@ from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.registry import load_again
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.checkpoint import (
     PARAMS,
@@ -146,11 +145,9 @@ class TrainedScene:
         scene = SurfelScene(self.surfels, self.shading, *given)
         asked = aovs if not isinstance(aovs, bool) else scene.all_aovs if aovs else ()
         once = partial(render, scene, request=Request(asked, forward_only=True))
-        averaged = partial(supersampled, once, samples=samples, maps=bool(aovs))
 
         def draw(camera: Camera) -> Frame:
             with dr.suspend_grad():
-                factor = samples_per_axis(samples)
-                return in_passes(averaged, camera, factor, self.shading.neighbours, self.count)
+                return in_passes(once, camera, samples, self.shading.neighbours, self.count, bool(aovs))
 
         return draw

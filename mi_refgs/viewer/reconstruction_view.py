@@ -15,7 +15,6 @@ from mi_refgs.plugins.aovs import aov_planes, suffixes, values_of_planes
 from mi_refgs.render.display import composited, display_image, srgb_from_linear
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
-from mi_refgs.render.samples import samples_per_axis, supersampled
 from mi_refgs.runs.relightable import lacking, relightable
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.ambient import update_occluder_caches
@@ -140,13 +139,9 @@ class ReconstructionView:
 
     def fine(self, camera: Camera, look: DisplayOptions, samples: int = SAMPLES) -> Frame:
         """Render an image to save as `refgs render` does, in passes that fit into memory."""
-
-        def averaged(view: Camera) -> Frame:
-            return supersampled(lambda fine: self.frame(fine, look, True), view, samples)
-
-        factor = samples_per_axis(samples)
+        size = self.scene.shading.neighbours, self.scene.count
         with dr.suspend_grad():
-            return in_passes(averaged, camera, factor, self.scene.shading.neighbours, self.scene.count)
+            return in_passes(lambda view: self.frame(view, look, True), camera, samples, *size)
 
 
 def planes_of(frame: Frame, camera: Camera, look: DisplayOptions, light: Light | None) -> list[Float]:
