@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.capture import colmap
-from mi_refgs.capture.photographs import Photograph, mask_pixels
+from mi_refgs.capture.photographs import REPORT, WORK, Photograph, mask_pixels
 from mi_refgs.data.colmap_model import MODELS, Camera
 from mi_refgs.data.lens import Undistortion, undistortion
 from mi_refgs.errors import InputError
@@ -22,8 +22,6 @@ from mi_refgs.io.progress import with_bar
 QUALITY = 95  # quality of JPEG files; lower ones make a fit reproduce their block edges
 WRITERS = 4  # images undistorted at once, at most: with images of 12 Mpx 1.3 GB, with one 0.5 GB
 SPLINE_PIXELS = 2_000_000  # up to which images are resampled with cubic splines; a fit reduces larger ones
-WORK = ".work"  # folder of working copies, features, matches and the model; it may be removed afterwards
-REPORT = "capture.json"  # written last: with a folder WORK or this file, the folder is a capture
 SPARSE, IMAGES, MASKS = "sparse/0", "images", "masks"
 
 

@@ -18,10 +18,13 @@ from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted, require_package
 from mi_refgs.io.images import exif_tags, image_header, open_image, positive, read_mask, to_8_bits
+from mi_refgs.io.progress import Tell
 
 VIDEOS = ".mp4 .mov .m4v .avi .mkv .webm .mts".split()
 FRAMES = 120  # of a video that are used, at most: with every pair matched, some minutes
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .avif".split()  # for a message
+WORK = ".work"  # folder of working copies, features, matches and the model; it may be removed afterwards
+REPORT = "capture.json"  # written last: with a folder WORK or this file, the folder is a capture
 FEWEST = 3  # smallest number of photographs: a third view checks a triangulated point
 ORIENTATION, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405  # EXIF tags
 SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation that swap width and height
@@ -39,6 +42,7 @@ class Photograph:
     device: str  # camera and lens: photographs with the same one share intrinsics
     exposure: Mapping[int, Any]  # EXIF's tags that tell it
     plain: bool = True  # colour or grey without alpha
+    cut_out: bool = False  # with transparent pixels
     orientation: int = 1  # EXIF's: how the stored pixels are turned for display
     lying: bool = False  # rotated by 90° anticlockwise in the data set, to have the sensor of the others
     number: int = 0  # index in the order of names
@@ -90,21 +94,28 @@ class Photograph:
         return upright.transpose(Image.Transpose.ROTATE_90) if self.lying else upright
 
 
-def find_photographs(folder: Path) -> list[Photograph]:
-    """The photographs of a folder by name, or of its subfolders, rotated as most of them are: so all have one
-    size and one lens. Raises InputError for too few images, many sizes, and unreadable files."""
+def find_photographs(folder: Path, tell: Tell = lambda _: None) -> list[Photograph]:
+    """The photographs of a folder by name, or of its subfolders but captures, rotated as most of them are: so
+    all have one size and one lens; `tell` is called with what is not read. Raises InputError for too few
+    images, many sizes, and unreadable files."""
     if not folder.is_dir():
         what = "is no video" if folder.exists() else "no such folder"
         raise InputError(what, folder, "photographs", "give a folder with JPEG or PNG files")
-    paths = image_files(folder, deep=False)
+    paths, captures = image_files(folder, deep=False), {*(file.parent for file in folder.rglob(REPORT))}
+    captures |= {path.parent for path in folder.rglob(WORK)}
+    inner = [p for p in image_files(folder, deep=True) if captures.isdisjoint(p.parents)]
+    inner = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
     if len(paths) < FEWEST:
-        inner = image_files(folder, deep=True)
-        paths = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
+        paths = inner
+    files = (path for path in folder.rglob("*") if path.suffix.lower() in OTHER_ENDINGS)
+    other = Counter(path.suffix for path in files).most_common(1)
     if len(paths) < FEWEST:
-        files = (path for path in folder.rglob("*") if path.suffix.lower() in OTHER_ENDINGS)
-        other = Counter(path.suffix for path in files).most_common(1)
         remedy = f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"
         raise InputError(f"contains {counted(len(paths), 'JPEG or PNG file')}", folder, "photographs", remedy)
+    if more := {*inner} - {*paths}:
+        tell(f"not read: {counted(len(more), 'image')} in subfolders, such as {min(more)}")
+    if other:
+        tell(f"not read: {counted(other[0][1], f'{other[0][0]} file')}; convert them to JPEG")
     read = enumerate(map(_photograph, paths))
     kept = [replace(p, name=str(p.path.relative_to(folder)), number=i) for i, p in read]
     most = Counter(photograph.size for photograph in kept).most_common(1)[0][0]
@@ -141,6 +152,7 @@ def _photograph(path: Path) -> Photograph:
     with open_image(path) as image:
         exif, detail = exif_tags(image)
         size, plain = image.size, image.mode in ("RGB", "L")
+        cut_out = image.mode in ("RGBA", "LA") and image.getchannel("A").getextrema()[0] < 255
     said = exif.get(ORIENTATION, 1)
     orientation = int(said) if said in range(1, 9) else 1
     size = size[::-1] if orientation in SIDEWAYS else size
@@ -149,7 +161,7 @@ def _photograph(path: Path) -> Photograph:
     focal = None if equivalent is None else equivalent / 43.2666  # mm, diagonal of 36 mm × 24 mm
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     exposure = {tag: detail[tag] for tag in EXPOSURE if positive(detail.get(tag)) is not None}
-    return Photograph(path, path.name, digest, size, focal, device, exposure, plain, orientation)
+    return Photograph(path, path.name, digest, size, focal, device, exposure, plain, cut_out, orientation)
 
 
 def find_masks(folder: Path, photographs: Sequence[Photograph]) -> dict[str, Path]:
@@ -158,7 +170,8 @@ def find_masks(folder: Path, photographs: Sequence[Photograph]) -> dict[str, Pat
     if not folder.is_dir():
         raise InputError("no such folder", folder, "--masks", "give one with a PNG file per photograph")
     for photograph in photographs:
-        path, wanted = mask_in(folder, photograph.name), photograph.size
+        beside = not photograph.cut_out and (folder / photograph.name).resolve() == photograph.path.resolve()
+        path, wanted = mask_in(folder, photograph.name, beside), photograph.size
         size = image_header(path)[:2]
         if not is_copy(size, wanted) and not is_copy(size, photograph.stored_size):
             what = f"{size[0]} × {size[1]} pixels, but {photograph.name} has {wanted[0]} × {wanted[1]}"

@@ -3,6 +3,7 @@ The folder `.work` contains the results of steps, and the hash of their inputs: 
 and other photographs or options begin anew."""
 
 import hashlib
+import itertools
 import json
 import shutil
 from collections.abc import Sequence
@@ -16,8 +17,8 @@ import numpy as np
 from mi_refgs.capture import colmap, output
 from mi_refgs.capture.colmap import Solved
 from mi_refgs.capture.frame import upright_unit
-from mi_refgs.capture.output import REPORT, SPARSE, WORK
-from mi_refgs.capture.photographs import Photograph, find_masks, find_photographs
+from mi_refgs.capture.output import MASKS, SPARSE
+from mi_refgs.capture.photographs import REPORT, WORK, Photograph, find_masks, find_photographs
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.images import MASK
 from mi_refgs.data.object_region import support_planes
@@ -28,6 +29,7 @@ from mi_refgs.io.images import image_header
 from mi_refgs.io.progress import Tell, command_line, with_bar
 
 PLOT, OLD_REGION = "capture.png", "region.old.json"
+OLD_MASKS = "oldmasks"  # a name that no reader takes for masks
 VERSION = 3  # of the steps' algorithms; results of other versions are computed again
 FIRST_MODEL = "SIMPLE_RADIAL"  # lens with which images are registered: few matches determine its parameter
 LEAST_PLACED = 0.5  # fraction of the photographs that must be registered in one group
@@ -52,8 +54,12 @@ def capture(
     if camera not in (None, *MODELS):
         remedy = f"give one of {', '.join(MODELS)}"
         raise InputError(f"{camera}: unknown lens model", "--camera-model", remedy=remedy)
-    photographs = find_photographs(source)
+    photographs = find_photographs(source, tell)
     mask_files = {} if masks is None else find_masks(masks, photographs)
+    if masks is None and (cut_out := {p.name: p.path for p in photographs if p.cut_out}):
+        mask_files = cut_out if len(cut_out) == len(photographs) else {}
+        use = "are masks" if mask_files else "are not used; cut out all of them, or give --masks"
+        tell(f"transparent pixels of {len(cut_out)} of {len(photographs)} images {use}")
     if masks is None and (ignored := [path for path in source.glob("*/") if MASK.search(path.name)]):
         tell(f"not used: {ignored[0]}; --masks {ignored[0]} would read masks there")
     output.prepare(folder, [source] if masks is None else [source, masks])
@@ -86,7 +92,13 @@ def capture(
     # Undistorted images and COLMAP's files, unless the last capture wrote the same.
     mask_digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in mask_files.values()]
     key, last = _hash([inputs, repr(straight), mask_digests]), folder / REPORT
-    if not (last.is_file() and read_json(last).get("key") == key):
+    before = read_json(last) if last.is_file() else {}
+    if before.get("key") != key:
+        if (folder / MASKS).is_dir() and not before.get("masks"):  # a user's
+            places = (folder / f"{OLD_MASKS}{i or ''}" for i in itertools.count())
+            place = next(path for path in places if not path.exists())
+            (folder / MASKS).rename(place)
+            tell(f"{folder / MASKS}: moved to {place.name}, as its images are replaced")
         for stale in (*folder.glob(f"{SPARSE}/*.bin"), last):  # without them the folder is no data set
             stale.unlink(missing_ok=True)
         output.write_images([copies[name] for name in solved.names], straight, mask_files, folder)
@@ -97,6 +109,7 @@ def capture(
     cameras = model.cameras.values()
     report = {
         "key": key,
+        "masks": bool(mask_files),
         "photographs": len(photographs),
         "placed": len(registered),
         "not_placed": [p.name for p in photographs if p.name not in registered],

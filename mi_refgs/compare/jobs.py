@@ -76,7 +76,7 @@ class Job(Shared):
         content = read_json(folder / JOB)
         try:
             lists = {name: tuple(content.get(name, ())) for name in ("settings", "plugins")}
-            return Job(**content | lists)
+            return Job(**content | lists | {"folder": str(folder.resolve())})  # it may have been moved
         except (KeyError, TypeError) as error:
             raise InputError(f"not a job ({error})", folder / JOB, remedy="remove the file") from error
 

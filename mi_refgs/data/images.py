@@ -217,7 +217,8 @@ def image_folder(root: Path, model: Path) -> tuple[Path, Path]:
 def image_files(folder: Path, deep: bool) -> list[Path]:
     """The images of a folder by name, `deep` with those of subfolders; neither hidden ones nor masks."""
     files = folder.glob("**/*" if deep else "*")
-    paths = sorted(p for p in files if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
+    seen = (p for p in files if not any(part.startswith(".") for part in p.relative_to(folder).parts))
+    paths = sorted(p for p in seen if p.suffix.lower() in ENDINGS)
     masks = {f"{path.with_suffix('')}{mark}" for path in paths for mark in MARKS[1:]}
     return [path for path in paths if str(path.with_suffix("")) not in masks]
 
@@ -257,9 +258,10 @@ def mask_of(image: Path, root: Path, beside: bool = True) -> Mask | None:
     return Mask(mask_in(best, str(name.relative_to(own) if own in (*FOLDERS, images[best]) else name)))
 
 
-def mask_in(folder: Path, name: str) -> Path:
-    """The mask of an image in a folder of masks: of `a.jpg` `a.jpg.png`, `a.png`, `a_mask.png` and so on."""
-    if found := _mask_file(folder, name, MARKS):
+def mask_in(folder: Path, name: str, beside: bool = False) -> Path:
+    """The mask of an image in a folder of masks: of `a.jpg` `a.jpg.png`, `a.png`, `a_mask.png` and so on;
+    `beside` the images it has a mark, such as `_mask`."""
+    if found := _mask_file(folder, name, MARKS[beside:]):
         return found
     wanted = folder / Path(name).with_suffix(".png")
     raise InputError("missing", wanted, "mask", "add it, or remove the folder of masks")

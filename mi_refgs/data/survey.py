@@ -64,19 +64,24 @@ def write_masks(folder: Path) -> None:
     InputError for other images, and for a folder that has masks."""
     if survey(folder)["checks"].get("background", {}).get("result") != SAID:
         raise InputError("no plain background", folder, "--masks", "segment the object by another program")
-    files = list[Path]()
+    masks = dict[Path, tuple[Path, Path]]()  # folder and name, by image
     for split in ("train", "test"):
         with contextlib.suppress(InputError):
-            files += [v.file.path for v in read_dataset(folder, split, truth=False).views if v.file]
-    named = [file.relative_to(folder).parts for file in files]
-    names = [Path(*parts[parts[0] in FOLDERS :]).with_suffix(".png") for parts in named]
-    if (masks := folder / MASKS).exists():
-        raise InputError("exists", masks, "--masks", "remove it")
-    for file, name in zip(files, names, strict=True):
+            data = read_dataset(folder, split, truth=False)
+            for file in (view.file.path for view in data.views if view.file):
+                parts = file.relative_to(folder).parts
+                # COLMAP's are beside its folder of images, such as dense/0/images.
+                deep = len(parts) if data.source and data.source.stem == "images" else 1
+                at = next((i for i, part in enumerate(parts[:deep]) if part in FOLDERS), -1)
+                name = Path(*parts[at + 1 :]).with_suffix(".png")
+                masks[file] = folder.joinpath(*parts[: max(at, 0)], MASKS), name
+    if found := [root for root, _ in masks.values() if root.exists()]:
+        raise InputError("exists", found[0], "--masks", "remove it")
+    for file, (root, name) in masks.items():
         alike = np.pad(off_backdrop(read_bytes(file)[0][..., :3] / np.float32(255)) <= 1, 1)
         alike[[0, -1]], alike[:, [0, -1]] = True, True
         label = ndimage.label(alike)[0]
-        write_png(masks / name, ~ndimage.binary_dilation(label == label[0, 0])[1:-1, 1:-1])
+        write_png(root / name, ~ndimage.binary_dilation(label == label[0, 0])[1:-1, 1:-1])
 
 
 def survey_text(found: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ without alpha, the file of the image's name in `masks` is the mask. `ply_file_pa
 of the poses; `train_filenames` and `test_filenames` (or `val_filenames`) list the images of a split."""
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -164,7 +165,7 @@ def _frames(folder: Path, split: str) -> list[Frame]:
         if names is None:
             frames = held_out(sorted(frames, key=lambda frame: frame.name), split)
         else:
-            frames = [frame for frame in frames if frame.name in names]
+            frames = [frame for frame in frames if os.path.normpath(frame.name) in names]
     if not frames:
         raise InputError(f"zero {split} views", file, "frames", "add images")
     return frames
@@ -177,11 +178,13 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
         names = frames[0].given.get(f"{key}_filenames") or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError("not a list of paths", frames[0].file, f"{key}_filenames", "correct it")
-        lists[key] = {*names}
+        lists[key] = {*map(os.path.normpath, names)}
     test = lists["test"] or lists["val"]
-    if not test or split == "test":
-        return test or None
-    return lists["train"] or {frame.name for frame in frames} - test - lists["val"]
+    if not test:
+        return {*held_out(sorted(lists["train"]), split)} or None
+    if split == "test":
+        return test
+    return lists["train"] or {os.path.normpath(frame.name) for frame in frames} - test - lists["val"]
 
 
 def read_points(path: Path) -> PointCloud | None:

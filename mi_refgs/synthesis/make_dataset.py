@@ -13,7 +13,7 @@ import numpy as np
 from mi_refgs.data.dataset import NEAR_EXTENTS, Dataset
 from mi_refgs.data.images import Pixels, compose
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, pinhole
-from mi_refgs.data.region import Region, write_region
+from mi_refgs.data.region import Region, read_region, write_region
 from mi_refgs.data.view import View
 from mi_refgs.errors import InputError, within
 from mi_refgs.io.exr import write_exr
@@ -62,7 +62,8 @@ def make_dataset(
     vertices, faces = surface_mesh(shapes)
     relit = [under_light(loaded, other.path, cameras.objects) for other in others]
     prepare_folder(out, settings, overwrite, others)
-    if region is not None:
+    drawn = read_region(out)
+    if region is not None and (drawn is None or drawn.estimated):  # else a user's
         write_region(out, region)
     if not (out / SURFACE).exists():
         write_mesh(out / SURFACE, Mesh(vertices, faces, 2 * cameras.radius / SURFACE_VOXELS))

@@ -1,5 +1,6 @@
 """`refgs capture`: cameras of a scene that the tests photograph, and error messages."""
 
+import contextlib
 import json
 import shutil
 from collections.abc import Callable, Sequence
@@ -222,6 +223,11 @@ def test_other_lens_rewrites_images(captured: Path, tmp_path: Path, monkeypatch:
     assert after.focal_length_x == pytest.approx(1.01 * before.focal_length_x)
     assert (data / "images" / NAMES[0]).stat().st_ino != inode
     assert [view.name for view in read_loaded(data, "test").views] == [NAMES[3]]
+    # Masks that a user made are of the images beside which they were made.
+    (data / "masks").mkdir()
+    (data / "masks/mine.png").write_bytes(b"")
+    monkeypatch.setattr(output, "straighten", whole)
+    assert main(command) == 0 and (data / "oldmasks/mine.png").is_file() and not (data / "masks").exists()
     # A region that a user saved is of the cameras that it was saved with.
     (data / "region.json").write_text('{"centre": [0, 0, 0], "radius": 2}')
     monkeypatch.setattr(pipeline, "VERSION", 0)
@@ -296,8 +302,15 @@ def test_photographs_in_subfolders(tmp_path: Path) -> None:
     for i, kind in enumerate(("JPEG", "WEBP", "PNG")):
         Image.new("RGB", (6, 4), (80 * i, 0, 0)).save(_made(tmp_path / str(i)) / "a.jpg", kind, lossless=True)
         Image.new("L", (6, 4)).save(_made(tmp_path / "masks") / f"{i}.png")
+    for copy in (".work/pictures/0.png", "images/0/a.jpg", ".thumbnails/a.jpg"):  # of a capture, of a desktop
+        shutil.copy(tmp_path / "0/a.jpg", _made((tmp_path / "out" / copy).parent))
     found = find_photographs(tmp_path)
     assert [photograph.name for photograph in found] == ["0/a.jpg", "1/a.jpg", "2/a.jpg"]
+    said = list[str]()
+    for name in ("b.jpg", "c.jpg", "d.jpg", "e.HEIC"):
+        shutil.copy(tmp_path / "0/a.jpg", tmp_path / name)
+    assert [one.name for one in find_photographs(tmp_path, said.append)] == ["b.jpg", "c.jpg", "d.jpg"]
+    assert "3 images in subfolders" in said[0] and "1 .HEIC file; convert" in said[1] and len(said) == 2
     assert [np.asarray(photograph.load())[1, 2, 0] for photograph in found] == [0, 80, 160]
 
 
@@ -390,6 +403,27 @@ def test_masks_match_photographs_by_name_and_size(tmp_path: Path) -> None:
         np.testing.assert_array_equal(pixels[..., 0], np.where(mask > 0, grey, 0))
     Image.fromarray(mask[:2]).save(masks / "c.png")
     refused(lambda: find_masks(masks, photographs), "6 × 2 pixels, but c.jpg has 6 × 4")
+    for name in ("a_mask.png", "b_mask.png", "c_mask.png"):  # beside the photographs, which are no masks
+        Image.fromarray(mask).save(tmp_path / "p" / name)
+    beside = find_masks(tmp_path / "p", photographs)
+    assert [path.name for path in beside.values()] == ["a_mask.png", "b_mask.png", "c_mask.png"]
+
+
+@needs_colmap
+def test_transparent_pixels_are_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If all images have some; opaque alpha is none."""
+    monkeypatch.setattr(pipeline, "_solve", stopped)
+    said = list[str]()
+    for i in range(4):
+        alpha = np.full((4, 6), 255, np.uint8)
+        alpha[0] = 0 if i else 255
+        Image.fromarray(np.dstack([np.zeros((4, 6, 3), np.uint8), alpha])).save(tmp_path / f"{i}.png")
+    assert [one.cut_out for one in find_photographs(tmp_path)] == [False, True, True, True]
+    for words in ("3 of 4 images are not used", "3 of 3 images are masks"):
+        with contextlib.suppress(KeyboardInterrupt):
+            pipeline.capture(tmp_path, tmp_path / "out", tell=said.append)
+        assert words in said[-1]
+        (tmp_path / "0.png").unlink(missing_ok=True)
 
 
 def test_large_sets_match_neighbours_and_similar_images(rng: np.random.Generator) -> None:

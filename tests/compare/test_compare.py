@@ -43,14 +43,6 @@ def variants(method: Path) -> Paths:
     return method, second
 
 
-def copied(folder: Path, target: Path) -> Path:
-    """Copy a comparison; its jobs name the new folders."""
-    shutil.copytree(folder, target)
-    for path in target.rglob("job.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"folder": str(path.parent)}))
-    return target
-
-
 @pytest.fixture(scope="module")
 def compared(data: Path, variants: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A comparison in which one of four jobs failed; do not change it."""
@@ -213,7 +205,7 @@ def test_different_sizes_are_refused(compared: Path, data: Path, variants: Paths
     """Before anything is fitted: two methods, or one and existing runs; and existing runs."""
     smaller = tmp_path / "smaller.toml"
     smaller.write_text(f'extends = "{variants[0]}"\n[data]\ndownscale = 2\n')
-    copy = copied(compared, tmp_path / "copy")
+    copy = shutil.copytree(compared, tmp_path / "copy")
     for folder, chosen in ((tmp_path / "new", (variants[0], smaller)), (copy, (smaller,))):
         refused(command(data, folder, *chosen), "20 × 20", "10 × 10", "smaller")
         assert not (folder / "runs/ball/smaller").exists()
@@ -226,14 +218,14 @@ def test_different_sizes_are_refused(compared: Path, data: Path, variants: Paths
 
 def test_a_run_refuses_other_settings(compared: Path, data: Path, variants: Paths, tmp_path: Path) -> None:
     """With compare.json and without it."""
-    folder = copied(compared, tmp_path / "copy")
+    folder = shutil.copytree(compared, tmp_path / "copy")
     refused([*command(data, folder, variants[1]), "loss.ssim=0.1"], "compare.json", "--set", "loss.ssim=0.1")
     (folder / "compare.json").unlink()
     refused([*command(data, folder, variants[1]), "loss.ssim=0.1"], "loss.ssim", "config.toml")
 
 
 def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:
-    folder = copied(compared, tmp_path / "copy")
+    folder = shutil.copytree(compared, tmp_path / "copy")
     (folder / "runs" / "ball" / "other" / "seed0" / "config.toml").write_text("future = 1")
     row = write(folder).scenes[0].rows[1]
     assert row.seeds == [1] and "future" in row.failed[0]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
@@ -16,10 +17,11 @@ from mi_refgs.data.checks import Finding, examine, heed
 from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.lens import Lens
 from mi_refgs.data.region import Region
+from mi_refgs.data.survey import write_masks
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png, write_png
 from tests.helpers import refused
-from tests.scenes.layouts import change_transforms
+from tests.scenes.layouts import change_transforms, write_colmap
 from tests.scenes.tiny import train_command, write_data, write_method
 
 VIEWS, SIZE, FOCAL, NO_LENS = 16, np.array([480, 360]), 450.0, Lens(False, (0.0, 0.0, 0.0))
@@ -106,8 +108,7 @@ def test_contradictory_cameras_need_force(tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(("inside", "level"), [(0, "fine"), (1, "said"), (7, "said"), (8, "refused")])
 def test_cameras_are_outside_of_the_region(inside: int, level: str, tmp_path: Path) -> None:
     data = read_dataset(write_model(tmp_path), "train")
-    normal = np.array([0.8, 0.0, 0.6])
-    heights = np.sort([view.to_world[:3, 3] @ normal for view in data.views])[::-1]
+    heights = np.sort([view.to_world[:3, 3] @ np.array([0.8, 0.0, 0.6]) for view in data.views])[::-1]
     plane = (0.8, 0.0, 0.6, float(heights[inside] + 1e-6))  # above it are so many of 14 cameras
     region = Region((0.0, 0.0, 0.0), 9.0, (plane,))
     found = {one.name: one for one in examine(replace(data, region=region))}["region"]
@@ -151,3 +152,14 @@ def test_constant_background_becomes_masks(tmp_path: Path, capsys: pytest.Captur
         mask = view.load().alpha
         assert (mask <= alpha).all() and mask.sum() > 0.6 * alpha.sum()  # type: ignore[union-attr, operator]
     refused(["doctor", data, "--masks"], "--masks")
+
+
+def test_masks_are_written_where_they_are_read(tmp_path: Path) -> None:
+    """Beside the images, of which COLMAP's may lie deeper in the data set."""
+    write_colmap(tmp_path / "dense/0", place="sparse")
+    for path in tmp_path.glob("dense/0/images/*"):
+        image = np.ones((*np.asarray(Image.open(path)).shape[:2], 3))
+        image[4:8, 4:8] = (0.2, 0.4, 0.1)
+        write_png(path, image)
+    write_masks(tmp_path)
+    assert all(view.has_alpha for view in read_dataset(tmp_path, "train").views)

@@ -23,8 +23,7 @@ def taken(log: np.ndarray, rng: np.random.Generator) -> list[View]:
     tracks, pinhole, views = np.pad(points, ((0, 0), (2, 0))), (115.0, 115.0, SIZE / 2, SIZE / 2), []
     for gain, origin in zip(np.exp(log), unit(rng.normal(size=(VIEWS, 3))), strict=True):
         image = np.full((SIZE, SIZE, 3), 0.5, np.float32)
-        pose = look_at(3 * origin, np.zeros(3))
-        view = View("a", SIZE, SIZE, *pinhole, pose, Pixels(image), tracks=tracks)
+        view = View("a", SIZE, SIZE, *pinhole, look_at(3 * origin, np.zeros(3)), Pixels(image), tracks=tracks)
         glitter = np.where(rng.random((POINTS, 1)) < 0.1, 3, 1)
         for row, column, colour in zip(*view.project(points)[:2], colours * glitter, strict=True):
             patch = slice(round(row) - 1, round(row) + 2), slice(round(column) - 1, round(column) + 2)
@@ -52,8 +51,7 @@ def log(rng: np.random.Generator) -> np.ndarray:
 
 
 def test_gains_are_those_of_the_points(log: np.ndarray, rng: np.random.Generator) -> None:
-    found = np.asarray(told_gains(taken(log, rng)))
-    np.testing.assert_allclose(found, log - log.mean(axis=0), atol=0.03)
+    np.testing.assert_allclose(np.asarray(told_gains(taken(log, rng))), log - log.mean(axis=0), atol=0.03)
     assert told_gains(taken(0.3 * log, rng)) is None  # surfaces that shine would seem to change as much
     bare = [replace(view, tracks=None) for view in taken(log, rng)]
     assert told_gains(bare) is None and told_gains([*bare[:1], *taken(log, rng)[1:]]) is None

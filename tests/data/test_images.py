@@ -123,6 +123,10 @@ def test_mask_formats(tmp_path: Path) -> None:
     for name, (pixels, expected) in files.items():
         Image.fromarray(pixels).save(tmp_path / f"{name}.png")
         np.testing.assert_allclose(Mask(tmp_path / f"{name}.png").read(), [expected], atol=1e-6)
+    labels = Image.fromarray(np.array([[0, 1, 2]], np.uint8))
+    labels.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])  # their colours in DAVIS and VOC
+    labels.save(tmp_path / "coloured.png")
+    np.testing.assert_array_equal(Mask(tmp_path / "coloured.png").read(), [[0, 1, 1]])
     assert read_grey(tmp_path / "deep.png")[1] == 65535
     np.testing.assert_array_equal(read_grey(tmp_path / "shallow.png")[0], bits)  # unscaled, as of depths
     np.testing.assert_array_equal(Mask(tmp_path / "deep.png", below=128 * 257).read(), [[1, 0, 0]])
@@ -260,8 +264,7 @@ def test_crop_of_a_target_is_that_part_of_its_view() -> None:
     assert part.clipped is not None and (part.camera.width, part.camera.height) == (10, 5)
     pairs = [*zip(whole.image, part.image, strict=True), *zip(whole.clipped, part.clipped, strict=True)]
     for one, other in [*pairs, (whole.alpha, part.alpha)]:
-        expected = np.array(one).reshape(24, 24)[rows]
-        np.testing.assert_array_equal(np.array(other).reshape(5, 10), expected)
+        np.testing.assert_array_equal(np.array(other).reshape(5, 10), np.array(one).reshape(24, 24)[rows])
     rays = np.array(whole.camera.rays()).T.reshape(24, 24, 3)[rows]
     np.testing.assert_allclose(np.array(part.camera.rays()).T.reshape(5, 10, 3), rays, atol=1e-6)
     linear = dataclasses.replace(whole, clipped=None, alpha=None).cropped(0, 0, 8, 8)

@@ -18,7 +18,7 @@ from tests.scenes.dots import COLOURS, POINTS, check
 from tests.scenes.layouts import (
     SHOTS,
     change_transforms,
-    ply_bytes,
+    point_bytes,
     write_colmap,
     write_llff,
     write_nerfstudio,
@@ -36,21 +36,16 @@ def colmap(folder: Path, name: str = "{}", images: str = "images", place: str = 
     return folder
 
 
-def ply_points(path: Path, kind: str) -> None:
-    names = ("x", "y", "z", "red", "green", "blue")
-    columns = dict(zip(names, [*POINTS.T, *COLOURS.T.astype(np.uint8)], strict=True))
-    path.write_bytes(ply_bytes(columns, kind))
-
-
 def points_beside_colmap(folder: Path) -> None:
     (colmap(folder) / SPARSE / "points3D.txt").unlink()
-    ply_points(folder / SPARSE / "points3D.ply", "binary_little_endian")
+    (folder / SPARSE / "points3D.ply").write_bytes(point_bytes())
 
 
 def points_of_nerfstudio(folder: Path) -> None:
     """Poses and points share a frame: `applied_transform` was applied to both."""
     moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
-    ply_points(write_nerfstudio(folder, ply_file_path="a.ply", applied_transform=moved) / "a.ply", "ascii")
+    write_nerfstudio(folder, ply_file_path="a.ply", applied_transform=moved)
+    (folder / "a.ply").write_bytes(point_bytes("ascii"))
 
 
 def frames(change: Callable[[dict[str, Any]], Any], **content: Any) -> Callable[[Path], None]:

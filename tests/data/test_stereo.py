@@ -60,8 +60,7 @@ def test_points_are_on_the_surfaces(data: Dataset, found: Stereo) -> None:
     assert np.count_nonzero(points.position[:, 2] > scene.BLOCK[2] - 0.05) > 100
     view = data.views[COUNT // 2]
     row, column, seen = view.project(points.position)
-    at = row[seen].round().astype(int), column[seen].round().astype(int)
-    shown = view.colour(data.background)[at]
+    shown = view.colour(data.background)[row[seen].round().astype(int), column[seen].round().astype(int)]
     assert points.colour is not None
     assert np.corrcoef(shown.ravel(), points.colour[seen].ravel())[0, 1] > 0.6
     assert abs(np.median(shown) - np.median(points.colour)) < 0.1

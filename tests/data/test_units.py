@@ -49,8 +49,7 @@ def test_optimiser_step_scales_with_the_scene(scale: float, tmp_path: Path) -> N
     def step(scale: float) -> np.ndarray:
         folder = write_data(tmp_path / f"{scale}", truth=False)
         move_cameras(folder, lambda position: scale * position)
-        setup = FitSetup(methods.load("ref_gaussian", "quick"), read_dataset(folder, "train"))
-        groups = setup.groups({})
+        groups = FitSetup(methods.load("ref_gaussian", "quick"), read_dataset(folder, "train")).groups({})
         params = {"position": mi.TensorXf(np.zeros((4, 3), np.float32))}
         adam = Adam(params, {"position": groups["position"]})
         slope = np.array([1e-7, 1e-12, 1e-15, 3e-17])[:, None] * np.ones(3)

@@ -147,8 +147,7 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
 def test_render_passes_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_string(SCENE)
     pose = pathtrace.camera_poses(1, CENTRE, (3.0, 3.0), (0, 30), (0, 360), np.random.default_rng(0))[0]
-    options = DatasetOptions(size=8, fov=30, spp=64, max_depth=3)
-    cameras = pathtrace.Cameras(options, CENTRE, RADIUS, RADIUS)
+    cameras = pathtrace.Cameras(DatasetOptions(size=8, fov=30, spp=64, max_depth=3), CENTRE, RADIUS, RADIUS)
     whole = pathtrace.Tracer(scene, cameras).image(pose, 5)
     monkeypatch.setattr(pathtrace, "SAMPLES_PER_LAUNCH", 8 * 8 * 16)
     split = pathtrace.Tracer(scene, cameras)

@@ -48,8 +48,7 @@ CASES: list[tuple[dict[str, Any], Expected]] = [
 
 def seen_from(direction: tuple[float, float, float], *shapes: dict[str, Any]) -> Any:
     """Materials where a ray from far away, along a direction to the origin, first meets one of the shapes."""
-    parts = {f"shape_{i}": shape for i, shape in enumerate(shapes)}
-    scene = mi.load_dict({"type": "scene", **parts})
+    scene = mi.load_dict({"type": "scene", **{f"shape_{i}": shape for i, shape in enumerate(shapes)}})
     ray = mi.Ray3f(-5 * mi.Point3f(direction), mi.Vector3f(direction))
     found = materials_at(scene, scene.ray_intersect(ray))
     dr.eval(*found)  # while there is a scene to trace
@@ -184,8 +183,7 @@ def test_surface_mesh_is_that_of_the_shapes(made: Path) -> None:
     for view in read_loaded(made, "train").views:
         assert view.depth is not None and view.normal is not None
         camera = view.camera()
-        hit = scene.ray_intersect(mi.Ray3f(camera.origin, camera.rays()))
-        distance = np.array(hit.t).reshape(32, 32)
+        distance = np.array(scene.ray_intersect(mi.Ray3f(camera.origin, camera.rays())).t).reshape(32, 32)
         grazing = np.abs(np.sum(view.normal * np.array(camera.rays()).T.reshape(32, 32, 3), -1)) < 0.2
         compared = (view.depth > 0) & np.isfinite(distance) & ~grazing
         assert compared.sum() > 0.8 * (view.depth > 0).sum()
@@ -201,8 +199,7 @@ def test_unsupported_shape_is_named(tmp_path: Path) -> None:
     """Before anything is written."""
     (tmp_path / "curve.txt").write_text("0 0 0 0.1\n0.3 0 0 0.1\n0.6 0.1 0 0.1\n0.8 0.1 0.2 0.1\n")
     shape = '<shape type="bsplinecurve" id="odd"><string name="filename" value="curve.txt"/></shape>'
-    scene = f'<scene version="3.0.0"><emitter type="constant"/>{shape}</scene>'
-    (tmp_path / "odd.xml").write_text(scene)
+    (tmp_path / "odd.xml").write_text(f'<scene version="3.0.0"><emitter type="constant"/>{shape}</scene>')
     make = partial(make_dataset, tmp_path / "odd.xml", tmp_path / "out", views=1, size=8, progress=False)
     refused(make, "odd.xml: shape 'odd': a BSplineCurve", "use a mesh, sphere")
     assert not (tmp_path / "out").exists()

@@ -1,5 +1,6 @@
 """Path-traced data sets of an object in a room: images of all, maps of the object, COLMAP's files."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -12,7 +13,7 @@ import trimesh
 from scipy.ndimage import binary_erosion
 
 from mi_refgs.cli import main
-from mi_refgs.data.region import read_region
+from mi_refgs.data.region import Region, read_region, write_region
 from mi_refgs.io.exr import write_exr
 from mi_refgs.synthesis.make_dataset import REGION_MARGIN, make_dataset
 from mi_refgs.synthesis.options import DatasetOptions
@@ -99,7 +100,10 @@ def test_environment_of_open_scene_is_the_room_without_the_object(made: Path) ->
 def test_relit_object_of_open_scene_is_alone(made: Path, tmp_path: Path) -> None:
     """Under light of radiance 2 from everywhere: no lamp, no table, and its outline as alpha."""
     write_exr(tmp_path / "even.exr", np.full((8, 16, 3), 2, np.float32))
-    out = make_dataset(made.parent / "room.xml", tmp_path / "out", relight=tmp_path / "even.exr", **OPTIONS)
+    out, drawn = shutil.copytree(made, tmp_path / "out"), Region((0.0, 0.0, 0.0), 2.0)
+    write_region(out, drawn)  # by a user: another light leaves it
+    make_dataset(made.parent / "room.xml", out, relight=tmp_path / "even.exr", **OPTIONS)
+    assert read_region(out) == drawn
     relit = read_loaded(out / "relight" / "even", "test", images="exr", background="black")
     for view, room in zip(relit.views, read_loaded(out, "test").views, strict=True):
         assert view.alpha is not None and room.depth is not None
@@ -153,8 +157,7 @@ def test_the_choice_of_object_is_said(made: Path, tmp_path: Path, capsys: pytest
     ],
 )
 def test_refusals(made: Path, tmp_path: Path, options: dict, words: str) -> None:
-    scene = made.parent / "room.xml"
-    refused(lambda: make_dataset(scene, tmp_path / "out", **OPTIONS | options), words)
+    refused(lambda: make_dataset(made.parent / "room.xml", tmp_path / "out", **OPTIONS | options), words)
     assert not (tmp_path / "out").exists()
 
 
