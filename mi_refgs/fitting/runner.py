@@ -1,6 +1,5 @@
 """A fit from data to artefacts: chooses method and image size, begins or resumes a run, finishes it."""
 
-import hashlib
 import itertools
 import re
 import time
@@ -29,7 +28,7 @@ from mi_refgs.registry import plugin_options
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import MODEL
-from mi_refgs.runs.views import read_views, sized, with_region
+from mi_refgs.runs.views import changed, digests, read_views, sized, with_region
 from mi_refgs.shade.light.placed import PlacedLight
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
@@ -181,11 +180,10 @@ def begin(
     Raises InputError for data that they refuse unless `force`, damaged checkpoints, and a folder that cannot
     be written."""
     resumed = run.exists()
-    if known := run.images():
-        now = _digests(views)
-        if changed := [name for name in known | now if known.get(name) != now.get(name)]:
-            what = f"not as when {run.path} began: {len(changed)} of {len(known | now)} images or cameras"
-            raise InputError(what, views.path, changed[0], "restore them, or choose another -o")
+    if other := changed(views, run.images()):
+        count = f"{len(other)} of {len({*run.images(), *other})}"
+        what = f"not as when {run.path} began: {count} images or cameras"
+        raise InputError(what, views.path, other[0], "restore them, or choose another -o")
     views = with_region(views, run.region(began=True), tell)
     state, found = run.load_checkpoint() if resumed else None, list[checks.Finding]()
     if resumed and state is None and (run.path / MODEL).is_file():
@@ -213,23 +211,12 @@ def begin(
     if resumed:
         run.rewind(trainer.iteration)
     else:
-        run.create(trainer.method, views.folder, views.region, _digests(views))
+        run.create(trainer.method, views.folder, views.region, digests(views))
         run.write_json("checks.json", {one.name: one.numbers for one in found})
         if len(views.views) < HOLDOUT and (names := waiting(trainer)):
             few = f"{len(views.views)} views: too few to hold some out"
             tell(f"{views.path}: {few}, so {' and '.join(names)} are not decided")
     return trainer
-
-
-def _digests(views: Dataset) -> dict[str, str]:
-    """A digest of the camera and of the size of the file of each image, by name."""
-    found = {}
-    for view in views.views:
-        size = view.file.path.stat().st_size if view.file and view.file.path.is_file() else 0
-        camera = np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 5)
-        text = repr((size, view.width, view.height, (camera + 0.0).tolist()))
-        found[view.name] = hashlib.sha256(text.encode()).hexdigest()[:16]
-    return found
 
 
 def _with_stereo(views: Dataset, tell: Tell) -> tuple[Dataset, np.ndarray | None]:

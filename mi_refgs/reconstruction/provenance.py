@@ -14,7 +14,7 @@ from mi_refgs.formats.orbits import shots_around
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.runs.views import read_views, with_poses, with_region
+from mi_refgs.runs.views import read_views, warn_of_changes, with_poses, with_region
 from mi_refgs.splat import Camera
 
 EDITS = "edit.json"
@@ -30,19 +30,20 @@ class Provenance:
     edits: tuple[dict[str, Any], ...] = ()  # made since, in order: the records of `editing.change.edit`
     records: dict[str, Any] = field(default_factory=dict)
     """Corrections of the fit by file: of its cameras and of the exposure."""
+    images: dict[str, str] = field(default_factory=dict)  # digests of those that it was fitted to
 
     @staticmethod
     def of(run: Run) -> "Provenance":
         """Read a run folder; raises InputError if it is none, or has a record that cannot be used."""
         made = run.record(EDITS).get("edits", [])
         records = {name: record for name in (CAMERAS, EXPOSURE) if (record := run.record(name))}
-        return Provenance(run.method(), run.dataset(), run.region(), tuple(made), records)
+        return Provenance(run.method(), run.dataset(), run.region(), tuple(made), records, run.images())
 
     def with_data(self, folder: Path | None) -> "Provenance":
         """Replace the data set, unless `folder` is None; raises InputError for a path that is no folder."""
         if folder is not None and not folder.is_dir():
             raise InputError("no such folder", folder, "--data", "give the folder of a data set")
-        return self if folder is None else replace(self, data=folder)
+        return self if folder is None else replace(self, data=folder, images={})
 
     @property
     def has_data(self) -> bool:
@@ -53,6 +54,7 @@ class Provenance:
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(gone, "views", split, "use cameras(), or restore the data set")
+        warn_of_changes(self.method, self.data, self.images)
         views = with_region(read_views(self.method, self.data, split, truth), self.region)
         return with_poses(views, self.records.get(CAMERAS, {}))
 
@@ -61,6 +63,8 @@ class Provenance:
         several splits one that cannot be read is left out, with a warning."""
         if self.data is None or not self.has_data:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
+        if "train" in splits:
+            warn_of_changes(self.method, self.data, self.images)
         relative, shots = (lambda path: Path(os.path.relpath(path, self.data))), list[Shot]()
         for split in splits:
             try:

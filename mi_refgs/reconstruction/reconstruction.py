@@ -104,13 +104,17 @@ class Reconstruction:
         return [shot.camera for shot in self.provenance.shots(self.trained, split)]
 
     def turntable(self, count: int) -> list[Camera]:
-        """Return cameras on a circle around the object, at the distance and height of the test views. Raises
-        InputError below 1."""
+        """Return cameras on a circle around the object, at the distance and height of the test views, or of
+        the training views without any. Raises InputError below 1."""
         require_between(count, "turntable", 1)
         trained, region = self.trained, None
         if trained.surroundings is not None:  # the mesh contains the background, too
             trained, region = replace(trained, mesh=None), self.provenance.region
-        return turntable_cameras(trained, self.cameras(), count, region)
+        try:
+            known = self.cameras()
+        except InputError:
+            known = self.cameras("train")
+        return turntable_cameras(trained, known, count, region)
 
     def camera(self, camera: CameraLike = 0, size: int | tuple[int, int] | None = None) -> Camera:
         """Convert a camera, a view, a Mitsuba sensor or an index of `cameras()` to a `Camera`.

@@ -64,8 +64,8 @@ def relight(
     fitted = load(run.path)
     fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
     provenance, requested, true_views, no_truth = fitted.provenance, light, None, NO_TRUTH
-    views = provenance.views("test", truth=False) if provenance.has_data else None
-    if views is not None and not turntable and (known := truth_under(light, views.path)) is not None:
+    views = provenance.views("test", truth=False) if provenance.has_data and not turntable else None
+    if views is not None and (known := truth_under(light, views.path)) is not None:
         try:
             true_views, light = _true_views(provenance.method, known[0], views), known[1]
         except InputError as error:
@@ -95,7 +95,8 @@ def relight(
         write_png(folder / image, straight_srgb(ours[-1]))
     colour = BACKGROUNDS[provenance.method.data.background]
     background = np.full(3, colour, np.float32) if views is None else views.background
-    reason = NO_DATA if views is None else "a turntable has no ground truth" if turntable else no_truth
+    reason = "a turntable has no ground truth" if turntable else no_truth
+    reason = reason if provenance.has_data else NO_DATA
     result: dict[str, Any] = {
         "run": str(run.path),
         "output": str(folder),

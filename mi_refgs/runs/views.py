@@ -1,7 +1,10 @@
 """The views of a run: a split of its data set, read as its method says, with its region of interest."""
 
+import contextlib
+import hashlib
 import os
 import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -71,8 +74,34 @@ def views_of_run(
             raise InputError("the run records no data set", record, "path", "name one with --data")
         if not os.path.isdir(path):  # False for impossible names too
             raise InputError(f"{path} is gone", record, "path", "name the data set's folder with --data")
+        warn_of_changes(method, path, run.images())
     views = measured_views(method, path) if measured else read_views(method, path, split)
     return with_region(views, run.region())
+
+
+def digests(views: Dataset) -> dict[str, str]:
+    """A digest of the camera, the size of the file and the presence of alpha of each image, by name."""
+    found = {}
+    for view in views.views:
+        size = view.file.path.stat().st_size if view.file and view.file.path.is_file() else 0
+        camera = np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 5)
+        text = repr((size, view.has_alpha, view.width, view.height, (camera + 0.0).tolist()))
+        found[view.name] = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return found
+
+
+def changed(views: Dataset, known: Mapping[str, str]) -> list[str]:
+    """The images whose digests are not those that a run recorded (`Run.images`), if it did."""
+    now = digests(views) if known else {}
+    return [name for name in {**known, **now} if known.get(name) != now.get(name)]
+
+
+def warn_of_changes(method: Method, path: Path, known: Mapping[str, str]) -> None:
+    """Warn if the training images of a data set are not those that a run began with."""
+    with contextlib.suppress(InputError):  # of images that are gone, readers of the split tell
+        if known and (other := changed(read_views(method, path, "train", truth=False), known)):
+            what = f"{path}: {len(other)} images or cameras are not as when the fit began, such as {other[0]}"
+            warnings.warn(f"{what}; fit again, or restore them", RuntimeWarning, stacklevel=3)
 
 
 def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:

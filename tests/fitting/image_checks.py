@@ -10,6 +10,7 @@ from mi_refgs.data.dataset import View
 from mi_refgs.data.images import Pixels
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as reference
+from tests.helpers import with_grad
 
 HEIGHT, WIDTH = 14, 17  # not square, and larger than SSIM's window in one axis only by a little
 BACKGROUND = np.array([1.0, 0.5, 0.25], np.float32)
@@ -69,8 +70,7 @@ def check(
     share: of the entries that are compared one by one (slow definitions); the image's rim is always among
     them. tolerance: relative L2."""
     image = image.astype(np.float32).astype(np.float64)
-    leaves = planes(image)
-    dr.enable_grad(leaves)
+    leaves = with_grad(planes(image))
     value = loss(leaves)
     assert abs(float(value[0]) - define(image)) < VALUE
     dr.backward(value)
@@ -81,11 +81,7 @@ def check(
     assert np.linalg.norm((found - wanted)[entries]) <= tolerance * np.linalg.norm(wanted)
 
     direction = np.random.default_rng(3).normal(size=image.shape).astype(np.float32)
-    leaves = planes(image)
-    for leaf, towards in zip(leaves, planes(direction), strict=True):
-        dr.enable_grad(leaf)
-        dr.set_grad(leaf, towards)
-    value = loss(leaves)
+    value = loss(with_grad(planes(image), planes(direction)))
     dr.forward_to(value)
     towards = direction.astype(np.float64)
     expected = (define(image + STEP * towards) - define(image - STEP * towards)) / (2 * STEP)

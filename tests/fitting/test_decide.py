@@ -159,8 +159,7 @@ def test_a_fork_keeps_common_parameters(method: Method, views: Dataset) -> None:
     trainer = step_to(Trainer(method, views), 3)
     before = {name: np.array(tensor.numpy()) for name, tensor in trainer.fit.params.items()}
     history = trainer.fit.arrays()["optimiser/radiance_sh/second"].reshape(-1, 12)
-    rows = [{"component": "colour_alone", "stays": True}]
-    poor = fork(trainer, as_decided(method, rows))
+    poor = fork(trainer, as_decided(method, [{"component": "colour_alone", "stays": True}]))
     assert {*poor.fit.params} == {"position", "rotation", "scale", "opacity", "radiance_sh"}
     assert poor.iteration == 3 and poor.run is None
     np.testing.assert_array_equal(poor.fit.params["position"].numpy(), before["position"])
@@ -235,8 +234,7 @@ def test_decided_fit_resumes(
         patch.setattr(Trainer, "step", killed)
         begin(method, views, run).train()
     assert not differences(run, method)
-    changed = methods.load(file, "quick", [*SETTINGS, "loss.ssim=0.5"])
-    assert "loss.ssim.weight" in differences(run, changed)
+    assert "loss.ssim.weight" in differences(run, methods.load(file, "quick", [*SETTINGS, "loss.ssim=0.5"]))
     resumed = begin(run.method(), views, run)
     assert summary(resumed) == [("colour_alone", 2, True)]
     resumed.train()

@@ -69,8 +69,7 @@ def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
     trainer = Trainer(method, CASES.get(name, ball)(), warn=pytest.fail)
     if name in LIGHTS:
         raw = trainer.fit.params[LIGHT].numpy()
-        changed_raw = LIGHTS[name](raw.reshape(-1, 3)).reshape(raw.shape)
-        trainer.fit.params[LIGHT] = upload_tensor(changed_raw)
+        trainer.fit.params[LIGHT] = upload_tensor(LIGHTS[name](raw.reshape(-1, 3)).reshape(raw.shape))
         trainer.fit.optimiser.reset(LIGHT)
     trainer.train()
     assert trainer.iteration == STEPS and trainer.health.skipped == 0

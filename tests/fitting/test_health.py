@@ -59,8 +59,7 @@ def test_surfels_with_bad_gradients_are_removed_and_named(method: Method, tmp_pa
     assert trainer.health.skipped == 1 and trainer.surfels.count == len(before) - 2
     assert said == [f"iteration {failed[0]}, view 2: albedo not finite at surfels 17, 52: 2 were removed"]
     assert len(trainer.fit.tables[0].error_sum) == trainer.surfels.count
-    lines = (run.path / "metrics.jsonl").read_text().splitlines()
-    assert json.loads(lines[-1])["skipped_steps"] == 1
+    assert json.loads((run.path / "metrics.jsonl").read_text().splitlines()[-1])["skipped_steps"] == 1
 
 
 @pytest.mark.parametrize("name", ["position", "roughness", "indirect_sh"])
@@ -80,8 +79,7 @@ def test_bad_surfels_are_removed_and_the_fit_goes_on(name: str, value: float, me
 
 def test_fit_in_which_every_step_fails_ends_with_one_sentence(method: Method, tmp_path: Path) -> None:
     """Too many surfels to be the cause: nothing is removed, nothing changes, and the view is named."""
-    run = run_folder(tmp_path / "run", method)
-    trainer = Trainer(without(method), ball(), run)
+    trainer = Trainer(without(method), ball(), run_folder(tmp_path / "run", method))
     spoil_gradient(trainer, "scale", list(range(1000)), set(range(6)))
     before = trainer.surfels.to_numpy()
     with pytest.raises(InputError, match=r"view \d: scale not finite; .*look at that image"):

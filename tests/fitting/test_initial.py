@@ -39,8 +39,7 @@ def test_share_inside_is_spread_over_volume(ball: dataset.Dataset) -> None:
     """Below 0.8 of the radius lies half of the volume of the ball, and nothing of its surface."""
     deep = {}
     for share in (0.0, 0.5, 1.0):
-        table = start(ball, share)
-        distance = np.linalg.norm(table["position"], axis=1)
+        distance = np.linalg.norm(start(ball, share)["position"], axis=1)
         assert len(distance) == COUNT
         deep[share] = np.mean(distance < 0.8 * RADIUS)
     assert deep[0.0] == 0

@@ -14,7 +14,7 @@ from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from tests.fitting.image_checks import HEIGHT, WIDTH, check, planes, stack
-from tests.helpers import level_maps
+from tests.helpers import level_maps, with_grad
 
 Images = tuple[np.ndarray, np.ndarray]
 Loss = Callable[..., Any]
@@ -46,8 +46,7 @@ def test_image_losses(loss: Loss, define: Loss, share: float, images: Images) ->
 
 @pytest.mark.parametrize(("loss", "most"), [(losses.l1, 0.0), (d_ssim, 1e-6)])
 def test_equal_images_cost_nothing(loss: Loss, most: float, images: Images) -> None:
-    leaves = planes(images[0])
-    dr.enable_grad(leaves)
+    leaves = with_grad(planes(images[0]))
     value = loss(leaves, planes(images[0]))
     dr.backward(value)
     assert abs(float(value[0])) <= most and np.abs(stack(leaves)).max() <= most
@@ -79,8 +78,7 @@ def test_only_objects_own_colour_is_highlight() -> None:
 
 def test_srgb_matches_file_reader_and_has_slope_at_zero() -> None:
     linear = np.array([-0.1, 0, 1e-30, 0.001, 0.0031308, 0.0032, 0.5, 1, 4, 1000], dtype=np.float32)
-    x = mi.Float(linear)
-    dr.enable_grad(x)
+    x = with_grad(mi.Float(linear))
     y = display.srgb_from_linear(x)
     dr.backward(y)
     np.testing.assert_allclose(np.array(y), srgb_from_linear(linear), rtol=2e-6, atol=1e-9)
@@ -90,8 +88,7 @@ def test_srgb_matches_file_reader_and_has_slope_at_zero() -> None:
 
 def test_display_image(rng: np.random.Generator) -> None:
     alpha = 0.05 + 0.9 * rng.random((HEIGHT, WIDTH, 1))
-    radiance = 2 * alpha * rng.random((HEIGHT, WIDTH, 3)) ** 2
-    both = np.concatenate([radiance, alpha], axis=-1)
+    both = np.concatenate([2 * alpha * rng.random((HEIGHT, WIDTH, 3)) ** 2, alpha], axis=-1)
     weights = (rng.normal(size=(HEIGHT, WIDTH, 3)) / 100).astype(np.float32)
     background = (1.0, 0.5, 0.0)
 
@@ -106,8 +103,7 @@ def test_display_image(rng: np.random.Generator) -> None:
 
 
 def test_display_image_shows_background_of_empty_pixels() -> None:
-    radiance, alpha = mi.Float(0, 0, 1e-9), mi.Float(0, 1e-7, 1e-8)
-    dr.enable_grad(radiance, alpha)
+    radiance, alpha = with_grad((mi.Float(0, 0, 1e-9), mi.Float(0, 1e-7, 1e-8)))
     (image,) = display.display_image([radiance], alpha, (0.25,))
     dr.backward(image)
     np.testing.assert_allclose(np.array(image), 0.25, atol=1e-6)
@@ -134,10 +130,8 @@ def test_half_metal(rng: np.random.Generator) -> None:
         lambda x: reference.half_metal(x, alpha),
         0.1 + 0.8 * rng.random((HEIGHT, WIDTH, 1)),
     )
-    weight = mi.Float(1, 1, 0.5)
-    dr.enable_grad(weight)
-    value = losses.half_metal(mi.Float(0, 1, 0), weight)
-    assert float(value[0]) == 0
+    weight = with_grad(mi.Float(1, 1, 0.5))
+    assert float(losses.half_metal(mi.Float(0, 1, 0), weight)[0]) == 0
     assert not dr.grad_enabled(losses.half_metal(mi.Float(0.5, 0.5, 0.5), weight))
 
 
@@ -175,8 +169,7 @@ def test_difference_of_lights(rng: np.random.Generator) -> None:
     def define(values: np.ndarray) -> float:
         return reference.light_difference(values, photographed, seen, area, losses.CLIPPED, losses.HUE)
 
-    light = mi.Color3f(radiance.T.astype(np.float32))
-    dr.enable_grad(light)
+    light = with_grad(mi.Color3f(radiance.T.astype(np.float32)))
     value = losses.light_difference(light, mi.Color3f(photographed.T), mi.Float(seen), mi.Float(area))
     assert float(value[0]) == pytest.approx(define(radiance), rel=1e-5)
     dr.backward(value)

@@ -42,8 +42,7 @@ Picture = tuple[np.ndarray, np.ndarray]
 def picture(rng: np.random.Generator) -> Picture:
     """Premultiplied radiance below 1, and alpha with empty and full pixels."""
     alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
-    colour = linear_from_srgb(rng.uniform(0.05, 0.9, (HEIGHT, WIDTH, 3)))
-    return colour * alpha[..., None], alpha
+    return linear_from_srgb(rng.uniform(0.05, 0.9, (HEIGHT, WIDTH, 3))) * alpha[..., None], alpha
 
 
 @pytest.mark.parametrize("linear", [False, True])

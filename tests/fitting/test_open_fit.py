@@ -29,6 +29,7 @@ from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.fields import Window
 from mi_refgs.methods.method import AROUND, LossWeight, Method, SurroundingsOptions
+from mi_refgs.reconstruction.provenance import Provenance
 from mi_refgs.reference.camera import look_at
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.run import Run
@@ -40,8 +41,9 @@ from mi_refgs.surfels.attributes import sigmoid
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused, unit
 from tests.scenes.highlight import require_same_state, set_rows, step_to, without
+from tests.scenes.layouts import change_transforms
 from tests.scenes.splats import opaque
-from tests.scenes.tiny import METHOD, REGION, write_data, write_open_data
+from tests.scenes.tiny import METHOD, REGION, write_data, write_method, write_open_data
 
 STEPS = 12
 
@@ -55,8 +57,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="module")
 def method(tmp_path_factory: pytest.TempPathFactory) -> Method:
     """The tiny method with surroundings, edits of the tables and a reset."""
-    path = tmp_path_factory.mktemp("method") / "tiny.toml"
-    path.write_text(METHOD + "[surroundings]\ndegree = 1\n")
+    path = write_method(tmp_path_factory.mktemp("method"), METHOD + "[surroundings]\ndegree = 1\n")
     settings = [
         f"iterations={STEPS}", "surfels.count=80", "surfels.max_count=100",
         "surroundings.count=60", "surroundings.max_count=90", "log_every=4",
@@ -80,8 +81,7 @@ def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None
     for name in ("opacity", "surroundings/opacity"):  # nearly transparent: images show through the cloud
         np.testing.assert_allclose(sigmoid(params[name].numpy()), method.surroundings.opacity, atol=1e-6)
     size = np.exp(params["surroundings/scale"].numpy()).max(axis=1)
-    distance = np.linalg.norm(outer, axis=1)
-    assert np.all(size <= 1.001 * method.surroundings.size * distance)
+    assert np.all(size <= 1.001 * method.surroundings.size * np.linalg.norm(outer, axis=1))
     assert np.exp(params["scale"].numpy()).max() < REGION.radius
     assert np.mean(np.any([view.project(outer)[2] for view in data.views], axis=0)) > 0.99
     # The sky is 0.5 + 0.3 d in the direction d, encoded; what no view sees is grey.
@@ -99,18 +99,15 @@ def test_initial_parameters_of_open_scene(data: Dataset, method: Method) -> None
 
 def test_points_keep_to_their_side(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SurroundingsOptions, "scattered", 0.0)
-    rng = np.random.default_rng(1)
-    near, far = np.array([0.4, 3])[:, None, None] * unit(rng.normal(size=(2, 30, 3)))
+    near, far = np.array([0.4, 3])[:, None, None] * unit(np.random.default_rng(1).normal(size=(2, 30, 3)))
     colour = np.concatenate([np.tile([1.0, 0, 0], (30, 1)), np.tile([0, 0, 1.0], (30, 1))])
     known = replace(data, points=PointCloud(np.concatenate([near, far]), colour))
     assert method.surroundings is not None
     surfels, around = replace(method.surfels, inside=0.0, count=30), replace(method.surroundings, count=30)
     no_random = replace(method, surfels=surfels, surroundings=around)
     params = initial_parameters(no_random, known, np.random.default_rng(0), True)
-    found = params["position"].numpy()
-    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(near, axis=0), atol=1e-6)
-    outer = params["surroundings/position"].numpy()
-    np.testing.assert_allclose(np.linalg.norm(outer, axis=1), 3, rtol=1e-5)
+    np.testing.assert_allclose(np.sort(params["position"].numpy(), axis=0), np.sort(near, axis=0), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(params["surroundings/position"].numpy(), axis=1), 3, rtol=1e-5)
     assert params["radiance_sh"].numpy()[:, 0].min() > params["surroundings/radiance_sh"].numpy()[:, 0].max()
     half = replace(no_random, surfels=replace(no_random.surfels, inside=0.5))
     mixed = initial_parameters(half, known, np.random.default_rng(0), True)["position"].numpy()
@@ -225,8 +222,7 @@ def test_points_of_a_surface_are_where_depth_is_level_and_opaque() -> None:
     alpha[30:35, 40:50] = 0.3
     points = open_scene.surface_points(view, depth.ravel(), alpha.ravel(), 1.0)
     row, column, seen = view.project(points)
-    along = (points - origin) @ pose[:3, 2]
-    assert seen.all() and {*np.round(along, 6)} == {3.0, 6.0}
+    assert seen.all() and {*np.round((points - origin) @ pose[:3, 2], 6)} == {3.0, 6.0}
     found = np.zeros((40, 60), bool)
     found[np.rint(row).astype(int), np.rint(column).astype(int)] = True
     assert found[10:20, 20:30].all() and not found[9, 20:30].any() and not found[30:35, 40:50].any()
@@ -243,8 +239,7 @@ def test_region_follows_object_once(data: Dataset, method: Method, monkeypatch: 
     guessed = replace(data, region=replace(REGION, estimated=True))
     trainer = step_to(Trainer(method, guessed, tell=said.append), STEPS // 3 + 1)
     assert fitted.call_count == len(said) == 1 and trainer.region == found and "0.5 units" in said[0]
-    position = trainer.surfels.to_numpy()["position"]
-    assert depth_outside(position, found).max() < 0.05
+    assert depth_outside(trainer.surfels.to_numpy()["position"], found).max() < 0.05
     resumed = Trainer(method, guessed, state=trainer.fit.arrays())
     step_to(resumed, STEPS // 2)
     assert resumed.region == found and fitted.call_count == 1
@@ -331,7 +326,8 @@ def test_resume_repeats_straight_run_bit_for_bit(data: Dataset, method: Method, 
 
 
 def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method, tmp_path: Path) -> None:
-    """However region.json is edited: a resumed fit says so, and what evaluates the run goes by its own."""
+    """However region.json is edited: a resumed fit says so, and what evaluates the run goes by its own. Other
+    cameras are another world: no fit goes on with them, and what reads them warns."""
     folder, run, said = shutil.copytree(data.path, tmp_path / "data"), Run(tmp_path / "run"), list[str]()
     begin(method, read_dataset(folder, "train"), run)
     assert run.region() == REGION
@@ -350,6 +346,12 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
         resumed = begin(method, read_dataset(folder, "train"), run, said.append)
         assert resumed.data.region == REGION and views_of_run(run, method, "test").region == REGION
         assert "region: it has changed" in said[0]
+    change_transforms(folder, lambda made: made["frames"][1].update(fl_x=30.0), "train")
+    refused(lambda: begin(method, read_dataset(folder, "train"), run), "1 of 8 images or cameras")
+    for read in (lambda: views_of_run(run, method, "test"), lambda: Provenance.of(run).views("test")):
+        with pytest.warns(RuntimeWarning, match="1 images or cameras are not as when the fit began"):
+            read()
+    assert views_of_run(run, method, "test", folder).views  # named: taken as it is
     (run.path / "dataset.json").write_text(json.dumps({"path": str(folder), "region": {"radius": 1}}))
     refused(lambda: views_of_run(run, method, "test"), "dataset.json: centre, radius")
 
@@ -395,8 +397,7 @@ def test_light_follows_photographs(data: Dataset, method: Method, monkeypatch: p
 
     monkeypatch.setattr(PhotographedLight, "of", staticmethod(counted))
     loss, rates = method.loss | {"photographed": LossWeight(100.0)}, replace(method.rates, light=0.3)
-    heavy = replace(method, loss=loss, rates=rates)
-    trainer = Trainer(heavy, data)
+    trainer = Trainer(replace(method, loss=loss, rates=rates), data)
     step_to(trainer, 4)
     known = trainer.fit.photographed
     assert known is not None and rendered == [4]
@@ -453,6 +454,5 @@ def test_images_without_alpha_have_a_method_of_their_own(
     assert (by_row is of_diffuse_colour) == method.rates.diffuse_relative == (own == "photographs")
     assert read.call_count == 1 and views.split == "train"
     monkeypatch.undo()
-    objects = write_data(tmp_path, views=3, truth=False)
-    assert chosen(objects, Choice(purpose=purpose))[0].name == alpha
+    assert chosen(write_data(tmp_path, views=3, truth=False), Choice(purpose=purpose))[0].name == alpha
     assert method.surroundings is not None and "photograph_light" in method.event

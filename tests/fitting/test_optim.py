@@ -287,8 +287,7 @@ def test_a_loop_over_the_parameters_of_a_scene(rng: np.random.Generator) -> None
         planes, true_planes = (mi_refgs.image_planes(x) for x in (image, goal))
         loss = mi_refgs.l1(planes, true_planes) + mi_refgs.d_ssim(planes, true_planes, 24, 24)
         dr.backward(loss)
-        moved = dr.grad(params["refgs.position"]).numpy()
-        table.observe(mi.Float(np.linalg.norm(moved, axis=1)))
+        table.observe(mi.Float(np.linalg.norm(dr.grad(params["refgs.position"]).numpy(), axis=1)))
         adam.step(step, loss)
         losses.append(float(loss.array[0]))
         if step == 7:

@@ -19,7 +19,7 @@ from mi_refgs.methods.fields import at_least
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes.highlight import require_same_state, step_to
-from tests.scenes.tiny import METHOD, SETTINGS, write_data
+from tests.scenes.tiny import METHOD, SETTINGS, write_data, write_method
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,8 @@ class Clone(mi_refgs.Event[Trainer]):
 @pytest.fixture
 def file(tmp_path: Path) -> Iterator[str]:
     mi_refgs.register_event(Clone)
-    path = tmp_path / "own.toml"
-    path.write_text(METHOD + "[event.clone]\nwhen = { start = 0, until = 1_000, every = 500 }\nshare = 0.2\n")
-    yield str(path)
+    table = "[event.clone]\nwhen = { start = 0, until = 1_000, every = 500 }\nshare = 0.2\n"
+    yield str(write_method(tmp_path, METHOD + table))
     EVENTS.unregister("clone")
 
 

@@ -15,7 +15,7 @@ from mi_refgs.fitting.initial import initial_surfels
 from mi_refgs.methods.extensions import INITIALISERS, Start, Wanted
 from mi_refgs.surfels.init import even_points
 from tests.helpers import refused
-from tests.scenes.tiny import METHOD, write_data
+from tests.scenes.tiny import METHOD, write_data, write_method
 
 MESH = trimesh.creation.icosphere(3, radius=0.5)
 
@@ -37,9 +37,8 @@ def data(tmp_path: Path) -> Dataset:
 @pytest.fixture
 def file(tmp_path: Path) -> Iterator[str]:
     mi_refgs.register_initialiser(mi_refgs.Initialiser("mesh", on_mesh))
-    path = tmp_path / "own.toml"
-    path.write_text(METHOD.replace("[surfels]\n", '[surfels]\nstart = ["mesh", "random"]\n'))
-    yield str(path)
+    text = METHOD.replace("[surfels]\n", '[surfels]\nstart = ["mesh", "random"]\n')
+    yield str(write_method(tmp_path, text))
     INITIALISERS.unregister("mesh")
 
 

@@ -46,8 +46,7 @@ def trainer_of(data: Path, method: Path, *settings: str) -> Trainer:
 
 def roughness_after(data: Path, method: Path, *settings: str) -> float:
     """Mean raw roughness after some steps of the deferred stage."""
-    trainer = step_to(trainer_of(data, method, *settings), 12)
-    return float(np.mean(trainer.surfels.to_numpy()["roughness"]))
+    return float(np.mean(step_to(trainer_of(data, method, *settings), 12).surfels.to_numpy()["roughness"]))
 
 
 def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path) -> None:

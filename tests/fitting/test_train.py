@@ -101,8 +101,7 @@ def test_stage_has_its_own_rates(method: Method) -> None:
 @pytest.mark.parametrize("stage", ["initial", "deferred"])
 def test_error_is_shared_by_surfels(stage: str, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """They sum to the squared error times alpha, and each gets that of the pixels that show it."""
-    only = {"only": replace(method.stage[stage], until=30)}
-    method = replace(without(method, "mesh"), stage=only)
+    method = replace(without(method, "mesh"), stage={"only": replace(method.stage[stage], until=30)})
     frames, errors = [], []
     render, measure = train.render, train.objective
 
@@ -236,8 +235,7 @@ def test_shared_light_learns_sum_of_gradients(method: Method, monkeypatch: pytes
     assert method.light is not None
     rates, sums = Rates(attribute=dict.fromkeys(method.surfels.names, 0.0), light=0.0), {}
     for every in (1, 3):
-        light = replace(method.light, every=every)
-        trainer = Trainer(replace(method, light=light, rates=rates), ball())
+        trainer = Trainer(replace(method, light=replace(method.light, every=every), rates=rates), ball())
         seen: list[np.ndarray] = []
         real = trainer.fit.optimiser.step
 

@@ -33,10 +33,16 @@ class PerView(Event[Trainer]):
     """An event that decides whether `parameter` learns."""
 
     parameter: ClassVar[str]
-    after: int = field(default=1_200, metadata=ITERATIONS | at_least(0))  # iterations before they learn
+    # Iterations before they learn; absent: a fifth of all.
+    after: int | None = field(default=None, metadata=ITERATIONS | at_least(0))
+
+    def waits(self, trainer: Trainer) -> bool:
+        """Whether it is too early to render what they are fitted to."""
+        after = trainer.method.iterations // 5 if self.after is None else self.after
+        return trainer.iteration < after
 
     def due(self, trainer: Trainer) -> bool:
-        waits = 0 < trainer.iteration < self.after or validates(trainer)
+        waits = (0 < trainer.iteration and self.waits(trainer)) or validates(trainer)
         decided = any(row["component"] == self.name for row in trainer.fit.decisions)
         return not waits and not decided and self.parameter not in trainer.fit.params
 
@@ -63,7 +69,7 @@ class Cameras(PerView):
     parameter: ClassVar[str] = POSE
 
     def first(self, trainer: Trainer) -> tuple[np.ndarray, bool, str] | None:
-        if trainer.iteration < self.after:
+        if self.waits(trainer):
             return None
         views = trainer.data.views
         moved = [_moved(trainer, views[i].load()) for i in evenly_spread(len(views), ALIGNED)]
@@ -83,7 +89,7 @@ class Exposure(PerView):
     def first(self, trainer: Trainer) -> tuple[np.ndarray, bool, str] | None:
         data = trainer.data
         if (log := told_gains(data.views)) is None:
-            if trainer.iteration < self.after:
+            if self.waits(trainer):
                 return None
             frames = (trainer.view(trainer.camera(i), aovs=False) for i in range(len(data.views)))
             fitted = [with_gain(frame, view, data)[0] for frame, view in zip(frames, data.views, strict=True)]

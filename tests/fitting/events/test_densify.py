@@ -46,8 +46,7 @@ def test_children_of_curved_surfels_turn_as_their_parents_do_there() -> None:
     rng, flat = np.random.default_rng(1), table(200, 0.05)
     raw = flat.to_numpy() | {"curvature": rng.normal(0, 5, (200, 3)).astype(np.float32)}
     raw["scale"] = np.log(rng.uniform(0.01, 0.05, (200, 2))).astype(np.float32)
-    options = replace(OPTIONS, grow=1.0)
-    edit = densify(Surfels.from_numpy(raw), np.ones(200), 400, options=options)
+    edit = densify(Surfels.from_numpy(raw), np.ones(200), 400, options=replace(OPTIONS, grow=1.0))
     parents, children = Surfels.from_numpy(raw).gather(mi.UInt32(edit.parent)), edit.surfels
     normal, now, longest = (
         np.array(x) for x in (parents.frame()[2], children.frame()[2], dr.detach(parents.scale()))
@@ -69,8 +68,7 @@ def test_surfels_with_the_largest_error_are_split() -> None:
     assert every.parent.tolist() == [0, 3, 5, *(1, 2, 4, 6, 7), *(1, 2, 4, 6, 7)]
     assert every.fresh.tolist() == [False] * 3 + [True] * 10
     for name in ("metallic", "roughness", "albedo", "rotation"):
-        values = every.surfels.to_numpy()[name]
-        assert np.array_equal(values, surfels.to_numpy()[name][every.parent]), name
+        assert np.array_equal(every.surfels.to_numpy()[name], surfels.to_numpy()[name][every.parent]), name
 
 
 def test_children_lie_on_the_longest_axis_of_their_parent() -> None:

@@ -109,10 +109,8 @@ def test_a_choice_is_that_of_the_neighbourhood() -> None:
     rng = np.random.default_rng(1)
     positions = rng.normal(size=(8000, 3)) * 0.1 + np.repeat([[-1.0, 0, 0], [1, 0, 0]], 4000, axis=0)
     values = np.repeat([-0.3, 0.3], 4000) + rng.normal(size=8000)
-    found = event._sum_around(positions, values)
-    np.testing.assert_array_equal(found > 0, np.repeat([False, True], 4000))
-    one = event._sum_around(positions[:1], values[:1])
-    np.testing.assert_allclose(one, values[:1])
+    np.testing.assert_array_equal(event._sum_around(positions, values) > 0, np.repeat([False, True], 4000))
+    np.testing.assert_allclose(event._sum_around(positions[:1], values[:1]), values[:1])
 
 
 def test_images_of_a_fit_decide(

@@ -34,7 +34,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, gradient, planes, shown, view_of
-from tests.helpers import refused, unit, with_pixels
+from tests.helpers import refused, unit, with_grad, with_pixels
 from tests.scenes.highlight import ball, require_same_state, run_folder, small_method, step_to
 
 GAINS = np.array([1.4, 0.7, 0.9])
@@ -47,8 +47,8 @@ Picture = tuple[np.ndarray, np.ndarray]
 def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
     """Without coarse images and other events; gains and cameras, which seem wrong, learn from AFTER on."""
     monkeypatch.setattr("mi_refgs.fitting.events.per_view._moved", lambda trainer, view: 1.0)
-    events: dict[str, Any] = {"exposure": Exposure(AFTER), "cameras": Cameras(AFTER)}
-    return replace(small_method(tmp_path), event=events, data=DataOptions())
+    events: dict[str, Any] = {"exposure": Exposure(), "cameras": Cameras(AFTER)}
+    return replace(small_method(tmp_path), iterations=5 * AFTER, event=events, data=DataOptions())
 
 
 @pytest.fixture
@@ -72,8 +72,7 @@ def test_gain_is_found_beside_clipped_pixels(linear: bool, has_alpha: bool, pict
         assert np.any(clipped < image - 0.05)
         image = clipped
     view = view_of(image, alpha if has_alpha else None, linear)
-    found = fitted_gain(radiance, alpha, view, BACKGROUND)
-    np.testing.assert_allclose(found, GAINS, rtol=2e-3)
+    np.testing.assert_allclose(fitted_gain(radiance, alpha, view, BACKGROUND), GAINS, rtol=2e-3)
     half = np.indices(alpha.shape)[0] < HEIGHT // 2
     radiance[~half] *= 3  # not looked at
     np.testing.assert_allclose(fitted_gain(radiance, alpha, view, BACKGROUND, half), GAINS, rtol=2e-3)
@@ -101,15 +100,13 @@ def test_exposure_and_its_derivative(linear: bool, picture: Picture, rng: np.ran
         return WEIGHTS["l1"].weight * reference.l1(image, goal, clipped) + prior
 
     log = np.array([0.3, -0.4, 0.2])
-    leaves = [mi.Float(float(value)) for value in log]
-    dr.enable_grad(leaves)
+    leaves = with_grad([mi.Float(float(value)) for value in log])
     frame = Frame(upload(alpha), upload(alpha), mi.Vector3f(0, 0, 1), mi.Color3f(*planes(radiance)))
     loss, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), WEIGHTS, 1)
     assert float(loss[0]) == pytest.approx(define(log), abs=3e-6)
     expected = gradient(define, log)
     dr.backward(loss, dr.ADFlag.ClearInterior)
-    found = np.array([float(dr.grad(leaf)[0]) for leaf in leaves])
-    np.testing.assert_allclose(found, expected, rtol=2e-4)
+    np.testing.assert_allclose([float(dr.grad(leaf)[0]) for leaf in leaves], expected, rtol=2e-4)
     for leaf, tangent in zip(leaves, (0.5, -1.0, 2.0), strict=True):
         dr.set_grad(leaf, mi.Float(tangent))
     moved, _ = objective(LossInputs.of(frame, target, data, log_gain=leaves), WEIGHTS, 1)
@@ -173,8 +170,7 @@ def test_gains_of_images(method: Method, rng: np.random.Generator, monkeypatch: 
         if spread < 1:
             assert GAIN not in trainer.fit.params and POSE in trainer.fit.params
             continue
-        found = trainer.fit.params[GAIN].numpy()
-        np.testing.assert_allclose(found, expected, atol=5e-3)
+        np.testing.assert_allclose(trainer.fit.params[GAIN].numpy(), expected, atol=5e-3)
     assert "exposure are left out: gains of 1.00" in said[0] and "exposure stay: gains of" in said[2]
     gains = per_view.gains_of(trainer.fit.params)
     assert gains is not None
@@ -203,8 +199,7 @@ def with_rows(trainer: Trainer, rows: np.ndarray) -> Trainer:
 
 def world_motion(trainer: Trainer, index: int) -> np.ndarray:
     """(4, 4): how the world would move to get from a view's camera to the corrected one."""
-    old = trainer.data.views[index].to_world
-    return np.asarray(trainer.camera(index).pose() @ np.linalg.inv(old))
+    return np.asarray(trainer.camera(index).pose() @ np.linalg.inv(trainer.data.views[index].to_world))
 
 
 def test_corrections_are_motions_about_focus_without_their_mean(method: Method) -> None:
@@ -346,8 +341,7 @@ def disturbed_discs(rng: np.random.Generator) -> tuple[Dataset, Surfels, np.ndar
         view = View(f"{i}", *intrinsics, pose, Pixels(np.zeros((size, size, 3), np.float32)))
         frame = render(scene, view.camera())
         image = image_array([*displayed(frame, background, False), frame.alpha], size, size)
-        pixels = Pixels(image[..., :3].clip(0, 1), image[..., 3])
-        made.append(replace(view, to_world=wrong[i], pixels=pixels))
+        made.append(replace(view, to_world=wrong[i], pixels=Pixels(image[..., :3].clip(0, 1), image[..., 3])))
     return Dataset(Path("discs"), "train", tuple(made), background, False, None), surfels, true
 
 
@@ -359,8 +353,7 @@ def pose_errors(trainer: Trainer, true: np.ndarray) -> tuple[float, float]:
     turns = whole * Rotation.from_matrix(found[:, :3, :3]) * Rotation.from_matrix(true[:, :3, :3]).inv()
     place, wanted = whole.apply(found[:, :3, 3]), true[:, :3, 3]
     offset = place - place.mean(axis=0) - (wanted - wanted.mean(axis=0))
-    distance = np.linalg.norm(wanted, axis=1)
-    moved = np.linalg.norm(offset, axis=1) / distance
+    moved = np.linalg.norm(offset, axis=1) / np.linalg.norm(wanted, axis=1)
     angle, far = (float(np.sqrt(np.mean(np.square(x)))) for x in (turns.magnitude(), moved))
     return float(np.degrees(angle)), far
 
@@ -395,8 +388,7 @@ def test_exact_cameras_stay(tmp_path: Path, rng: np.random.Generator) -> None:
     data, surfels, true = disturbed_discs(rng)
     nearly = [0.95 * pose + 0.05 * view.to_world for view, pose in zip(data.views, true, strict=True)]
     views = [replace(view, to_world=pose) for view, pose in zip(data.views, nearly, strict=True)]
-    method = small_method(tmp_path, RADIANCE)
-    trainer = Trainer(method, replace(data, views=tuple(views)), tell=said.append)
+    trainer = Trainer(small_method(tmp_path, RADIANCE), replace(data, views=tuple(views)), tell=said.append)
     trainer.fit.tables[0].replace(surfels, tuple(surfels.raw))
     step_to(trainer, 3)
     assert POSE not in trainer.fit.params
