@@ -29,6 +29,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import safe_normalize
 from mi_refgs.shade.reflectance import Reflectance
 from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.table import vector_of
 from mi_refgs.types import Array, Float, Point2f, Point3f, UInt32, Vector3f
 
 SMOOTHING = 30  # steps of the filter that removes stairs of voxels and keeps the volume [Taubin 1995]
@@ -190,7 +191,7 @@ def _points(
         return dr.concat((dr.gather(mi.Float, column, vertices), mixed))
 
     columns = nearby.values(scene.surfels, scene.shading.required_attributes)
-    values = {name: own[0] if len(own) == 1 else mi.Color3f(*own) for name, own in columns.items()}
+    values = {name: vector_of(own) for name, own in columns.items()}
     materials = [interpolated(column) for column in _columns(scene.shading.model, values)]
     normal = mi.Vector3f(*(interpolated(upload(column)) for column in mesh.normals().astype(np.float32).T))
     points = mi.Point3f(*(interpolated(upload(column)) for column in mesh.vertices.T))

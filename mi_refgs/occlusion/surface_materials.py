@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.surfels.table import Surfels
+from mi_refgs.surfels.table import Surfels, vector_of
 from mi_refgs.types import Array, Bool, Color3f, Float, Point2f, UInt32, Vector3f
 
 NEIGHBOURS = 4  # surfels per vertex: those that overlap at a point of a fitted surface with visible weight
@@ -123,7 +123,7 @@ class Surface:
         values = {}
         for name, width in self.widths.items():
             own = [next(columns) for _ in range(width)]
-            values[name] = own[0] if width == 1 else mi.Color3f(*own) if width == 3 else own
+            values[name] = vector_of(own) if width <= 4 else own  # coefficients of SH
         return SurfaceSample(values, mi.Vector3f(*(next(columns) for _ in range(3))), surfel)
 
 

@@ -1,5 +1,6 @@
 """Images through a sensor's film, and their derivatives."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -139,7 +140,9 @@ class FilmImage:
 
     def _through_film(self, mode: Any, derivative: Any) -> Any:
         """Tangent of the image for that of the channels, or their adjoint for that of the image."""
-        before = self.film.develop(True)
+        before = None
+        with contextlib.suppress(RuntimeError):  # it was never used
+            before = self.film.develop(True)
         height, width = self._size
         weight = 4 if self._alpha else 3  # the channel that it divides by
         count = weight + 1 + len(self.aovs)
@@ -153,7 +156,8 @@ class FilmImage:
         dr.traverse(mode)
         found = dr.detach(dr.grad(end))
         dr.eval(found)
-        if before.shape[2] == count:  # restore the image before, unless another integrator made it
+        # Restore the image before, unless there was none or another integrator made it.
+        if before is not None and before.shape[2] == count:
             self.film.prepare(self.aovs)
             self.film.put_block(mi.ImageBlock(before, self.film.crop_offset()))
         return found

@@ -40,8 +40,9 @@ class RefGSIntegrator(mi.SamplingIntegrator):
      * filename (string): PLY file with surfels or 3D Gaussians: raw values (before the activation) of 2DGS or
        3DGS and of the attributes below. In Python, tensors may add or replace attributes.
      * light *or any name* (emitter): An ``envmap`` or ``constant`` emitter, copied into the integrator's own
-       light; in Python also the raw tensor of an ``EnvironmentLight``. (Default: the scene's emitter of these
-       types and, unless the model samples its light, its ``directional`` ones)
+       light; in Python also the raw tensor of an ``EnvironmentLight``. Maps of more than 512 rows are
+       downscaled. (Default: the scene's emitter of these types and, unless the model samples its light, its
+       ``directional`` ones)
      * near_field (string): File (.npz) with ``nearness`` (h, 2h), 1 / distance of what an unrotated
        ``envmap`` shows, seen from the point ``centre`` (3,). (Default: infinitely far)
      * mesh (string): PLY file of the mesh that occludes mirror reflections. (Default: none)

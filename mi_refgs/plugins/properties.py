@@ -98,7 +98,12 @@ def read_light(props: Any) -> tuple[Any, Any, NearField | None]:
     distances of what it shows; None: infinitely far."""
     path = _path(props, "near_field")
     near = None if path is None else NearField.read(path)
-    emitters = [child for _, child in props.objects() if isinstance(child, mi.Emitter)]
+    nested = dict(props.objects())
+    emitters = [child for child in nested.values() if isinstance(child, mi.Emitter)]
+    for name, child in nested.items():
+        if not isinstance(child, mi.Emitter):
+            what = f"refgs takes no {type(child).__name__}"
+            raise InputError(what, "refgs", name, "nest it in the scene, or remove it")
     if len(emitters) > 1:
         raise InputError("two emitters are nested in the integrator", "refgs", "light", "keep one")
     if emitters:
@@ -115,7 +120,7 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     at: Any = _choice(props, "shade_at", MODELS[reflectance].shaded_at[0], ("pixel", "surfel"))
     mesh = _path(props, "mesh")
     shading = Shading(at, reflectance, diffuse)
-    occlusion = get(props, "occlusion", mesh is not None and shading.traceable)
+    occlusion = get(props, "occlusion", mesh is not None)
     quality = {name: get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
     shading = replace(shading, occlusion=occlusion, **quality)
     return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None

@@ -10,10 +10,10 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.plugins.light import light_of, used_emitters
+from mi_refgs.plugins.light import light_of, own_light, used_emitters
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, EnvironmentLight
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.latlong import lat_long
 from mi_refgs.shade.light.light import RotatedLight
 from mi_refgs.shade.options import ShadingOptions
@@ -35,8 +35,8 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         raise InputError(what, "from_params", type(params).__name__, remedy)
     if shading is not None:
         raise InputError("a scene has its own", "from_params", "shading", "give arrays, or drop it")
+    lights = used_emitters(integrator.shading, params) if isinstance(params, mi.Scene) else []
     if integrator.light is None and integrator.shading.model.light != "none":
-        lights = used_emitters(integrator.shading, params) if isinstance(params, mi.Scene) else []
         if not lights or not all(emitter.is_environment() for emitter in lights):
             what, remedy = "its light is not an environment alone", "nest an `envmap` in the integrator"
             raise InputError(what, "from_params", "light", remedy)
@@ -44,8 +44,8 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         seen = light_of(integrator.shading, integrator.light, integrator.light_to_world, params)
     light = integrator.light
     if isinstance(seen, RotatedLight) or (light is None and seen is not None):
-        height = DEFAULT_HEIGHT if light is None else light.height
-        light = EnvironmentLight.from_radiance(lat_long(seen.radiance, height))
+        own = own_light(lights[0])[0] if light is None else light
+        light = EnvironmentLight.from_radiance(lat_long(seen.radiance, own.height))
     if not isinstance(integrator.behind, EnvironmentLight | None) and dr.any(integrator.behind != 0):
         what = "background: a reconstruction has none of one colour, so it becomes transparent"
         warnings.warn(what, RuntimeWarning, stacklevel=3)

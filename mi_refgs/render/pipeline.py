@@ -267,7 +267,8 @@ def _shade_at_pixels(view: _View) -> Frame:
         covered = dr.detach(alpha) > COVERAGE_FLOOR
         context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
         points = trace(points, context, shading)
-        maps["visibility"] = points.visibility
+        if (seen := points.get("visibility")) is not None:  # a model may trace its own rays
+            maps["visibility"] = seen
 
     # Radiance, premultiplied.
     light = scene.light
@@ -276,7 +277,7 @@ def _shade_at_pixels(view: _View) -> Frame:
     shaded_at = partial(shade, light=light, shading=shading)
     if shading.antialias:
         # Traced radiance exists only where the pixel's own ray is blocked: the rest would have none.
-        interpolated = shading.occlusion and not shading.traced_bounces
+        interpolated = "visibility" in maps and not shading.traced_bounces
         shaded = averaged(shaded_at, points, alpha, camera, buffer.pixels, interpolated)
     else:
         shaded = shaded_at(points)

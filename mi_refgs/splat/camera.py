@@ -36,6 +36,7 @@ class Camera:
     focal: float  # |fx| on the host, decides the size of tiles
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film; tiles are those of the film
     film: tuple[int, int] | None = None  # pixels, size of the film; None: the camera has all of it
+    mirrored: bool = False  # whether the pose is a reflection
     motion: Float | None = None
     """(6,) of `kernels.motion`: rotation about the origin, translation (scene units)."""
 
@@ -86,12 +87,13 @@ class Camera:
         def opaque(*numbers: float) -> list[Float]:
             return [dr.opaque(mi.Float, float(x)) for x in numbers]
 
+        mirrored = bool(np.linalg.det(rotation) < 0)
         turn = mi.Matrix3f([opaque(*row) for row in rotation.T])
         origin = matrix[:3, 3].astype(np.float32)
         place, rest = mi.Point3f(*opaque(*origin)), mi.Vector3f(*opaque(*(matrix[:3, 3] - origin)))
         lens = dict(zip(("fx", "fy", "cx", "cy", "near"), opaque(fx, fy, cx, cy, near), strict=True))
-        focal = abs(float(fx))
-        return Camera(width, height, rotation=turn, origin=place, origin_rest=rest, focal=focal, **lens)
+        at = {"rotation": turn, "origin": place, "origin_rest": rest}
+        return Camera(width, height, **at, focal=abs(float(fx)), mirrored=mirrored, **lens)
 
     @staticmethod
     def look_at(

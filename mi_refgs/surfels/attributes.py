@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, abbreviated
 from mi_refgs.registry import Registry
 
 MAX_SH_DEGREE = 3  # of the 3DGS family; `shade.sh` evaluates no more
@@ -13,6 +13,10 @@ ALBEDO_JITTER = 0.025  # half the width of the initial albedo's noise: breaks ti
 SH_DC = 0.28209479177387814  # Y_0 = 1 / (2 √π): a constant coefficient c adds the colour Y_0 c. [3DGS]
 JITTER_RANGE = (0.001, 0.999)  # of initial values with noise: beyond, the sigmoid is flat
 PROBABILITY_MARGIN = 1e-6  # least distance of initial values from 0 and 1, where the logit is infinite
+
+RESERVED = """normal depth alpha visibility radiance diffuse specular indirect object surroundings
+    light light_to_world near_field mesh background aovs filename occlusion shade_at reflectance""".split()
+"""Names of maps and of options of the integrator."""
 
 Activation = Literal["identity", "quaternion", "exp", "sigmoid", "harmonics"]
 """Activation of a raw value. "quaternion": normalised (x, y, z, w); "sigmoid": logistic; `harmonics`: raw
@@ -60,21 +64,30 @@ class Attribute:
     ) -> np.ndarray:  # (count, width) float64
         """Initial raw values around the activated `value`, for SH what the constant coefficient adds;
         InputError for one that the activation cannot return."""
-        value = self.initial if value is None else value
+        given = np.asarray(self.initial if value is None else value, dtype=np.float64)
+        columns = 3 if self.harmonics else width
+        by_row = given[:, None] if columns == 1 and given.shape == (count,) else given
+        try:
+            value = np.broadcast_to(by_row, (count, columns))
+        except ValueError as error:
+            remedy = f"give one number, or an array {(count, columns)}"
+            raise InputError(f"shape {given.shape}", "surfels", self.name, remedy) from error
         if self.activation == "sigmoid":
-            if not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= 1)):
-                raise InputError(f"{value} is out of range", "surfels", self.name, "start it between 0 and 1")
+            if not np.all((value >= 0) & (value <= 1)):
+                remedy = "start it between 0 and 1"
+                raise InputError(f"{abbreviated(given)} is out of range", "surfels", self.name, remedy)
             if self.jitter:
                 noise = rng.uniform(-self.jitter, self.jitter, (count, width))
                 return logit(np.clip(value + noise, *JITTER_RANGE))
-            return np.broadcast_to(logit(value), (count, width)).copy()
+            return logit(value)
         if self.activation == "exp":
-            if not 0 < value < np.inf:
-                raise InputError(f"{value} is out of range", "surfels", self.name, "start it above 0")
+            if not np.all((value > 0) & (value < np.inf)):
+                remedy = "start it above 0"
+                raise InputError(f"{abbreviated(given)} is out of range", "surfels", self.name, remedy)
             value = np.log(value)
         if self.harmonics:
-            return np.tile(np.where(np.arange(width) < 3, value / SH_DC, 0.0), (count, 1))
-        return np.full((count, width), float(value))
+            return np.hstack([value / SH_DC, np.zeros((count, width - 3))])
+        return np.array(value)
 
 
 def _check(attribute: Attribute) -> None:
@@ -82,6 +95,8 @@ def _check(attribute: Attribute) -> None:
         what = f"aov: {attribute.aov!r} does not fit {' or '.join(map(str, attribute.widths))} columns"
         remedy = 'use Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""'
         raise InputError(f"attribute '{attribute.name}': {what}", remedy=remedy)
+    if attribute.name in RESERVED:
+        raise InputError(f"attribute '{attribute.name}': the integrator has it", remedy="rename it")
     for other in ATTRIBUTES.values():
         if {*other.properties} & {*attribute.properties}:
             what = f"attribute '{attribute.name}': '{other.name}' has its PLY property"

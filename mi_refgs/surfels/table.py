@@ -12,7 +12,7 @@ Named rules for degenerate values (each keeps values and gradients finite for ev
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import drjit as dr
@@ -139,15 +139,13 @@ class Surfels:
         return columns_of(tensor.array, width)
 
     def value(self, name: str) -> Any:
-        """Activated mi.Float of one column, mi.Color3f of three, else a list (SH: of mi.Color3f)."""
+        """Activated mi.Float of one column, mi.Color3f of three, else a vector (SH: list of mi.Color3f)."""
         columns = self.columns(name)
         activate = {"sigmoid": sigmoid, "exp": _exp}.get(attribute(name).activation)
         columns = columns if activate is None else [activate(column) for column in columns]
         if attribute(name).harmonics:
             return [mi.Color3f(*columns[start : start + 3]) for start in range(0, len(columns), 3)]
-        if len(columns) == 3:
-            return mi.Color3f(*columns)
-        return columns[0] if len(columns) == 1 else columns
+        return vector_of(columns)
 
     def values(self, names: Collection[str]) -> dict[str, Any]:
         """Activated values of the attributes among `names`, by name; those that are absent are left out."""
@@ -220,6 +218,12 @@ class Surfels:
     def enable_grad(self) -> None:
         """Make every raw tensor a leaf of the AD graph."""
         dr.enable_grad(list(self.raw.values()))
+
+
+def vector_of(columns: Sequence[Float]) -> Any:
+    """One column as it is, three as a colour, others as a vector."""
+    kinds = {2: mi.Vector2f, 3: mi.Color3f, 4: mi.Vector4f}
+    return columns[0] if len(columns) == 1 else kinds.get(len(columns), mi.ArrayXf)(*columns)
 
 
 def _limit(name: str) -> float:

@@ -119,7 +119,8 @@ class Surfel(base.Oriented):
         along_u, along_v = (
             mi.Vector2f(*(dr.fma(-slope[i], t.z, t[i]) for i in range(2))) for t in (t_u, t_v)
         )
-        of_u, of_v = inverse / s.x, inverse / s.y
+        turned = -inverse if camera.mirrored else inverse  # t_u × t_v = -n there
+        of_u, of_v = turned / s.x, turned / s.y
         centre = focal * slope + mi.Vector2f(camera.cx, camera.cy)
         columns = [of_u * along_v.y / focal.x, -of_u * along_v.x / focal.y]
         columns += [-of_v * along_u.y / focal.x, of_v * along_u.x / focal.y]
