@@ -10,7 +10,7 @@ from pathlib import Path
 from tests.simple_kernels import set_options
 
 # isort: split
-import mi_refgs  # noqa: F401  (first: it chooses the libLLVM that Dr.Jit loads)
+import mi_refgs  # first: it chooses the libLLVM that Dr.Jit loads
 
 # isort: split
 import drjit as dr
@@ -41,34 +41,16 @@ settings.load_profile("mi_refgs")
 
 VARIANT = os.environ.get("MI_REFGS_TEST_VARIANT", "llvm_ad_rgb")
 THREADS = max(dr.thread_count(), 2)  # Mitsuba must be able to read EXR files
-LONGEST = (
-    "test_tutorials.py",
-    "test_additive_gradients.py",
-    "test_viewer_page.py",
-    "test_option_pairs.py",
-    "test_docs.py",
-    "test_train.py",
-    "test_routes.py",
-    "test_variants.py",
-    "test_reflectance_models.py",
-    "test_bsdf.py",
-    "test_sensor_derivatives.py",
-    "test_traced_light.py",
-    "test_poses.py",
-    "test_compare.py",
-    "test_dataset.py",
-    "test_own_files.py",
-    "test_gallery.py",
-    "test_profile.py",
-    "test_packaging.py",
-    "test_config.py",
-)
-"""Files that take longest, in this order: run first, so that no process ends long before the other."""
+LONGEST = """
+    tutorials additive_gradients viewer_page option_pairs docs train routes variants reflectance_models bsdf
+    sensor_derivatives traced_light poses compare dataset own_files gallery profile packaging config
+""".split()
+"""The slowest files test_*.py, in this order: run first, so that no process ends long before the other."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files; the others keep their order."""
-    rank = {name: place for place, name in enumerate(LONGEST)}
+    rank = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 
 
@@ -85,6 +67,12 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("known")
     write_known_run(write_known_data(folder), folder / "run")
     return folder
+
+
+@pytest.fixture(scope="module")
+def balls(known: Path) -> mi_refgs.Reconstruction:
+    """That run."""
+    return mi_refgs.load(known / "run")
 
 
 @pytest.fixture(autouse=True)

@@ -112,6 +112,14 @@ def emitted(emitter: Any, directions: np.ndarray) -> np.ndarray:
     return emitter.eval(si).numpy().T
 
 
+def with_grad(x: Any, tangent: Any = None) -> Any:
+    """The same array, or arrays, with derivatives; `tangent` is that of forward mode."""
+    dr.enable_grad(x)
+    if tangent is not None:
+        dr.set_grad(x, tangent)
+    return x
+
+
 def level_maps(light: Any) -> list[np.ndarray]:
     """The levels of a prefiltered light as float64 maps (h, 2h, 3)."""
     flat = np.array(light.levels, np.float64).reshape(-1, 4)[:, :3]

@@ -86,8 +86,7 @@ def test_trainer_metrics(run: Run, trainer: Trainer, views: Dataset, monkeypatch
     assert 0 <= result["normal_mae_deg_full"] < result["normal_mae_deg"] <= 180
     for key in ("lpips", "normal", "env", "albedo", "roughness", "metallic", "surface", "concave"):
         names = [name for name in result if name.startswith(key) and not name.endswith(("reason", "concave"))]
-        missing = any(result[name] is None for name in names)
-        assert missing == bool(result[f"{key}_reason"]), key
+        assert any(result[name] is None for name in names) == bool(result[f"{key}_reason"]), key
 
 
 def test_one_half_of_a_view_is_aligned_and_the_other_scored(run: Run, data: Path, tmp_path: Path) -> None:

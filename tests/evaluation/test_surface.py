@@ -33,8 +33,7 @@ def around(count: int = 8) -> list[View]:
     """Cameras on a circle and above that look at the origin."""
     views, pixels = [], Pixels(np.zeros((16, 16, 3), np.float32))
     for angle in 2 * np.pi * np.arange(count) / count:
-        origin = 6 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)])
-        pose = look_at(origin, np.zeros(3))
+        pose = look_at(6 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)]), np.zeros(3))
         views.append(View("", 16, 16, 16, 16, 8, 8, pose, pixels))
     return views
 

@@ -22,7 +22,7 @@ from mi_refgs.render.display import displayed, image_array
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.shading import Shading, shade
 from mi_refgs.splat import Camera
-from tests.helpers import read_exr, refused
+from tests.helpers import read_exr, refused, unit, with_grad
 from tests.scenes.layouts import ply_bytes
 
 SIZE, FOCAL, COUNT = 48, 60.0, 40
@@ -65,8 +65,7 @@ def their_image(columns: dict[str, np.ndarray], camera: PinholeCamera) -> tuple[
 
     raw = {name: table(name) for name in ("scale", "opacity")}
     raw |= {"position": table("x", "y", "z"), "rotation": table("rot_1", "rot_2", "rot_3", "rot_0")}
-    towards = raw["position"] - camera.to_world[:3, 3]
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    towards = unit(raw["position"] - camera.to_world[:3, 3])
     dc = table("f_dc")
     rest = table("f_rest").reshape(COUNT, 3, -1) if "f_rest_0" in columns else np.zeros((COUNT, 3, 0))
     sh = np.concatenate([dc[:, :, None], rest], axis=2).transpose(0, 2, 1).reshape(COUNT, -1)
@@ -131,8 +130,7 @@ def test_displayed_model_inverts_the_srgb_encoding() -> None:
     """Values below and above the straight part, and the derivative, against differences of the formula."""
     encoded = np.array([0.0, 0.02, 0.04, 0.05, 0.5, 1.0, 1.7])
     formula = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    plane = mi.Float(encoded.astype(np.float32))
-    dr.enable_grad(plane)
+    plane = with_grad(mi.Float(encoded.astype(np.float32)))
     points = ShadingPoints(mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), radiance=mi.Color3f(plane))
     out = shade(points, None, Shading("pixel", "displayed")).total()
     np.testing.assert_allclose(np.array(dr.detach(out.x)), formula, rtol=1e-5, atol=1e-7)

@@ -86,8 +86,7 @@ def test_splats_of_others_are_read(
     ],
 )
 def test_antialiasing(comment: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    content = ply_bytes(BALL).replace(b"by hand", comment.encode())
-    (tmp_path / "a.ply").write_bytes(content)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(BALL).replace(b"by hand", comment.encode()))
     read_splats(tmp_path / "a.ply")
     assert ("antialiasing filter" in capsys.readouterr().err) == said
 

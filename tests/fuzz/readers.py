@@ -34,7 +34,6 @@ from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import read_loaded
 from tests.scenes import layouts
-from tests.scenes.dots import COLOURS, POINTS
 from tests.scenes.splat_file import ball_columns
 from tests.scenes.tiny import write_data
 
@@ -59,9 +58,7 @@ def _data_set(path: Path) -> list[Any]:
 
 
 def _nerfstudio(folder: Path) -> None:
-    names = ("x", "y", "z", "red", "green", "blue")
-    columns = dict(zip(names, [*POINTS.T, *COLOURS.T.astype(np.uint8)], strict=True))
-    (folder / "points.ply").write_bytes(layouts.ply_bytes(columns))
+    (folder / "points.ply").write_bytes(layouts.point_bytes())
     lens: dict[str, Any] = {"k1": 0.03, "k2": -0.01, "p1": 1e-3, "p2": -1e-3}
     lens |= {"train_filenames": ["images/b.png"], "test_filenames": ["images/a.png"]}
     layouts.write_nerfstudio(folder, layouts.SHOTS[:3], ply_file_path="points.ply", **lens)

@@ -25,8 +25,7 @@ def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
 def write_file(
     path: Path, columns: dict[str, np.ndarray], kind: str = "binary_little_endian", dtype: str = "f4"
 ) -> Path:
-    typed = {name: np.asarray(values, dtype) for name, values in columns.items()}
-    path.write_bytes(ply_bytes(typed, kind))
+    path.write_bytes(ply_bytes({name: np.asarray(values, dtype) for name, values in columns.items()}, kind))
     return path
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from mi_refgs.kernels import rows as rows_module
 from mi_refgs.kernels.rows import PackedRows, columns_of, joined
+from tests.helpers import with_grad
 
 ROWS = 37
 
@@ -14,10 +15,8 @@ ROWS = 37
 @pytest.mark.parametrize("width", [1, 2, 3, 4, 8, 12, 27, 48])
 def test_columns_and_their_derivatives(width: int) -> None:
     """Whatever divides the width, columns are those of the surfel model, in value, tangent and adjoint."""
-    rng = np.random.default_rng(width)
-    table, tangent, adjoint = rng.normal(size=(3, ROWS, width)).astype(np.float32)
-    array = mi.Float(table.ravel())
-    dr.enable_grad(array)
+    table, tangent, adjoint = np.random.default_rng(width).normal(size=(3, ROWS, width)).astype(np.float32)
+    array = with_grad(mi.Float(table.ravel()))
     columns = columns_of(array, width)
     np.testing.assert_array_equal(np.stack([c.numpy() for c in columns], axis=1), table)
 
@@ -25,22 +24,15 @@ def test_columns_and_their_derivatives(width: int) -> None:
     dr.backward(weighted)
     np.testing.assert_allclose(dr.grad(array).numpy().reshape(ROWS, width), adjoint, rtol=1e-6)
 
-    array = mi.Float(table.ravel())
-    dr.enable_grad(array)
-    dr.set_grad(array, mi.Float(tangent.ravel()))
-    columns = columns_of(array, width)
-    dr.enqueue(dr.ADMode.Forward, array)
-    dr.traverse(dr.ADMode.Forward)
-    moved = np.stack([dr.grad(c).numpy() for c in columns], axis=1)
-    np.testing.assert_allclose(moved, tangent, rtol=1e-6)
+    moved = dr.forward_to(columns_of(with_grad(mi.Float(table.ravel()), mi.Float(tangent.ravel())), width))
+    np.testing.assert_allclose(np.stack([c.numpy() for c in moved], axis=1), tangent, rtol=1e-6)
 
 
 def test_joined_arrays_and_their_derivatives() -> None:
     """Arrays of several lengths, one after the other; each part has an adjoint and a tangent of its own."""
     rng = np.random.default_rng(0)
     parts = [[rng.normal(size=n).astype(np.float32) for n in sizes] for sizes in ((5, 3, 7), (2, 4, 1))]
-    first, second = ([mi.Float(x) for x in part] for part in parts)
-    dr.enable_grad(first, second)
+    first, second = with_grad([[mi.Float(x) for x in part] for part in parts])
     whole = joined(first, second)
     weights = [rng.normal(size=dr.width(x)).astype(np.float32) for x in whole]
     for found, a, b in zip(whole, *parts, strict=True):
@@ -50,13 +42,8 @@ def test_joined_arrays_and_their_derivatives() -> None:
         np.testing.assert_array_equal(dr.grad(a).numpy(), w[: dr.width(a)])
         np.testing.assert_array_equal(dr.grad(b).numpy(), w[dr.width(a) :])
 
-    moved = mi.Float(parts[1][0])
-    dr.enable_grad(moved)
-    whole = joined([mi.Float(parts[0][0])], [moved])
-    dr.set_grad(moved, mi.Float([1, 2]))
-    dr.enqueue(dr.ADMode.Forward, moved)
-    dr.traverse(dr.ADMode.Forward)
-    np.testing.assert_array_equal(dr.grad(whole[0]).numpy(), [0] * 5 + [1, 2])
+    [whole] = joined([mi.Float(parts[0][0])], [with_grad(mi.Float(parts[1][0]), mi.Float([1, 2]))])
+    np.testing.assert_array_equal(dr.forward_to(whole).numpy(), [0] * 5 + [1, 2])
 
 
 def values(rows: PackedRows) -> np.ndarray:

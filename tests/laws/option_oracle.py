@@ -139,8 +139,7 @@ class Oracle:
             along = (maps["depth"] - NEAR) * self._ray_lengths()  # distances, which are averaged
             distance = self._blocks(along * maps["alpha"]) / np.where(alpha > 0, alpha, 1)
             return np.where(alpha > c.COVERAGE_FLOOR, distance, 0)
-        by = maps["object_alpha"]
-        mean = self._blocks(maps[kind] * by) / np.where(share > 0, share, 1)
+        mean = self._blocks(maps[kind] * maps["object_alpha"]) / np.where(share > 0, share, 1)
         return np.where(share > c.COVERAGE_FLOOR, mean, 0)
 
     def _ray_lengths(self) -> Array:

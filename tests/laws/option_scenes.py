@@ -76,8 +76,7 @@ def radiance(case: Case) -> np.ndarray:
     if case["map"] == "constant":
         return np.tile(np.array(CONSTANT, np.float32), (8, 16, 1))
     if case["map"] == "9 x 14":
-        smooth = sky(56)
-        return np.ascontiguousarray(smooth[::6][:9, ::8])
+        return np.ascontiguousarray(sky(56)[::6][:9, ::8])
     return sky(int(case["map"].split()[0]))
 
 

@@ -17,6 +17,7 @@ from mi_refgs.constants import ALPHA_MIN
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
+from tests.helpers import with_grad
 from tests.laws import law_scenes
 from tests.laws.law_scenes import COUNT, SCENES, SEEDS, SHADINGS, Scene, View, differing, draw, gradients
 from tests.scenes.integrator import plane_mesh, sky
@@ -90,8 +91,7 @@ def test_zero_opacity_equals_removal(shading: Shading, scene: Scene, seed: int) 
     opacity = scene.raw["opacity"].copy()
     opacity[gone] = np.log(ALPHA_MIN) - rng.uniform(0, 20, (gone.sum(), 1))
     assert differing(draw(scene.changed(opacity=opacity), shading), removed, EXACT) == 0
-    one = np.flatnonzero(gone)[:1]
-    opacity[one] = np.log(ALPHA_MIN) + 0.01
+    opacity[np.flatnonzero(gone)[:1]] = np.log(ALPHA_MIN) + 0.01
     faint = draw(scene.changed(opacity=opacity), shading)["alpha"]
     assert np.abs(faint - removed["alpha"]).max() <= 1.02 * ALPHA_MIN
 
@@ -205,8 +205,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(setting: str, scene: Scen
     tangents = {key: rng.normal(size=value.shape).astype(np.float32) for key, value in values.items()}
 
     def rendered() -> tuple[dict[str, Any], Any]:
-        leaves = {key: upload_tensor(value) for key, value in values.items()}
-        dr.enable_grad(list(leaves.values()))
+        leaves = with_grad({key: upload_tensor(value) for key, value in values.items()})
         for key, leaf in leaves.items():
             params[key] = leaf
         params.update()
@@ -258,8 +257,7 @@ def test_no_more_light_leaves_than_arrives(
         metallic=np.full((COUNT, 1), logit(metallic)),
         roughness=np.full((COUNT, 1), logit(roughness)),
     )
-    light = EnvironmentLight.constant(1.0, ROWS).raw
-    rgba = picture(uniform, light, diffuse="irradiance", **options)
+    rgba = picture(uniform, EnvironmentLight.constant(1.0, ROWS).raw, diffuse="irradiance", **options)
     assert rgba.min() >= 0
     # Lookups are bilinear, a prefiltered 1 is 1 ± 1e-4.
     assert np.all(rgba[..., :3] <= rgba[..., 3:] * (1 + 1e-3) + 1e-5)

@@ -28,8 +28,8 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light import lobe_matrices
 from mi_refgs.shade.light.maps import LARGEST_HEIGHT, Learnt
 from mi_refgs.shade.light.placed import PlacedLight
-from tests.helpers import refused, unit, vector
-from tests.scenes.tiny import METHOD, SETTINGS, train_command, write_data, write_open_data
+from tests.helpers import refused, unit, vector, with_grad
+from tests.scenes.tiny import METHOD, SETTINGS, train_command, write_data, write_method, write_open_data
 
 FILE = 'kind = "file"\nfile = "sky.exr"\nworld = true\n'
 PHOTOGRAPHS = """[surroundings]
@@ -56,14 +56,13 @@ def fitted(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     """A kind, and the folder of a short fit with it."""
     folder, kind = tmp_path_factory.mktemp(request.param), request.param
     write_exr(folder / "sky.exr", SKY)
-    (folder / "own.toml").write_text(METHOD.replace("height = 8\n", KINDS[kind]))
+    own = write_method(folder, METHOD.replace("height = 8\n", KINDS[kind]))
     data = (write_open_data if kind == "photographed" else write_data)(folder / "data")
     options = {
         "fixed": ["--light-fixed", "--light", str(data / "environment.exr")],
         "photographed": ["--set", "surroundings.count=60", "surroundings.max_count=90"],
     }
-    command = train_command(data, folder / "run", folder / "own.toml")
-    assert main([*command, *options.get(kind, [])]) == 0
+    assert main([*train_command(data, folder / "run", own), *options.get(kind, [])]) == 0
     (folder / "sky.exr").unlink()  # a run has all of its light
     return kind, folder
 
@@ -139,9 +138,9 @@ def test_height_follows_the_size_of_images(tmp_path: Path) -> None:
     rows = [Learnt().sized(side**2).height for side in (20, 96, 128, 162, 400)]
     assert rows == [16, 76, 104, LARGEST_HEIGHT, LARGEST_HEIGHT]
     assert Learnt(height=8).sized(96**2).height == 8
-    (tmp_path / "own.toml").write_text(METHOD.replace("height = 8\n", ""))
-    data, own, said = write_data(tmp_path / "data"), str(tmp_path / "own.toml"), list[str]()
-    run, method = Run(tmp_path / "run"), methods.load(own, "quick", SETTINGS)
+    own = write_method(tmp_path, METHOD.replace("height = 8\n", ""))
+    data, said = write_data(tmp_path / "data"), list[str]()
+    run, method = Run(tmp_path / "run"), methods.load(str(own), "quick", SETTINGS)
     begin(method, read_dataset(data, "train"), run, said.append)
     assert run.method().light == Learnt(height=16) and "16 rows" in said[0]
     assert differences(run, method).keys() <= {"data.downscale"}
@@ -175,18 +174,17 @@ def test_derivatives_of_rotation_and_scale_with_other_losses(tmp_path: Path) -> 
     """Of the objective without L1, which has kinks, against central differences; at 0 too."""
     sky = 0.6 + 0.3 * lobe_matrices.map_directions(32)
     write_exr(tmp_path / "sky.exr", sky.astype(np.float32))
-    (tmp_path / "own.toml").write_text(METHOD.replace("height = 8\n", KINDS["placed"]))
+    own = write_method(tmp_path, METHOD.replace("height = 8\n", KINDS["placed"]))
     more = ["loss.ssim=1", *(f"loss.{name}=0.1" for name in ("smooth", "half_metal", "normal"))]
     more.append("surfels.initial={metallic=0.9}")
-    method = methods.load(str(tmp_path / "own.toml"), "quick", [*SETTINGS, *more])
+    method = methods.load(str(own), "quick", [*SETTINGS, *more])
     trainer = Trainer(method, read_dataset(write_data(tmp_path / "data"), "train"))
     trainer.train()
     target, fit = trainer.targets.at(6, 0), trainer.fit
 
     def objective_at(numbers: np.ndarray) -> Any:
         for name, row in zip((LIGHT_ROTATION, LIGHT_SCALE), numbers, strict=True):
-            fit.params[name] = mi.TensorXf(row[None].astype(np.float32))
-            dr.enable_grad(fit.params[name])
+            fit.params[name] = with_grad(mi.TensorXf(row[None].astype(np.float32)))
         shading = trainer.shading()
         light = shading.light_of(fit.light)
         scene = SurfelScene(fit.surfels, shading, light, fit.occluder)

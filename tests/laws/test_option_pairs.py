@@ -18,6 +18,7 @@ from mi_refgs.reference.models import MODELS as REFERENCE_MODELS
 from mi_refgs.render.load_scene import reason
 from mi_refgs.shade.options import QUALITY, TRACED
 from mi_refgs.shade.reflectance import MODELS
+from tests.helpers import with_grad
 from tests.laws.covering import Case, combinations_of, completed, covering_array, marked
 from tests.laws.option_cases import ACCURACY, DIMENSIONS, RULES, spec
 from tests.laws.option_oracle import Oracle
@@ -102,8 +103,7 @@ def check(case: Case, folder: Path, set_threads: Any) -> None:
 def attached(built: Built, moving: list[str]) -> dict[str, Any]:
     params = mi.traverse(built.scene)
     keys = {name: built.parameters[name] for name in moving}
-    leaves = {name: type(params[key])(dr.detach(params[key])) for name, key in keys.items()}
-    dr.enable_grad([*leaves.values()])
+    leaves = with_grad({name: type(params[key])(dr.detach(params[key])) for name, key in keys.items()})
     for name, key in keys.items():
         params[key] = leaves[name]
     params.update()

@@ -260,8 +260,7 @@ def exported(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]
 
 def edited(made: Reconstruction, scratch: Path) -> tuple[Reconstruction, Path]:
     run, out = run_of(made, scratch / "fitted"), scratch / "edited"
-    changes = ["--where", "x > 0.2", "--set", "opacity*=0.5"]
-    assert main(["edit", str(run), "-o", str(out), *changes]) == 0
+    assert main(["edit", str(run), "-o", str(out), "--where", "x > 0.2", "--set", "opacity*=0.5"]) == 0
     return made.edit(where="x > 0.2", set=["opacity*=0.5"]), out
 
 

@@ -25,6 +25,7 @@ from mi_refgs.methods.fields import ITERATIONS, Window
 from mi_refgs.shade.shading import Shading
 from tests.helpers import refused
 from tests.scenes.highlight import ball
+from tests.scenes.tiny import write_method
 
 FOLDER = resource_dir("scenes")
 OF_SCENES = [str(path.relative_to(FOLDER).with_suffix("")) for path in (FOLDER / "paper").rglob("*.toml")]
@@ -63,12 +64,12 @@ def test_other_presets_are_refused(preset: str) -> None:
 
 
 def test_a_preset_scales_every_number_of_iterations(tmp_path: Path) -> None:
-    path = tmp_path / "long.toml"
-    path.write_text(
+    path = write_method(
+        tmp_path,
         "iterations = 4000\n[light]\n[stage.first]\nuntil = 1000\n[stage.last]\nuntil = 4000\n"
         "[event.propagate]\nwhen = {start = 0, until = 4000, every = 100}\nhold = 200\n"
         "[loss]\nsmooth = { weight = 1, until = 3000 }\n"
-        "[data]\ncoarse = [{ until = 1000, block = 2, least = 400 }, { until = 400, block = 4 }]\n"
+        "[data]\ncoarse = [{ until = 1000, block = 2, least = 400 }, { until = 400, block = 4 }]\n",
     )
     method = methods.load(str(path), "quick")
     assert method.iterations == 2000 and [stage.until for _, stage in method.stages()] == [500, 2000]
@@ -160,10 +161,7 @@ propagate.when = { start = 0, until = 2_601, every = 650 }
 
 def test_every_preset_has_the_same_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a trainer does over the whole fit, its steps left out."""
-    path = tmp_path / "many.toml"
-    path.write_text(MANY_EVENTS)
-    done: list[str] = []
-
+    path, done = write_method(tmp_path, MANY_EVENTS), list[str]()
     for kind in REGISTERED.values():
         monkeypatch.setattr(kind, "apply", lambda event, trainer: done.append(event.name))
     monkeypatch.setattr(Propagate, "due", Propagate._grows)
@@ -245,8 +243,7 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
     assert methods.for_purpose("relighting") == "relighting"
     purposes = [methods.load(name).about.purpose for name in methods.names()]
     assert sorted(filter(None, purposes)) == ["photographs", "relighting"]
-    own = tmp_path / "own.toml"
-    own.write_text('extends = "relighting"\n[about]\nname = "mine"\n')
+    own = write_method(tmp_path, 'extends = "relighting"\n[about]\nname = "mine"\n')
     assert methods.load(str(own)).about.purpose == ""
     for word in ("", "speed"):
         with pytest.raises(InputError, match=r"--for.*relighting"):

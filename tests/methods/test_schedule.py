@@ -20,8 +20,7 @@ DATA = ball(size=4, views=7)
 
 def schedule(seed: int = 0) -> FitSetup:
     surfels = SurfelOptions(degree={"radiance_sh": 2}, sh_raise=Window(start=10, until=100, every=10))
-    method = Method(iterations=100, stage={"all": Stage(until=100)}, surfels=surfels, seed=seed)
-    return FitSetup(method, DATA)
+    return FitSetup(Method(iterations=100, stage={"all": Stage(until=100)}, surfels=surfels, seed=seed), DATA)
 
 
 def test_views_come_once_an_epoch_in_an_order_of_its_own() -> None:
@@ -71,7 +70,6 @@ def test_the_degree_rises_with_its_window() -> None:
 
 
 def test_the_light_learns_every_so_often_and_where_a_stage_ends() -> None:
-    stages = {"a": Stage(until=10), "b": Stage(until=20)}
-    method = Method(iterations=20, stage=stages, light=Learnt(every=4))
+    method = Method(iterations=20, stage={"a": Stage(until=10), "b": Stage(until=20)}, light=Learnt(every=4))
     assert [i for i in range(1, 21) if FitSetup(method, DATA).light_learns(i)] == [4, 8, 10, 12, 16, 20]
     assert not any(schedule().light_learns(i) for i in range(20))

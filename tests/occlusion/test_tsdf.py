@@ -28,8 +28,7 @@ def ring_of_views(count: int) -> list[np.ndarray]:
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (1 + 5**0.5)
     r = np.sqrt(1 - z * z)
-    directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
-    return [look_at(4.0 * d, np.zeros(3)) for d in directions]
+    return [look_at(4.0 * d, np.zeros(3)) for d in np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)]
 
 
 def camera(pose: np.ndarray) -> Camera:
@@ -53,8 +52,7 @@ def test_surface_is_closed_outward_and_within_a_voxel(name: str) -> None:
     shape = SHAPES[name]
     poses = ring_of_views(12)
     depths = [ref.depth_map(shape, p, FOCAL, SIZE) for p in poses]
-    fused = fuse(depths, poses)
-    mesh = meshes.extract_mesh(fused)
+    mesh = meshes.extract_mesh(fuse(depths, poses))
     error = np.abs(shape(mesh.vertices.astype(np.float64))) / mesh.voxel
     solid = as_trimesh(mesh)
     assert error.max() < 1 and np.sqrt(np.mean(error**2)) < 0.2, (error.max(), np.sqrt(np.mean(error**2)))
@@ -107,13 +105,11 @@ def test_floaters_go_and_second_objects_stay() -> None:
     """A speck of 0.1 radius beside two balls; the wall of a cavity inside is no object either."""
     balls = ((-0.5, 0, 0), 0.5), ((0.7, 0, 0), 0.3), ((0, 0.9, 0.9), 0.1)
     shape = ref.union(*(ref.sphere(centre, radius) for centre, radius in balls))
-    axes = [np.linspace(-1.2, 1.2, 61)] * 3
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.2, 1.2, 61)] * 3, indexing="ij"), axis=-1)
     cavity = 0.3 - np.linalg.norm(grid - np.array([-0.5, 0, 0]), axis=-1)
     volume = np.clip(np.maximum(shape(grid), cavity) / 0.2, -1, 1).astype(np.float32)
     mesh = meshes.extract_mesh(tsdf.TSDF(volume, np.full(3, -1.2), 0.04))
-    parts = as_trimesh(mesh).split()
-    assert sorted(round(float(p.volume), 1) for p in parts) == [0.1, 0.5]
+    assert sorted(round(float(p.volume), 1) for p in as_trimesh(mesh).split()) == [0.1, 0.5]
     assert (shape(mesh.vertices) < 0.04).all() and mesh.vertices[:, 1].max() < 0.6
 
 

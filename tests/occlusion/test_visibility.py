@@ -12,7 +12,7 @@ from mi_refgs.occlusion import tsdf, visibility
 from mi_refgs.occlusion.mesh import Mesh, extract_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.reference import occlusion as ref
-from tests.helpers import unit, vector
+from tests.helpers import unit, vector, with_grad
 from tests.scenes.integrator import joined
 
 GRID = 64
@@ -109,8 +109,7 @@ def test_updates_in_place_compile_nothing() -> None:
     occluder.update(Mesh.empty())
     assert dr.all(occluder.visible(origin, direction) == 1)
     assert answer(0.5, 1) == [0, 1, 1]
-    after = dr.detail.launch_stats()
-    assert after[1:] == (before[1], before[2]), "recompiled"
+    assert dr.detail.launch_stats()[1:] == (before[1], before[2]), "recompiled"
     assert occluder._scene is scene
     saved = occluder.mesh
     assert saved is not None
@@ -120,10 +119,8 @@ def test_updates_in_place_compile_nothing() -> None:
 def test_detached_and_total_on_degenerate_rays() -> None:
     """No gradient arrives; zero and non-finite directions or origins are visible, never NaN."""
     occluder = Occluder(extracted(SHAPES["sphere"]))
-    bad = [0.0, np.nan, np.inf, 1e30, 1e-30, 1.0]
-    direction = mi.Vector3f(mi.Float(bad), 0, 0)
-    origin = mi.Point3f(mi.Float([-5, -5, -5, -5, -5, np.nan]), 0, 0)
-    dr.enable_grad(direction, origin)
+    direction = with_grad(mi.Vector3f(mi.Float([0.0, np.nan, np.inf, 1e30, 1e-30, 1.0]), 0, 0))
+    origin = with_grad(mi.Point3f(mi.Float([-5, -5, -5, -5, -5, np.nan]), 0, 0))
     answer = occluder.visible(origin, direction, direction)
     assert not dr.grad_enabled(answer)
     assert np.isin(np.array(answer), (0.0, 1.0)).all()

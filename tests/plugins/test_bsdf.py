@@ -12,7 +12,7 @@ from mi_refgs.reference import lobe as reference
 from mi_refgs.reference.light import radiance_of
 from mi_refgs.shade.brdf import split_sum
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from tests.helpers import slow, unit, vector
+from tests.helpers import slow, unit, vector, with_grad
 from tests.scenes.integrator import sky
 
 ALBEDO = np.array([0.9, 0.5, 0.2])
@@ -135,8 +135,7 @@ def test_chi_squared(roughness: float, metallic: float) -> None:
 
 def test_samples_agree_with_eval_and_pdf(rng: np.random.Generator) -> None:
     count = 5000
-    wi = above(rng, count)
-    of, si = mi.load_dict(bsdf(0.15)), interaction(wi, count)
+    of, si = mi.load_dict(bsdf(0.15)), interaction(above(rng, count), count)
     u = mi.Float(rng.uniform(size=count))
     sampled, weight = of.sample(context(), si, u, mi.Point2f(rng.uniform(size=(2, count)).astype(np.float32)))
     value, density = of.eval_pdf(context(), si, sampled.wo)
@@ -144,8 +143,7 @@ def test_samples_agree_with_eval_and_pdf(rng: np.random.Generator) -> None:
     assert valid.mean() > 0.95
     assert (np.array(weight)[:, ~valid] == 0).all() and (np.array(sampled.wo)[2, valid] > 0).all()
     np.testing.assert_allclose(np.array(density)[valid], np.array(sampled.pdf)[valid], rtol=1e-4)
-    product = np.array(weight * sampled.pdf)[:, valid]
-    np.testing.assert_allclose(product, np.array(value)[:, valid], rtol=1e-4)
+    np.testing.assert_allclose(np.array(weight * sampled.pdf)[:, valid], np.array(value)[:, valid], rtol=1e-4)
     kind, component = np.array(sampled.sampled_type), np.array(sampled.sampled_component)
     for index, flag in ((SPECULAR, mi.BSDFFlags.GlossyReflection), (DIFFUSE, mi.BSDFFlags.DiffuseReflection)):
         assert 0.1 < (component == index).mean() < 0.9
@@ -204,8 +202,7 @@ def test_derivatives_of_sampled_weights(roughness: float) -> None:
     n_dot_v, metallic, ε = 0.5, 0.3, 1e-3
     of = mi.load_dict(bsdf(roughness, metallic))
     params = mi.traverse(of)
-    values = [params[f"{name}.value"] for name in ("roughness", "metallic", "albedo")]
-    dr.enable_grad(values)
+    values = with_grad([params[f"{name}.value"] for name in ("roughness", "metallic", "albedo")])
     params.update()
     si = interaction(seen_at(n_dot_v))
     sampled, weight = of.sample(context(), si, mi.Float(0.5), mi.Point2f(0.3, 0.6))
@@ -236,8 +233,7 @@ def test_everything_is_finite() -> None:
     for roughness, metallic, albedo in ((1e-9, 1.0, 0.0), (1e-9, 0.0, 1.0), (1.0, 1.0, 0.0), (1.0, 0.0, 0.0)):
         of = mi.load_dict(bsdf(roughness, metallic, albedo))
         params = mi.traverse(of)
-        inputs = [params[f"{name}.value"] for name in ("roughness", "metallic", "albedo")]
-        dr.enable_grad(inputs)
+        inputs = with_grad([params[f"{name}.value"] for name in ("roughness", "metallic", "albedo")])
         params.update()
         si, out = interaction(wi, count), vector(wo)
         dr.enable_grad(si.wi, out)

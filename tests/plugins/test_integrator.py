@@ -20,7 +20,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import refused
+from tests.helpers import refused, with_grad
 from tests.scenes import integrator as scenes
 
 
@@ -117,8 +117,7 @@ def test_a_node_of_a_torch_pipeline_may_be_a_render() -> None:
     theirs = torch.tensor(raw, requires_grad=True)
     shown = dr.wrap("torch", "drjit")(rendered)(torch.tanh(theirs))
     (torch.tensor(weights) * torch.sigmoid(shown)).sum().backward()
-    ours = mi.TensorXf(raw)
-    dr.enable_grad(ours)
+    ours = with_grad(mi.TensorXf(raw))
     shown = rendered(dr.tanh(ours))
     dr.backward(dr.sum(mi.TensorXf(weights) / (1 + dr.exp(-shown)), axis=None))
     np.testing.assert_allclose(theirs.grad.numpy(), dr.grad(ours).numpy(), rtol=1e-3, atol=1e-6)
@@ -142,7 +141,9 @@ def test_recording_by_dr_freeze_is_refused() -> None:
         ({"occlusion": True}, "no mesh"),
         ({"visibility_rays": 1.5}, "visibility_rays: 1.5 is not allowed"),
         ({"mesh": "nowhere.ply"}, "nowhere.ply: mesh: no such file"),
+        ({"mesh": "nowhere.ply", "shade_at": "surfel"}, "occlusion: needs shading at pixel"),
         ({"light": {"type": "point"}}, "takes no PointLight"),
+        ({"ball": {"type": "sphere"}}, "ball: refgs takes no Shape"),
     ],
 )
 def test_bad_properties_are_refused(changes: dict, words: str) -> None:
@@ -187,8 +188,7 @@ def test_an_exported_scene_has_the_trainers_tiles(
 
 
 def test_variants() -> None:
-    of = scenes.scene()
-    before = scenes.image(of)
+    before = scenes.image(scenes.scene())
     mi.set_variant("scalar_rgb")
     mi.set_variant("llvm_ad_rgb")
     np.testing.assert_array_equal(scenes.image(scenes.scene()), before)

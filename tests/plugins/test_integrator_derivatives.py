@@ -10,7 +10,7 @@ import pytest
 
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from tests import gradients
-from tests.helpers import slow
+from tests.helpers import slow, with_grad
 from tests.scenes import integrator as scenes
 
 
@@ -88,15 +88,12 @@ def test_tangents_add_up_over_losses(
         return dr.mean(dr.square(used.array))
 
     def tangent(*names: str) -> float:
-        leaf = mi.TensorXf(base)
-        dr.enable_grad(leaf)
-        dr.set_grad(leaf, dr.ones(mi.TensorXf, leaf.shape))
+        leaf = with_grad(mi.TensorXf(base), dr.ones(mi.TensorXf, base.shape))
         params[f"integrator.{key}"] = 2 * leaf if derived else leaf
         params.update()
         return float(dr.forward_to(sum((weighed(name, leaf) for name in names), mi.Float(0)))[0])
 
     alone = {name: tangent(name) for name in ("image", "leaf", "parameter")}
     for names in (("parameter", "image", "leaf"), ("image", "parameter"), ("image", "image")):
-        expected = sum(alone[name] for name in names)
-        assert tangent(*names) == pytest.approx(expected, rel=1e-4, abs=1e-6), names
+        assert tangent(*names) == pytest.approx(sum(alone[name] for name in names), rel=1e-4, abs=1e-6), names
     assert alone["image"] != 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import refused
+from tests.scenes import integrator
 from tests.scenes.integrator import HEIGHT, WIDTH, check_derivatives, image, plane_mesh, scene, sensor
 from tests.scenes.splats import discs
 
@@ -52,6 +53,11 @@ def test_a_batch_is_its_sensors_side_by_side() -> None:
     together = scene(batch)
     np.testing.assert_array_equal(image(together), np.concatenate([image(one) for one in alone], axis=1))
     check_derivatives(together, "integrator.albedo", spp=4)
+    fresh = scene(batch)  # whose film was not used before
+    params = mi.traverse(fresh)
+    dr.enable_grad(params["integrator.albedo"])
+    dr.set_grad(params["integrator.albedo"], 1)
+    assert dr.any(fresh.integrator().render_forward(fresh, params, fresh.sensors()[0], 0, 4) != 0, axis=None)
     slopes = []
     for of, key in ((alone[1], "sensor.x_fov"), (together, "sensor.s1.x_fov")):
         params = mi.traverse(of)
@@ -60,6 +66,16 @@ def test_a_batch_is_its_sensors_side_by_side() -> None:
         slopes.append(dr.grad(params[key]).numpy())
     np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-5)
     assert slopes[0] != 0
+
+
+def test_a_mirrored_sensor_shows_the_mirror_image() -> None:
+    """Normals that vary over a surfel bend the same way."""
+    raw, turn = integrator.raw_channels(), mi.ScalarTransform4f
+    raw["curvature"] = np.tile(np.array([2, 0, 2], np.float32), (len(raw["position"]), 1))
+    pose = turn().look_at([3, 1, 2], [0, 0, 0], [0, 0, 1])
+    poses = (pose, pose @ turn().scale([-1, 1, 1]))
+    straight, mirrored = (image(scene(sensor(to_world=to_world), raw=raw)) for to_world in poses)
+    np.testing.assert_allclose(mirrored[:, ::-1], straight, atol=1e-3)
 
 
 def test_depth_is_that_of_mitsuba() -> None:

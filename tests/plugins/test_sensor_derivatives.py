@@ -18,7 +18,7 @@ from mi_refgs.kernels.device import upload, upload_tensor
 from mi_refgs.occlusion.mesh import write_mesh
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference.camera import PinholeCamera, ray_slopes
-from tests.helpers import slow
+from tests.helpers import slow, with_grad
 from tests.scenes import integrator as scenes
 from tests.scenes.camera_motion import moved_pose, require_slopes, transform
 
@@ -126,8 +126,7 @@ def test_derivatives_are_those_of_float64(name: str, tmp_path: Path) -> None:
     exact_image, band = pair.planes(START.astype(np.float64))
     found = pair.scene.image(mi.Float(START), spp=1).numpy().reshape(exact_image.shape)
     np.testing.assert_allclose(found[~band], exact_image[~band], atol=2e-4 * np.abs(exact_image).max())
-    rng = np.random.default_rng(7)
-    weight = rng.normal(size=exact_image.shape) / np.abs(exact_image).max(axis=0)
+    weight = np.random.default_rng(7).normal(size=exact_image.shape) / np.abs(exact_image).max(axis=0)
     weight[band] = 0
 
     def total(leaf: mi.Float) -> mi.Float:
@@ -158,8 +157,7 @@ def test_derivatives_are_those_of_differences(kind: str, tmp_path: Path) -> None
 def test_only_rigid_changes_have_derivatives() -> None:
     """The gradient of a matrix is a rotation's and a translation's: that of scale and shear is zero."""
     moved = Moved(scenes.scene())
-    leaf = mi.Matrix4f(moved.start.matrix)
-    dr.enable_grad(leaf)
+    leaf = with_grad(mi.Matrix4f(moved.start.matrix))
     moved.params[POSE] = mi.Transform4f(leaf)
     moved.params.update()
     dr.backward(dr.sum(mi.render(moved.of, moved.params, spp=1), axis=None))

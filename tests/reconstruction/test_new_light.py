@@ -63,8 +63,7 @@ def test_images_of_a_room_are_no_ground_truth_under_its_light(known: Path, tmp_p
     """environment.exr of an open scene: its test views show the room, too."""
     shutil.copytree(known / "data", tmp_path / "data")
     (tmp_path / "data" / "region.json").write_text("{}")
-    light = NewLight(tmp_path / "data" / "environment.exr", world=True)
-    assert truth_under(light, tmp_path / "data") is None
+    assert truth_under(NewLight(tmp_path / "data" / "environment.exr", world=True), tmp_path / "data") is None
 
 
 def test_data_set_may_have_the_name_of_a_light(tmp_path: Path) -> None:

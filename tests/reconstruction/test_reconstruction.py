@@ -25,11 +25,6 @@ from tests.scenes.known import SIZE, with_background
 from tests.scenes.tiny import SETTINGS
 
 
-@pytest.fixture(scope="module")
-def balls(known: Path) -> Reconstruction:
-    return mi_refgs.load(known / "run")
-
-
 def psnr(ours: np.ndarray, truth: np.ndarray) -> float:
     """PSNR of linear premultiplied images in dB."""
     return float(-10 * np.log10(np.mean((ours - truth) ** 2)))
@@ -59,8 +54,7 @@ def test_render_accepts_every_kind_of_camera(balls: Reconstruction) -> None:
 
 def test_render_size_keeps_the_view(balls: Reconstruction) -> None:
     """Twice the size, averaged, equals 2 × 2 samples; one number is the longer side."""
-    fine = balls.render(0, size=2 * SIZE)
-    mean = fine.reshape(SIZE, 2, SIZE, 2, 4).mean(axis=(1, 3))
+    mean = balls.render(0, size=2 * SIZE).reshape(SIZE, 2, SIZE, 2, 4).mean(axis=(1, 3))
     np.testing.assert_allclose(mean, balls.render(0, samples=4), atol=1e-5)
     camera = Camera.look_at([3, 0, 1], size=(64, 32))
     assert balls.render(camera, size=20).shape == (10, 20, 4)
@@ -114,15 +108,13 @@ def test_training_cameras_are_those_that_the_fit_corrected(balls: Reconstruction
     run.write_json(CAMERAS, {"corrected": True, "to_world": record})
     corrected = mi_refgs.load(run.path).save(tmp_path / "copy")
     np.testing.assert_array_equal([view.to_world for view in corrected.views("train").views], poses)
-    found = [camera.pose() for camera in corrected.cameras("train")]
-    np.testing.assert_allclose(found, poses, atol=1e-6)
+    np.testing.assert_allclose([camera.pose() for camera in corrected.cameras("train")], poses, atol=1e-6)
     np.testing.assert_array_equal(corrected.cameras()[1].pose(), balls.cameras()[1].pose())
     frames: list[Any] = []
     for made in (balls, corrected):
         files = made.export("cameras", tmp_path / str(len(frames)))
         frames.append(json.loads(files[0].read_text())["frames"])
-    moved = [new["file_path"] for old, new in zip(*frames, strict=True) if old != new]
-    assert moved == ["train/r_001.png"]
+    assert [new["file_path"] for old, new in zip(*frames, strict=True) if old != new] == ["train/r_001.png"]
 
 
 def test_turntable_of_an_open_scene_is_around_its_region(balls: Reconstruction) -> None:

@@ -85,8 +85,7 @@ def test_relit_files_have_the_encoding_of_a_data_set(known: Path, dusk: dict[str
 
 
 def test_exposure_scales_ours_and_ground_truth(known: Path, dusk: dict[str, Any]) -> None:
-    darker = result_of(known, "dark", exposure=-1)
-    np.testing.assert_allclose(darker["scale"], dusk["scale"], rtol=0.03)
+    np.testing.assert_allclose(result_of(known, "dark", exposure=-1)["scale"], dusk["scale"], rtol=0.03)
     pictures = [read_exr_image(known / out / "test/r_001.exr") for out in ("dark", "dusk")]
     np.testing.assert_allclose(2 * pictures[0][..., :3], pictures[1][..., :3], rtol=2e-3, atol=1e-4)
 
@@ -144,8 +143,7 @@ def test_run_without_data_is_relit_around_the_object(
         np.testing.assert_allclose(shown, relit.render(camera), atol=1e-4)
         assert 0.05 < shown[..., 3].mean() < 0.9
     if record is not None and not turntable:  # with its data named there is ground truth
-        found = relight(Run(run), NewLight(light), tmp_path / "named", data=known / "data")
-        assert found["psnr"] > 20
+        assert relight(Run(run), NewLight(light), tmp_path / "named", data=known / "data")["psnr"] > 20
 
 
 def test_relight_command(known: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
@@ -180,8 +178,7 @@ def test_relight_warns_of_fitted_diffuse_colour(known: Path, tmp_path: Path) -> 
     assert Path(turned["output"]) == tmp_path / "run/relight/dusk_r90_e-1"
     # Fewer frames leave none of the old ones behind.
     relight(run, NewLight(known / "dusk.exr"), turntable=1)
-    frames = (folder / "turntable").glob("t_*.png")
-    assert [frame.name for frame in frames] == ["t_000.png"]
+    assert [frame.name for frame in (folder / "turntable").glob("t_*.png")] == ["t_000.png"]
 
 
 def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:

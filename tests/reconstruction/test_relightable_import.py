@@ -112,8 +112,7 @@ def test_import_is_fitted_measured_and_relit(imported: Path, tmp_path: Path) -> 
     made = mi_refgs.load(run)
     assert made.trained.light is not None and made.trained.surfels.has("albedo")
     assert made.trained.iteration == 6 and made.provenance.data == (imported / "data").resolve()
-    light = np.ones((8, 16, 3), np.float32)
-    assert made.relight(light).render(0)[..., 3].max() > 0.5
+    assert made.relight(np.ones((8, 16, 3), np.float32)).render(0)[..., 3].max() > 0.5
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["psnr"] > 5
 
@@ -123,8 +122,7 @@ def test_command_writes_the_same_views_and_fits_the_method_for_relighting(
 ) -> None:
     run, for_purpose = tmp_path / "run", Mock(return_value=str(method))
     monkeypatch.setattr(methods, "for_purpose", for_purpose)
-    argv = ["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET]
-    assert main(argv) == 0
+    assert main(["import", str(ball), "-o", str(run), "--relightable", "--preset", PRESET]) == 0
     assert contents(run / "data") == contents(imported / "data")
     for_purpose.assert_called_once_with("relighting")
 
@@ -156,8 +154,7 @@ def test_box_crops_an_import(ball: Path, tmp_path: Path) -> None:
     upper = [-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]
     found = mi_refgs.import_splats(ball, box=upper).trained.surfels.to_numpy()["position"]
     assert (found[:, 2] >= 0).all() and len(found) == (ball_columns()["z"] >= 0).sum()
-    argv = ["import", str(ball), "-o", str(tmp_path / "run"), "--box", *map(str, upper)]
-    assert main(argv) == 0
+    assert main(["import", str(ball), "-o", str(tmp_path / "run"), "--box", *map(str, upper)]) == 0
     loaded = mi_refgs.load(tmp_path / "run").trained.surfels.to_numpy()["position"]
     np.testing.assert_array_equal(loaded, found)
     nowhere = ["import", ball, "-o", tmp_path / "none", "--box", 5, 5, 5, 6, 6, 6]

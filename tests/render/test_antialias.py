@@ -80,8 +80,7 @@ def test_points_integrate_cubic_radiance_exactly() -> None:
     points = ShadingPoints(mi.Vector3f(0, 0, 1) + 0 * rays, -dr.normalize(rays))
     mean = averaged(cubic, points, alpha, view, None, False).specular.numpy()
     y, x = np.mgrid[-2:3, -2:3].reshape(2, -1)
-    exact = [x**2 + 1 / 12, x**3 + x / 4, x * (y**2 + 1 / 12)]
-    np.testing.assert_allclose(mean, exact, atol=2e-5)
+    np.testing.assert_allclose(mean, [x**2 + 1 / 12, x**3 + x / 4, x * (y**2 + 1 / 12)], atol=2e-5)
 
 
 def test_antialias_requires_deferred_shading() -> None:

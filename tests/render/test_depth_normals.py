@@ -16,6 +16,7 @@ from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.stencil import neighbours
 from mi_refgs.splat.camera import Camera
 from tests.fitting.image_checks import HEIGHT, WIDTH, check, stack
+from tests.helpers import with_grad
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 1), (3, 4)])
@@ -28,8 +29,7 @@ def test_neighbours_adjoint_is_the_transpose(size: tuple[int, int], rng: np.rand
         unit[source] = 1
         matrix[:, :, source] = [np.array(out) for out in neighbours(mi.Float(unit), width, height, steps)]
     weights = rng.normal(size=(len(steps), width * height))
-    plane = mi.Float(rng.normal(size=width * height).astype(np.float32))
-    dr.enable_grad(plane)
+    plane = with_grad(mi.Float(rng.normal(size=width * height).astype(np.float32)))
     out = neighbours(plane, width, height, steps)
     losses_of = (o * mi.Float(w.astype(np.float32)) for o, w in zip(out, weights, strict=True))
     dr.backward(sum(losses_of, mi.Float(0)))
@@ -77,8 +77,7 @@ def test_steps_between_surfaces_have_no_normal(rng: np.random.Generator) -> None
     step = np.linspace(0, 4, WIDTH) * (np.arange(HEIGHT) > 6)[:, None]
     depth = 3 + 0.1 * rng.random((HEIGHT, WIDTH)) + step
     depth = depth.astype(np.float32).astype(np.float64)
-    alpha = np.ones((HEIGHT, WIDTH))
-    expected, wanted = reference.normals_from_depth(depth, alpha, *INTRINSICS, ROTATION)
+    expected, wanted = reference.normals_from_depth(depth, np.ones((HEIGHT, WIDTH)), *INTRINSICS, ROTATION)
     found, valid = found_normals(depth)
     np.testing.assert_array_equal(valid, wanted)
     np.testing.assert_allclose(found, expected, atol=2e-5)
@@ -121,8 +120,7 @@ def test_aligned_and_empty_pixels_keep_their_roughness() -> None:
 def test_empty_image_gives_finite_gradients() -> None:
     """Nothing seen anywhere: every loss stays finite, forwards and backwards."""
     size = WIDTH * HEIGHT
-    leaves = [dr.zeros(mi.Float, size) for _ in range(5)]
-    dr.enable_grad(leaves)
+    leaves = with_grad([dr.zeros(mi.Float, size) for _ in range(5)])
     z = expected_depth(leaves[3], leaves[4])
     depth_normal, valid = normals_from_depth(z, leaves[4], camera())
     image = display.display_image(leaves[:3], leaves[4], (1.0, 1.0, 1.0))

@@ -34,8 +34,7 @@ def test_surfels_have_their_radiance_and_distance(axis: int, sign: int) -> None:
     seen = panorama(Surroundings(both), CENTRE, HEIGHT, 1.0)
     directions = map_directions(HEIGHT)
     central = directions @ towards > 0.9
-    expected = directions[central] @ towards / 2
-    np.testing.assert_allclose(seen.nearness[central], expected, rtol=0.03)
+    np.testing.assert_allclose(seen.nearness[central], directions[central] @ towards / 2, rtol=0.03)
     np.testing.assert_allclose(seen.radiance[central], np.broadcast_to(colour, (central.sum(), 3)), atol=0.02)
     assert not seen.nearness[directions @ towards < -0.1].any()
 

@@ -18,7 +18,7 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import arrays_of, slow
+from tests.helpers import arrays_of, slow, with_grad
 from tests.scenes import integrator as scenes
 
 FEW = 512  # samples of a pass in these tests: two rows of pixels or more of 4 × 4 samples
@@ -96,8 +96,7 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
     moved = {key: mi.TensorXf(rng.normal(size=x.shape).astype(np.float32)) for key, x in start.items()}
 
     def rendered() -> tuple[mi.Float, mi.TensorXf]:
-        amount = mi.Float(0)
-        dr.enable_grad(amount)
+        amount = with_grad(mi.Float(0))
         for key in keys:
             params[key] = start[key] + moved[key] * amount
         move_sensor(amount)
@@ -114,12 +113,10 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
         dr.backward(dr.sum(image * mi.TensorXf(weight), axis=None))
         shown = np.array(of.sensors()[0].film().bitmap())
         reverse = np.array(dr.grad(amount))
-        leaf = {key: mi.TensorXf(value) for key, value in start.items()}
+        leaf = with_grad({key: mi.TensorXf(value) for key, value in start.items()})
         for key, value in leaf.items():
-            dr.enable_grad(value)
             params[key] = value
-        leaf["sensor"] = mi.Float(0)
-        dr.enable_grad(leaf["sensor"])
+        leaf["sensor"] = with_grad(mi.Float(0))
         move_sensor(leaf["sensor"])
         image_again = mi.render(of, params, spp=16)
         mi.render(of, integrator=mi.load_dict({"type": "path"}), spp=1)  # leaves fewer channels in the film
@@ -127,22 +124,19 @@ def test_the_plugin_in_passes_and_its_derivatives_are_those_of_one(
         gradients = [np.array(dr.grad(value)) for value in leaf.values()]
         amount, again = rendered()
         dr.forward(amount)
-        tangent = dr.grad(again).numpy()
-        return (image.numpy(), shown, tangent, reverse, *gradients)
+        return (image.numpy(), shown, dr.grad(again).numpy(), reverse, *gradients)
 
     whole = derivatives()
     assert np.abs(whole[2]).max() > 1 and all(np.abs(value).max() > 1e-4 for value in whole[4:])
     few(monkeypatch)
     for i, (one, several) in enumerate(zip(whole, derivatives(), strict=True)):
-        scale = np.abs(one).max()
-        np.testing.assert_allclose(several, one, atol=3e-5 * scale, err_msg=str(i))
+        np.testing.assert_allclose(several, one, atol=3e-5 * np.abs(one).max(), err_msg=str(i))
 
 
 def history(of: "mi.Scene", spp: int, backward: bool) -> list[dict[str, Any]]:
     """Kernels of a render."""
     params = mi.traverse(of)
-    leaf = mi.TensorXf(params["integrator.albedo"])
-    dr.enable_grad(leaf)
+    leaf = with_grad(mi.TensorXf(params["integrator.albedo"]))
     params["integrator.albedo"] = leaf
     params.update()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

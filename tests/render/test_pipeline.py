@@ -98,8 +98,7 @@ def test_layers_show_down_to_the_least_transmittance() -> None:
 
 def test_samples_before_the_near_plane_are_cut() -> None:
     """A disc crosses the plane, though its centre lies beyond."""
-    tilted = np.array([[np.sin(0.5), 0, 0, np.cos(0.5)]])
-    leaning = discs(rotation=tilted, scale=np.full((1, 2), np.log(2.0)))
+    leaning = discs(rotation=np.array([[np.sin(0.5), 0, 0, np.cos(0.5)]]), scale=np.full((1, 2), np.log(2.0)))
     raw = {name: values.astype(np.float64) for name, values in leaning.to_numpy().items()}
     covered = []
     for near in (0.01, 3.5):

@@ -46,9 +46,7 @@ def test_eval_encodes_the_mean_of_linear_radiance(tmp_path: Path) -> None:
     assert abs(once["psnr"] - result["psnr"]) > 1e-3
     scores, encoded_first = [], []
     for view in (view.load() for view in views.views):
-        small = view.camera()
-        large = small.supersampled(2)
-        frame = made.renderer()(large)
+        frame = made.renderer()(view.camera().supersampled(2))
         parts = np.array([*frame.radiance, frame.alpha], np.float64).reshape(4, SIZE, 2, SIZE, 2)
 
         def shown(radiance: np.ndarray, alpha: np.ndarray) -> np.ndarray:

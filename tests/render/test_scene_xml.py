@@ -83,8 +83,7 @@ def test_other_pixels_keep_directions_and_extent(ratio: float, tmp_path: Path, r
     point = mi.Point3f(rng.uniform(-1, 1, (3, 50)).astype(np.float32))
     there, here = (pixels(which, point) for which in (exported, camera))
     np.testing.assert_allclose(there, here * np.array(stretch)[:, None], atol=2e-4)
-    text = (tmp_path / "scene.xml").read_text()
-    assert ("square pixels" in text) == ((width, height) != (WIDTH, HEIGHT))
+    assert ("square pixels" in (tmp_path / "scene.xml").read_text()) == ((width, height) != (WIDTH, HEIGHT))
 
 
 def pixels(camera: Camera, point: Any) -> np.ndarray:
@@ -113,12 +112,10 @@ def test_rays_start_at_covered_pixels_only(
     trace = Occluder.first_hit
 
     def counted(self: Occluder, origin: Any, direction: Any, active: Any = True) -> Any:
-        width = dr.width(direction)
-        hits.append(int(dr.count(mi.Bool(active) & dr.full(mi.Bool, True, width))[0]))
+        hits.append(int(dr.count(mi.Bool(active) & dr.full(mi.Bool, True, dr.width(direction)))[0]))
         return trace(self, origin, direction, active)
 
     monkeypatch.setattr(Occluder, "first_hit", counted)
-    frame = made.renderer()(view(0.4))
-    covered = int((frame.alpha.numpy() > 1e-3).sum())
+    covered = int((made.renderer()(view(0.4)).alpha.numpy() > 1e-3).sum())
     assert 0 < covered < 0.7 * WIDTH * HEIGHT
     assert hits == [covered]

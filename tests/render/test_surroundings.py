@@ -13,6 +13,7 @@ from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import with_grad
 from tests.scenes.integrator import scattered_discs
 from tests.scenes.open_pair import CASES, MAPS, Pair, weighted
 
@@ -36,8 +37,7 @@ def test_image_matches_float64(pair: Pair) -> None:
 
 def test_both_derivative_modes_are_those_of_float64(pair: Pair) -> None:
     """Each class of parameters along a random direction, against central differences in float64."""
-    params = {name: upload_tensor(x) for name, x in pair.values.items()}
-    dr.enable_grad(list(params.values()))
+    params = with_grad({name: upload_tensor(x) for name, x in pair.values.items()})
     dr.backward(weighted(pair.planes(params), pair.weights))
     adjoint = {name: np.asarray(dr.grad(x).numpy(), np.float64) for name, x in params.items()}
 
@@ -51,12 +51,9 @@ def test_both_derivative_modes_are_those_of_float64(pair: Pair) -> None:
         assert np.sum(adjoint[name] * direction) == pytest.approx(expected, abs=0.01 * size), name
 
         fresh = {key: upload_tensor(x) for key, x in pair.values.items()}
-        dr.enable_grad(fresh[name])
-        dr.set_grad(fresh[name], upload_tensor(direction))
-        total = weighted(pair.planes(fresh), pair.weights)
-        dr.enqueue(dr.ADMode.Forward, fresh[name])
-        dr.traverse(dr.ADMode.Forward)
-        assert dr.grad(total).numpy()[0] == pytest.approx(expected, abs=0.01 * size), name
+        with_grad(fresh[name], upload_tensor(direction))
+        forward = dr.forward_to(weighted(pair.planes(fresh), pair.weights))
+        assert forward.numpy()[0] == pytest.approx(expected, abs=0.01 * size), name
 
 
 def test_what_lies_behind_is_exposed_as_the_rest_is() -> None:

@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.helpers import with_grad
+
 CENTRE = np.array([0.3, -0.2, 0.1])
 STEP = 1e-6
 
@@ -43,13 +45,9 @@ def require_slopes(total: Any, define: Any, at: np.ndarray, tolerance: float = 2
     sides = [[define(exact + sign * STEP * axis) for sign in (1, -1)] for axis in np.eye(len(at))]
     expected = np.array([(above - below) / (2 * STEP) for above, below in sides])
     largest = np.abs(expected).max()
-    leaf = mi.Float(at)
-    dr.enable_grad(leaf)
+    leaf = with_grad(mi.Float(at))
     dr.backward(total(leaf))
     np.testing.assert_allclose(np.array(dr.grad(leaf)), expected, atol=tolerance * largest)
     tangent = np.resize(np.array([0.5, -1, 0.7, 0.3, 1, -0.4], np.float32), len(at))
-    leaf = mi.Float(at)
-    dr.enable_grad(leaf)
-    dr.set_grad(leaf, mi.Float(tangent))
-    found = dr.forward_to(total(leaf))
+    found = dr.forward_to(total(with_grad(mi.Float(at), mi.Float(tangent))))
     assert abs(float(found[0]) - expected @ tangent) < 2 * tolerance * largest

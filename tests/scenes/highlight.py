@@ -14,6 +14,7 @@ from mi_refgs.methods import load_resolved
 from mi_refgs.methods.method import Method
 from mi_refgs.runs.run import Run
 from mi_refgs.surfels.table import Surfels
+from tests.scenes.tiny import write_method
 
 SIZE = 24
 METHOD = """
@@ -73,9 +74,7 @@ def ball(size: int = SIZE, views: int = 6) -> Dataset:
 
 
 def small_method(folder: Path, text: str = METHOD) -> Method:
-    path = folder / "small.toml"
-    path.write_text(text)
-    return load_resolved(path)
+    return load_resolved(write_method(folder, text))
 
 
 def without(method: Method, *names: str) -> Method:

@@ -124,6 +124,12 @@ def ply_bytes(columns: dict[str, np.ndarray], kind: str = "binary_little_endian"
     return f"{header}end_header\n".encode() + body
 
 
+def point_bytes(kind: str = "binary_little_endian") -> bytes:
+    """The dots as a PLY file of coloured points."""
+    names = ("x", "y", "z", "red", "green", "blue")
+    return ply_bytes(dict(zip(names, [*POINTS.T, *COLOURS.T.astype(np.uint8)], strict=True)), kind)
+
+
 def write_llff(folder: Path, factor: int = 1) -> Path:
     rows = []
     for shot in SHOTS:

@@ -131,8 +131,7 @@ def seen_from(*origin: float, size: int = 1, focal: float = 8.0) -> Camera:
 
 def quaternion_to(normal: np.ndarray) -> np.ndarray:
     """A quaternion (x, y, z, w) whose rotation takes +z to `normal`."""
-    axis = np.cross([0, 0, 1.0], normal)
-    return np.array([*axis, 1 + normal[2]]) + 1e-9
+    return np.array([*np.cross([0, 0, 1.0], normal), 1 + normal[2]]) + 1e-9
 
 
 def fast_maps(scene: Scene) -> Composited:

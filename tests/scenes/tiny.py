@@ -41,9 +41,9 @@ resolution = 16
 SETTINGS = ["iterations=6", "surfels.count=80", "surfels.max_count=100", "preview_every=4", "log_every=2"]
 
 
-def write_method(folder: Path) -> Path:
+def write_method(folder: Path, text: str = METHOD) -> Path:
     path = folder / "tiny.toml"
-    path.write_text(METHOD)
+    path.write_text(text)
     return path
 
 
@@ -72,8 +72,7 @@ def write_data(folder: Path, views: int = 3, truth: bool = True) -> Path:
         content = {"fl_x": FOCAL, "fl_y": FOCAL, "w": SIZE, "h": SIZE, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
     if truth:
-        light = np.linspace(0.1, 2, 8 * 16 * 3).reshape(8, 16, 3)
-        write_exr(folder / "environment.exr", light)
+        write_exr(folder / "environment.exr", np.linspace(0.1, 2, 8 * 16 * 3).reshape(8, 16, 3))
     return folder
 
 

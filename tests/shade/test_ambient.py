@@ -69,8 +69,7 @@ def test_ratios_against_rays_one_by_one() -> None:
         return exact_terms(values, exact_levels, ShadingOptions(diffuse="irradiance")).sum((0, 1))
 
     def sky(ω: np.ndarray) -> np.ndarray:
-        lookup = specular(exact_levels, ω[None], np.array([(4 * RAYS) ** -0.25]))
-        return exact_levels.look_up(*lookup)[0]
+        return exact_levels.look_up(*specular(exact_levels, ω[None], np.array([(4 * RAYS) ** -0.25])))[0]
 
     rays = directions(normals, RAYS).astype(np.float64)
     shape = (mesh.vertices.astype(np.float64), mesh.faces.astype(int), normals, rays)

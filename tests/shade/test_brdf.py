@@ -13,6 +13,7 @@ import pytest
 from mi_refgs.reference.light import table_lookup
 from mi_refgs.reference.lobe import split_sum_entry
 from mi_refgs.shade import brdf
+from tests.helpers import with_grad
 
 
 def test_a_lookup_needs_one_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,8 +52,7 @@ def test_derivatives_in_both_arguments(rng: np.random.Generator) -> None:
     n_dot_v = (rng.integers(1, 254, n) + 0.5 + rng.uniform(0.2, 0.8, n)) / 256
     roughness = (rng.integers(1, 254, n) + 0.5 + rng.uniform(0.2, 0.8, n)) / 256
     weight = rng.normal(size=(2, n))
-    x, y = mi.Float(n_dot_v), mi.Float(roughness)
-    dr.enable_grad(x, y)
+    x, y = with_grad((mi.Float(n_dot_v), mi.Float(roughness)))
     a, b = brdf.split_sum(x, y)
     dr.backward(a * mi.Float(weight[0]) + b * mi.Float(weight[1]))
     table = brdf.table().astype(np.float64)
@@ -71,9 +71,7 @@ def test_derivatives_in_both_arguments(rng: np.random.Generator) -> None:
 
 
 def test_finite_outside_the_table() -> None:
-    x = mi.Float(-1, 0, 0, 1, 1, 2, 0.5, -3)
-    y = mi.Float(-1, 0, 1, 0, 1, 2, -2, 7)
-    dr.enable_grad(x, y)
+    x, y = with_grad((mi.Float(-1, 0, 0, 1, 1, 2, 0.5, -3), mi.Float(-1, 0, 1, 0, 1, 2, -2, 7)))
     a, b = brdf.split_sum(x, y)
     dr.backward(a + b)
     for value in (a, b, dr.grad(x), dr.grad(y)):

@@ -141,8 +141,7 @@ def test_samples_of_coarser_channels_are_repeated() -> None:
 def test_a_crash_of_the_exr_library_is_an_error_of_the_file(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", np.ones((4, 8, 3)))
     exr._end()
-    dies = "import os, sys; sys.stdin.readline(); os.kill(os.getpid(), 11)"
-    command = [sys.executable, "-c", dies]
+    command = [sys.executable, "-c", "import os, sys; sys.stdin.readline(); os.kill(os.getpid(), 11)"]
     exr._processes[os.getpid()] = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     refused(lambda: read_radiance(tmp_path / "a.exr"), "a.exr: header:", "(status -11); export it again")
     assert read_radiance(tmp_path / "a.exr").shape == (4, 8, 3)
@@ -201,8 +200,7 @@ def test_scenes_read_their_maps_so(tmp_path: Path, capsys: Captured) -> None:
     (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{scene}</scene>')
     loaded = load_scene(tmp_path / "a.xml")
     assert "a.exr: pixels" in capsys.readouterr().err
-    image = environment_image(loaded, 16)
-    np.testing.assert_allclose(image[[0, 8], 0], [(0, 0, 0), GREY], atol=1e-3)
+    np.testing.assert_allclose(environment_image(loaded, 16)[[0, 8], 0], [(0, 0, 0), GREY], atol=1e-3)
     (reflectance,) = (v for k, v in mi.traverse(loaded).items() if k.endswith("reflectance.data"))
     assert np.array(reflectance).shape[:2] == (32, 32)
     (tmp_path / "a.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:300])

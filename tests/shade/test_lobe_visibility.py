@@ -43,8 +43,7 @@ def test_weights_add_up_to_the_table(roughness: float) -> None:
     normals, views = (vector(np.repeat(x, count, 0)) for x in (np.tile(normal, (5, 1)), view))
     lobe = Lobe.of(normals, views, dr.opaque(mi.Float, roughness, 5 * count), mi.Color3f(f0))
     unturned = replace(lobe, turn=mi.UInt32(0))
-    ray = dr.arange(mi.UInt32, 5 * count) % count
-    direction, weight = unturned.sample(ray, mi.UInt32(count))
+    direction, weight = unturned.sample(dr.arange(mi.UInt32, 5 * count) % count, mi.UInt32(count))
     weighted = np.concatenate([np.array(weight)[None], np.array(weight) * direction.numpy()])
     total, *mean = weighted.astype(np.float64).reshape(4, 5, count).sum(2)
     mean = np.stack(mean).T
@@ -65,8 +64,7 @@ def test_limits_of_the_lobe() -> None:
     view = height * normal + np.sqrt(1 - height**2) * across
 
     def sample(roughness: float) -> tuple[np.ndarray, np.ndarray]:
-        r = dr.opaque(mi.Float, roughness, 60)
-        lobe = Lobe.of(vector(normal), vector(view), r, mi.Color3f(0.3))
+        lobe = Lobe.of(vector(normal), vector(view), dr.opaque(mi.Float, roughness, 60), mi.Color3f(0.3))
         direction, weight = lobe.sample(mi.UInt32(5), mi.UInt32(8))
         return direction.numpy().T, np.array(weight)
 

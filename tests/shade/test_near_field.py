@@ -11,7 +11,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.lobe_matrices import map_directions
 from mi_refgs.shade.light.near_field import LocalLight, NearField
-from tests.helpers import unit, vector
+from tests.helpers import unit, vector, with_grad
 
 CENTRE = np.array([0.4, -0.3, 0.2])
 COUNT = 2000
@@ -67,15 +67,10 @@ def test_derivatives_are_those_of_the_lookup(rays: tuple[np.ndarray, np.ndarray]
     nearness = 1 / (1.5 + 0.5 * np.sin(3 * map_directions(32)).prod(axis=-1))
     field, step = NearField(CENTRE, nearness), np.random.default_rng(3).normal(size=(2, COUNT, 3))
     x, δ = np.array(rays), 2e-3
-    position, direction = mi.Point3f(vector(x[0])), vector(x[1])
-    dr.enable_grad(position, direction)
-    found = field.seen_from(position, direction)
-    dr.set_grad(position, mi.Point3f(vector(step[0])))
-    dr.set_grad(direction, vector(step[1]))
-    dr.enqueue(dr.ADMode.Forward, position, direction)
-    dr.traverse(dr.ADMode.Forward)
+    position = with_grad(mi.Point3f(vector(x[0])), mi.Point3f(vector(step[0])))
+    found = dr.forward_to(field.seen_from(position, with_grad(vector(x[1]), vector(step[1]))))
     expected = (towards(field, *(x + δ * step)) - towards(field, *(x - δ * step))) / (2 * δ)
-    error = np.linalg.norm(np.array(dr.grad(found)).T - expected, axis=1)
+    error = np.linalg.norm(np.array(found).T - expected, axis=1)
     assert error.mean() < 0.01 * np.linalg.norm(expected, axis=1).mean()
 
 
@@ -89,8 +84,7 @@ def test_points_beyond_surfaces_stay_finite() -> None:
 
 
 def test_local_light_moves_reflections_but_not_irradiance() -> None:
-    rng = np.random.default_rng(1)
-    light = EnvironmentLight.from_radiance(rng.random((16, 32, 3))).prefilter()
+    light = EnvironmentLight.from_radiance(np.random.default_rng(1).random((16, 32, 3))).prefilter()
     local = LocalLight(light, NearField(CENTRE, np.ones((4, 8))), mi.Point3f([0.9], [-0.3], [0.2]))
     up, moved = mi.Vector3f(0, 0, 1), mi.Vector3f(0.5, 0, 0.75**0.5)
     for found, expected in (

@@ -19,7 +19,7 @@ from mi_refgs.shade.light import LIGHTS, FittedLight, LightKind
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import safe_normalize
 from tests.helpers import unit, vector
-from tests.scenes.tiny import train_command, write_data
+from tests.scenes.tiny import train_command, write_data, write_method
 
 SHARPNESS = 40.0  # of the sun: radiance falls as exp(SHARPNESS (cosine - 1))
 
@@ -98,8 +98,7 @@ def test_the_map_that_a_run_saves_is_the_light(rng: np.random.Generator) -> None
 
 def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     """Learnt, saved as a map that scene.xml reads, made again from a checkpoint; and relit."""
-    data, own = write_data(tmp_path / "data"), tmp_path / "own.toml"
-    own.write_text(METHOD)
+    data, own = write_data(tmp_path / "data"), write_method(tmp_path, METHOD)
     assert main(train_command(data, tmp_path / "run", own)) == 0
     run: Any = mi_refgs.load(tmp_path / "run")
     saved = run.trained.light.radiance().numpy()
@@ -111,5 +110,4 @@ def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     assert state is not None
     again: Any = TrainedScene.from_state(run.method, state).light
     np.testing.assert_allclose(again.radiance().numpy(), saved, rtol=1e-5)
-    relit = run.relight(EnvironmentLight.constant(0.5, 8))
-    assert np.isfinite(np.asarray(relit.render(0))).all()
+    assert np.isfinite(np.asarray(run.relight(EnvironmentLight.constant(0.5, 8)).render(0))).all()

@@ -1,14 +1,17 @@
 """CONTRIBUTING's recipe "add a reflectance model", followed: Phong's, by one attribute and one class."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refgs import Reconstruction
 from mi_refgs.cli import main
 from mi_refgs.evaluation.decomposition import material_maps
 from mi_refgs.evaluation.images import RenderedView
@@ -20,7 +23,7 @@ from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
-from mi_refgs.shade.reflectance import Reflectance, SurfelView
+from mi_refgs.shade.reflectance import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels import attributes
@@ -29,9 +32,9 @@ from mi_refgs.surfels.ply import read_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes.corner import floor_points, seen, wall_surfels
-from tests.scenes.integrator import check_derivatives, image, raw_channels, scene
+from tests.scenes.integrator import check_derivatives, image, plane_mesh, raw_channels, scene
 from tests.scenes.known import known_mesh, known_surfels
-from tests.scenes.tiny import train_command, write_data
+from tests.scenes.tiny import train_command, write_data, write_method
 
 SHININESS = Attribute("shininess", (1,), "sigmoid", 0.02, ("shininess",), initial=0.5, aov="Y")
 SHARE = 0.3  # of the light that the lobe reflects
@@ -76,13 +79,17 @@ reflectance = "phong"
 """
 
 
+@contextmanager
+def registered(registry: Any, item: Any) -> Iterator[None]:
+    registry.register(item)
+    yield
+    registry.unregister(item.name)
+
+
 @pytest.fixture(autouse=True)
 def phong() -> Iterator[None]:
-    attributes.register(SHININESS)
-    reflectance.register(Phong())
-    yield
-    reflectance.unregister("phong")
-    attributes.ATTRIBUTES.unregister("shininess")
+    with registered(attributes.ATTRIBUTES, SHININESS), registered(reflectance.MODELS, Phong()):
+        yield
 
 
 def raw() -> dict[str, np.ndarray]:
@@ -102,9 +109,8 @@ def test_the_plugin_renders_and_differentiates_it(order: str) -> None:
 
 def test_a_method_fits_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     """`refgs train` with a table that names it; the exported surfels have the channel, and it has moved."""
-    (tmp_path / "own.toml").write_text(METHOD)
-    data = write_data(tmp_path / "data")
-    assert main(train_command(data, tmp_path / "run", tmp_path / "own.toml")) == 0
+    data, own = write_data(tmp_path / "data"), write_method(tmp_path, METHOD)
+    assert main(train_command(data, tmp_path / "run", own)) == 0
     fitted = read_ply(tmp_path / "run" / "surfels.ply")
     assert fitted.has("shininess") and not fitted.has("roughness")
     moved = fitted.to_numpy()["shininess"]
@@ -144,11 +150,42 @@ def test_textures_are_baked_and_compared(aov: str) -> None:
     assert abs(baked.roughness.mean() - (1 - shown.mean())) < 0.1
     rendered = RenderedView.maps_of(scene.renderer()(camera), 32, 32)
     view = RenderedView(np.zeros((32, 32, 3)), np.zeros((32, 32)), np.zeros((32, 32, 3)), rendered)
-    maps = material_maps(scene)(camera, view)
-    np.testing.assert_array_equal(maps["roughness"], 1 - rendered["shininess"])
+    np.testing.assert_array_equal(material_maps(scene)(camera, view)["roughness"], 1 - rendered["shininess"])
+
+
+class Traced(Phong):
+    """Rays of its own, whose result is not the visibility; an attribute of two columns, used as a vector."""
+
+    name = "traced"
+    visibility = "own"  # type: ignore[assignment]
+    honoured = ()  # type: ignore[assignment]
+
+    def required_attributes(self, options: ShadingOptions) -> tuple[str, ...]:
+        return ("albedo", "shininess", "brushed")
+
+    def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
+        start, normal, hit = context.start(points.normal)
+        return points.replaced(open=context.occluder.visible(start, normal, normal, hit))
+
+    def shade(self, points: ShadingPoints, light: Any, options: ShadingOptions) -> RadianceTerms:
+        return RadianceTerms(points.albedo * dr.norm(points.brushed) * dr.select(points.open, 1.0, 0.5))
+
+
+@pytest.mark.parametrize("order", ["pixel", "surfel"])
+def test_a_model_may_trace_its_own_rays(order: str, tmp_path: Path) -> None:
+    brushed = Attribute("brushed", (2,), "identity", 0.01, ("brushed_0", "brushed_1"))
+    with registered(attributes.ATTRIBUTES, brushed), registered(reflectance.MODELS, Traced()):
+        own = raw() | {"brushed": np.full((len(raw()["albedo"]), 2), 0.6, np.float32)}
+        of = scene(raw=own, reflectance="traced", shade_at=order, mesh=plane_mesh(tmp_path), antialias=False)
+        expected, sensor = image(of), of.sensors()[0]
+        found = Reconstruction.from_params(of).aovs(sensor, ["normal", "diffuse"])
+        assert np.ptp(expected) > 0.1
+        np.testing.assert_allclose(found["diffuse"], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("aov, widths", [("S", (1,)), ("RGB", (1,)), ("Y", (3,))])
 def test_suffixes_of_an_aov_are_those_of_its_columns(aov: str, widths: tuple[int, ...]) -> None:
     wrong = Attribute("sheen", widths, "sigmoid", 0.02, ("sheen",) * widths[0], aov=aov)
     refused(lambda: attributes.register(wrong), "attribute 'sheen': aov: ", "columns; use Mitsuba's")
+    taken = replace(wrong, name="specular", aov="")  # one of the image's own maps
+    refused(lambda: attributes.register(taken), "attribute 'specular': the integrator has it")

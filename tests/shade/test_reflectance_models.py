@@ -18,7 +18,7 @@ from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import check_slopes, unit, vector
+from tests.helpers import check_slopes, unit, vector, with_grad
 from tests.scenes.shading_points import N, exact_light, exact_terms, points_of, shading_values
 
 MAP = np.random.default_rng(3).uniform(0.1, 3, (16, 32, 3))
@@ -80,8 +80,7 @@ def test_attribute_derivatives(shading: Shading, names: tuple[str, ...], rng: np
     tangent is the transpose of the adjoint."""
     light, values = EnvironmentLight.from_radiance(MAP), shading_values(rng, names)
     exact, points, weight = exact_light(light.prefilter()), points_of(values), rng.normal(size=(N, 3, 3))
-    used = {name: getattr(points, name) for name in values if name != "free"}
-    dr.enable_grad(list(used.values()))
+    used = with_grad({name: getattr(points, name) for name in values if name != "free"})
     dr.backward(weighted(shaded(points, light, shading), weight))
     gradients = {n: [np.array(dr.grad(x)).reshape(-1, N).T for x in flat(a)] for n, a in used.items()}
 
@@ -101,9 +100,8 @@ def test_attribute_derivatives(shading: Shading, names: tuple[str, ...], rng: np
     for name in used:
         for part, gradient in zip(flat(getattr(again, name)), gradients[name], strict=True):
             tangent = rng.normal(size=gradient.shape).astype(np.float32)
-            dr.enable_grad(part)
             moved = mi.Float(tangent[:, 0]) if tangent.shape[1] == 1 else type(part)(vector(tangent))
-            dr.set_grad(part, moved)
+            with_grad(part, moved)
             expected += float((tangent * gradient).sum())
     total = weighted(shaded(again, light, shading), weight)
     dr.forward_to(total)
@@ -133,9 +131,7 @@ def test_derivative_of_light(shading: Shading, names: tuple[str, ...], rng: np.r
     one = np.zeros_like(MAP)
     one.flat[np.abs(gradient * activation).argmax()] = 1
     assert (gradient * one).sum() == pytest.approx(slope(one, 0.05), rel=5e-3)
-    leaf = mi.TensorXf(raw)
-    dr.enable_grad(leaf)
-    dr.set_grad(leaf, mi.TensorXf((direction / activation).astype(np.float32)))
+    leaf = with_grad(mi.TensorXf(raw), mi.TensorXf((direction / activation).astype(np.float32)))
     found = weighted(shaded(points, EnvironmentLight(leaf), shading), weight)
     dr.forward_to(found)
     assert float(dr.sum(dr.grad(found))[0]) == pytest.approx(difference, rel=1e-2, abs=0.05)
@@ -165,16 +161,13 @@ def test_degenerate_points_stay_finite(shading: Shading, names: tuple[str, ...])
     if "indirect" in names:
         assert (dr.grad(points.indirect).numpy()[:, inside] != 0).all(), "indirect light of 0 gets a gradient"
     if "roughness" in names:
-        leaf = mi.Float(r.astype(np.float32))
-        dr.enable_grad(leaf)
-        dr.set_grad(leaf, 1)
+        leaf = with_grad(mi.Float(r.astype(np.float32)), 1)
         total = shaded(points.replaced(roughness=leaf), EnvironmentLight(raw), shading).total()
         assert dr.all(dr.isfinite(dr.forward_to(total)), axis=None)
 
 
 def test_safe_normalize() -> None:
-    v = mi.Vector3f([3e-30, 3, 3e18, 0, 0], [0, 0, 0, 0, 1e-3], [4e-30, 4, 4e18, 0, 0])
-    dr.enable_grad(v)
+    v = with_grad(mi.Vector3f([3e-30, 3, 3e18, 0, 0], [0, 0, 0, 0, 1e-3], [4e-30, 4, 4e18, 0, 0]))
     n = safe_normalize(v)
     dr.backward(n.x + 2 * n.y + 3 * n.z)
     expected = [[0.0, 0, 1], [0.6, 0, 0.8], [0.6, 0, 0.8], [0.0, 0, 1], [0.0, 1, 0]]
@@ -189,8 +182,7 @@ def test_safe_normalize() -> None:
 def test_lights_give_same_to_model() -> None:
     """A constant light is its own filter, and one look-up of the map needs no filter."""
     d, roughness = mi.Vector3f(0.6, 0, 0.8), mi.Float(0.3)
-    colour = mi.Color3f(0.5, 1, 2)
-    dr.enable_grad(colour)
+    colour = with_grad(mi.Color3f(0.5, 1, 2))
     light = ConstantLight(colour)
     for value in (light.radiance(d), light.irradiance(d), light.specular(d, roughness)):
         np.testing.assert_array_equal(value.numpy(), colour.numpy())
@@ -219,8 +211,7 @@ def test_hemisphere_is_blocked_where_mesh_stands() -> None:
     place = mi.Point3f(vector(np.linspace(0, 0.5, n)[:, None] * [1.0, 0, 0]))
     points = ShadingPoints(normal, normal, position=place)
     context = TraceContext(occluder, Surfels({}), None, mi.Point3f(0, 9, 0), -normal)
-    shading = CASES["monte_carlo, occluded"][0]
-    free = np.array(trace(points, context, shading).free)
+    free = np.array(trace(points, context, CASES["monte_carlo, occluded"][0]).free)
     directions = models.hemisphere(DIRECTIONS, np.array([0, 1.0, 0]))
     blocked = directions[:, 0] * 50 > 1  # the wall is as good as infinite
     assert 0 < blocked.sum() < DIRECTIONS

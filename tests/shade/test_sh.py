@@ -9,7 +9,7 @@ import scipy.special
 from mi_refgs.errors import InputError
 from mi_refgs.reference import models as reference
 from mi_refgs.shade.sh import clamp_positive, eval_sh, sh_basis
-from tests.helpers import unit
+from tests.helpers import unit, with_grad
 
 
 def directions(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -45,9 +45,8 @@ def test_against_scipy_and_the_recursion(rng: np.random.Generator) -> None:
 def test_derivatives_of_eval(degree: int, rng: np.random.Generator) -> None:
     n, count = 40, (degree + 1) ** 2
     d, coefs, weight = directions(rng, n - 6), rng.normal(size=(count, 3, n)), rng.normal(size=(3, n))
-    direction = mi.Vector3f(d.T.astype(np.float32))
-    colours = [mi.Color3f(c.astype(np.float32)) for c in coefs]
-    dr.enable_grad(direction, colours)
+    direction = with_grad(mi.Vector3f(d.T.astype(np.float32)))
+    colours = with_grad([mi.Color3f(c.astype(np.float32)) for c in coefs])
     dr.backward(dr.dot(mi.Vector3f(eval_sh(colours, direction)), mi.Vector3f(weight.astype(np.float32))))
     basis = np.array([reference.sh_basis(x, degree) for x in d])
     for k in range(count):
@@ -72,8 +71,7 @@ def test_wrong_numbers_of_coefficients() -> None:
 
 def test_clamp_lets_a_coefficient_leave_zero() -> None:
     """Indirect coefficients start at exactly 0; a derivative of 0 there would keep them there for ever."""
-    coefs = [mi.Color3f(dr.zeros(mi.Float, 3)) for _ in range(4)]
-    dr.enable_grad(coefs)
+    coefs = with_grad([mi.Color3f(dr.zeros(mi.Float, 3)) for _ in range(4)])
     colour = clamp_positive(eval_sh(coefs, mi.Vector3f([1, 0, 0], [0, 0, 1], [0, 1, 0])))
     assert dr.all(colour == 0, axis=None)
     dr.backward(colour)

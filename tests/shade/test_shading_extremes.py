@@ -9,7 +9,7 @@ import pytest
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance.split_sum import SplitSum
-from tests.helpers import AXES, slow, unit
+from tests.helpers import AXES, slow, unit, with_grad
 from tests.scenes.shading_points import exact_light, exact_terms, points_of, shading_values
 
 N = 24
@@ -29,8 +29,7 @@ def mirrored_to(view: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def cases(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """Values of N points by name, each with some at an end."""
-    names = ("albedo", "metallic", "roughness", "radiance", "visibility", "indirect")
-    values = shading_values(rng, names, N)
+    values = shading_values(rng, ("albedo", "metallic", "roughness", "radiance", "visibility", "indirect"), N)
     values |= {name: unit(values[name]) for name in ("normal", "view")}
     view = values["view"]
     across_the_seam = rng.normal(size=(N, 3)) * (1e-4, 1, 0) + [0, 0, -1]
@@ -73,8 +72,7 @@ def test_values_and_gradients_at_the_ends(light: str, diffuse: Any, rng: np.rand
     for name, values in cases(rng).items():
         made = points_of(values)
         keys = ("albedo", "metallic", "radiance", "roughness", "normal")
-        leaves = {key: getattr(made, key) for key in keys}
-        dr.enable_grad(*leaves.values())
+        leaves = with_grad({key: getattr(made, key) for key in keys})
         terms = SplitSum().shade(made, prefiltered, options)
         found = np.stack([np.broadcast_to(getattr(terms, t).numpy(), (3, N)).T for t in TERMS], 1)
         expected = exact_terms(values, exact, options)
@@ -109,8 +107,7 @@ def test_energy_under_a_constant_light_of_1(dominant: bool) -> None:
     values |= {"albedo": np.repeat(albedo[:, None], 3, 1), "metallic": metallic, "roughness": roughness}
     light = EnvironmentLight.constant(1.0, 16).prefilter()
     options = ShadingOptions(diffuse="irradiance", dominant=dominant)
-    terms = SplitSum().shade(points_of(values), light, options)
-    total = terms.total().numpy()[0]
+    total = SplitSum().shade(points_of(values), light, options).total().numpy()[0]
     assert total.min() >= 0 and total.max() <= 1 + 1e-3
     white = (albedo == 1) & (metallic == 0)
     assert total[white].min() >= 1 - 1e-3

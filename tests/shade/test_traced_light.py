@@ -21,7 +21,7 @@ from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import ShadingPoints
 from mi_refgs.shade.reflectance.split_sum import MATERIALS, SplitSum
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import slow, unit, vector
+from tests.helpers import slow, unit, vector, with_grad
 from tests.scenes import corner as scenes
 from tests.scenes.shading_points import exact_light, exact_terms
 from tests.scenes.splats import discs
@@ -200,14 +200,10 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
     assert abs(difference) > 1e-3
     assert rays == 1 or 0 < (kept[0].numpy() < 0.9).mean() < 0.5
 
-    leaf = mi.TensorXf(base)
-    dr.enable_grad(leaf)
+    leaf = with_grad(mi.TensorXf(base))
     dr.backward(dr.sum(dr.dot(mi.Vector3f(indirect(leaf)), weight)))
     reverse = float(np.sum(dr.grad(leaf).numpy().astype(np.float64) * step))
-    leaf = mi.TensorXf(base)
-    dr.enable_grad(leaf)
-    dr.set_grad(leaf, mi.TensorXf(step))
-    tangent = dr.forward_to(indirect(leaf))
+    tangent = dr.forward_to(indirect(with_grad(mi.TensorXf(base), mi.TensorXf(step))))
     forward = float(np.sum(tangent.numpy().astype(np.float64) * weight.numpy()))
     scale = float(np.linalg.norm(tangent.numpy()) * np.linalg.norm(weight.numpy())) / np.sqrt(len(place))
     assert abs(reverse - forward) < 1e-4 * scale
@@ -256,8 +252,7 @@ def test_degenerate_pixels_stay_finite() -> None:
         (scenes.with_materials(scenes.corner(), surfels), options),
         (empty, replace(options, visibility_rays=1)),
     ):
-        raw = mi.TensorXf(light.raw)
-        dr.enable_grad(raw)
+        raw = with_grad(mi.TensorXf(light.raw))
         prefiltered = EnvironmentLight(raw).prefilter()
         found = scenes.seen(points, place, chosen, surfels, prefiltered, occluder=occluder)
         assert dr.all((found.visibility >= 0) & (found.visibility <= 1))

@@ -115,14 +115,12 @@ def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pyt
 
 def test_compacted_pixels_contain_each_pixel_of_chosen_patches_once() -> None:
     view = camera_at(30.0, (3, 2))
-    footprints = splat.project([things()], view)
-    lists = splat.list_by_tile(footprints, view)
+    lists = splat.list_by_tile(splat.project([things()], view), view)
     chosen = Lanes.filled(lists)
     assert 0 < dr.width(chosen) < Grid(view).patches
     pixels = CompactedPixels.of(view, chosen, Lanes.of(lists, chosen))
     there, raster = np.array(pixels.there), np.array(pixels.raster)
-    back = raster[np.array(pixels.index)[there]]
-    np.testing.assert_array_equal(back, np.flatnonzero(there))
+    np.testing.assert_array_equal(raster[np.array(pixels.index)[there]], np.flatnonzero(there))
     alpha = np.array(splat.splat([things()], [], view).alpha)
     assert not alpha[~there].any() and alpha[there].any()
 

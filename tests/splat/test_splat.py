@@ -188,8 +188,7 @@ def test_tile_lists_are_in_the_oracles_order(kind: Primitive, seed: int, tile: t
     for i, (begin, end) in enumerate(zip(lists.pair_begin.numpy(), lists.pair_end.numpy(), strict=True)):
         y, x = (k * size for k, size in zip(divmod(i, camera.tiles[0]), camera.tile[::-1], strict=True))
         listed = surfel[begin:end]
-        expected = [k for k in order[:, y, x] if k in set(listed)]
-        np.testing.assert_array_equal(listed, expected)
+        np.testing.assert_array_equal(listed, [k for k in order[:, y, x] if k in set(listed)])
         compared += len(listed)
     assert compared > 100
 

@@ -23,8 +23,7 @@ def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) 
     values = rng.random(24 * 24).astype(np.float32)
     seen = BlendedView.of([surfels], view, [0, 1, mi.Float(2)])
     weight, weighted, deep = seen.sums([1, mi.Float(values), seen.maps.expected_depth])
-    features = [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)]
-    blended = splat([surfels], features, view)
+    blended = splat([surfels], [mi.Float(row) for row in np.eye(surfels.count, dtype=np.float32)], view)
     images = np.array([image.numpy() for image in blended.features], np.float64)
     assert images.any()
     np.testing.assert_allclose(weight, images.sum(axis=1), rtol=1e-4, atol=1e-5)
@@ -47,8 +46,7 @@ def test_surfels_are_listed_in_the_tiles_that_they_cover(rng: np.random.Generato
     width, height = view.tile
     for index in range(surfels.count):
         alone = [surfels.gather(mi.UInt32(index))]
-        alpha = splat(alone, [], view).alpha.numpy().reshape(24, 24) > 0
-        rows, columns = np.nonzero(alpha)
+        rows, columns = np.nonzero(splat(alone, [], view).alpha.numpy().reshape(24, 24) > 0)
         shown = {(row // height, column // width) for row, column in zip(rows, columns, strict=True)}
         assert len(shown) <= tiles[index] == listed_tiles(alone, view)[0]
     assert tiles.max() > tiles.min() >= 1

@@ -36,8 +36,7 @@ def test_reference_footprints_match_textbook_matrices() -> None:
 
 def test_the_normal_is_the_shortest_axis() -> None:
     scales = np.log([[1, 2, 3], [2, 1, 3], [3, 2, 1], [1, 1, 1], [1, 1, 2]])
-    rotation = np.random.default_rng(0).normal(size=(5, 4))
-    surfels = Surfels.from_numpy(discs(scale=scales, rotation=rotation))
+    surfels = Surfels.from_numpy(discs(scale=scales, rotation=np.random.default_rng(0).normal(size=(5, 4))))
     axes = np.stack([np.array(axis).T for axis in surfels.frame()], axis=1)
     expected = axes[np.arange(5), [0, 1, 2, 2, 0]]
     normal = np.array(surfels.primitive.normal(surfels)).T
@@ -46,8 +45,7 @@ def test_the_normal_is_the_shortest_axis() -> None:
 
 def test_a_gaussian_is_split_along_its_longest_axis() -> None:
     raw = discs(position=np.ones((2, 3)), scale=np.log([[0.3, 0.1, 0.05], [0.05, 0.1, 0.3]]))
-    gaussians = Surfels.from_numpy(raw)
-    edited = densify.densify_and_prune(gaussians, np.ones(2), 4, grow=1.0)
+    edited = densify.densify_and_prune(Surfels.from_numpy(raw), np.ones(2), 4, grow=1.0)
     children = edited.surfels.to_numpy()
     assert edited.parent.tolist() == [0, 1, 0, 1] and edited.fresh.all()
     offsets = children["position"] - 1

@@ -23,8 +23,7 @@ def test_from_points(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.array(surfels.frame()[2]).T, unit(normals), atol=1e-6)
     squared = np.sort(np.sum((points[:, None] - points[None]) ** 2, axis=-1), axis=1)[:, 1:4]
     np.testing.assert_allclose(np.array(surfels.scale())[0], np.sqrt(squared.mean(axis=1)), rtol=1e-5)
-    constant = np.array(surfels.value("radiance_sh")[0]).T
-    np.testing.assert_allclose(constant * SH_DC + 0.5, colours, atol=1e-6)
+    np.testing.assert_allclose(np.array(surfels.value("radiance_sh")[0]).T * SH_DC + 0.5, colours, atol=1e-6)
     np.testing.assert_allclose(np.array(surfels.opacity()), 0.2, rtol=1e-6)
     np.testing.assert_allclose(np.array(surfels.value("roughness")), 0.3, rtol=1e-6)
     assert np.abs(np.array(surfels.value("albedo")) - 0.5).max() <= 0.0251
@@ -77,11 +76,14 @@ def test_attribute_starts_at_its_activated_value(rng: np.random.Generator) -> No
     }  # fmt: skip
     for kind, function in activate.items():
         declared = Attribute("width", (2,), kind, 1e-3, ("w_0", "w_1"), initial=0.2)
-        for value in (None, 0.7):
+        for value in (None, 0.7, np.linspace(0.1, 0.9, 10).reshape(5, 2)):
             raw = declared.start(5, 2, rng, value)
             assert raw.shape == (5, 2)
             np.testing.assert_allclose(function(raw), 0.2 if value is None else value, rtol=1e-6)
     size = Attribute("width", (2,), "exp", 1e-3, ("w_0", "w_1"))
+    np.testing.assert_allclose(np.exp(size.start(3, 1, rng, np.arange(1.0, 4))), [[1], [2], [3]])
+    with pytest.raises(InputError, match=r"width: shape \(3,\); give one number, or an array \(3, 2\)"):
+        size.start(3, 2, rng, np.arange(1.0, 4))
     for value in (0.0, -1.0, np.inf):
         with pytest.raises(InputError, match=r"width: .* is out of range; start it above 0"):
             size.start(1, 1, rng, value)

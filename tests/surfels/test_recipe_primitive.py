@@ -25,7 +25,7 @@ from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.primitives import primitive as base
 from mi_refgs.surfels.primitives.primitive import Footprints, cutoff_radius_squared, rectangle
 from mi_refgs.surfels.table import Surfels
-from tests.scenes.tiny import train_command, write_data
+from tests.scenes.tiny import train_command, write_data, write_method
 
 RADIUS = Attribute("radius", (1,), "exp", 5e-3, ("radius",), geometry=True)
 
@@ -193,18 +193,15 @@ def test_balls_are_split_and_written(tmp_path: Path) -> None:
 
 def test_balls_are_fitted(tmp_path: Path) -> None:
     """A method names them; the run's own scene, checkpoint and evaluation have them."""
-    path = tmp_path / "balls.toml"
-    path.write_text(
-        f"""
+    text = f"""
         iterations = {methods.PRESETS["quick"].iterations}
         checkpoint_every = 3
         surfels = {{ primitive = "ball", attributes = ["radiance_sh"], degree = {{ radiance_sh = 1 }} }}
         stage.all = {{ until = 6, reflectance = "radiance" }}
         event.densify = {{ when = {{ start = 1, until = 6, every = 2 }}, prune_extent = 10.0 }}
         """
-    )
     data, run = write_data(tmp_path / "data"), tmp_path / "run"
-    assert main(train_command(data, run, path)) == 0
+    assert main(train_command(data, run, write_method(tmp_path, text))) == 0
     fitted = read_ply(run / "surfels.ply")
     assert fitted.primitive.name == "ball" and 80 < fitted.count <= 100
     assert main(["eval", str(run)]) == 0

@@ -35,8 +35,7 @@ def test_activations(count: int, rng: np.random.Generator) -> None:
     for column, axis in enumerate(surfels.frame()):
         np.testing.assert_allclose(np.array(axis).T, axes[:, :, column], atol=1e-6)
     assert surfels.sh_degree("radiance_sh") == surfels.sh_degree("indirect_sh") == 2
-    coefficient = surfels.value("radiance_sh")[4]
-    np.testing.assert_array_equal(np.array(coefficient).T, raw["radiance_sh"][:, 12:15])
+    np.testing.assert_array_equal(np.array(surfels.value("radiance_sh")[4]).T, raw["radiance_sh"][:, 12:15])
     for name, values in surfels.to_numpy().items():
         np.testing.assert_array_equal(values, raw[name])
 

@@ -107,8 +107,7 @@ def test_every_rotation_survives_the_page(axis: tuple[int, int, int], degrees: f
     q, r = np.linalg.qr(matrix[:3, :3])
     matrix[:3, :3] = q * np.sign(np.diag(r))
     pose = Pose(matrix, 0.7, 1.0)
-    again = of_page(pose.page_rotation, pose.position, 0.7, 1.0)
-    assert np.abs(again.to_world - pose.to_world).max() < 1e-9
+    assert np.abs(of_page(pose.page_rotation, pose.position, 0.7, 1.0).to_world - pose.to_world).max() < 1e-9
 
 
 def test_oblong_pixels_cover_the_field_of_view_of_square_ones_and_samples_are_offset() -> None:

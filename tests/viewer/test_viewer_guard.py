@@ -37,8 +37,7 @@ def page(
     request: pytest.FixtureRequest, scene: TrainedScene, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Page]:
     """A page for this machine only, and one for others, too; nothing is drawn."""
-    folder = tmp_path_factory.mktemp("page")
-    made = Page(ReconstructionView(scene), {}, "a page", (request.param, 0), folder)
+    made = Page(ReconstructionView(scene), {}, "a page", (request.param, 0), tmp_path_factory.mktemp("page"))
     yield made
     made.close()
 
