@@ -83,8 +83,8 @@ class Reflectance:
         raise NotImplementedError
 
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-        """The points with what rays find, called if `options.occlusion` and visibility is "own". Pixels have no
-        `position`: rays from them begin at `context.start`."""
+        """The points with what rays find, called if `options.occlusion` and visibility is "own". Pixels have
+        no `position`: rays from them begin at `context.start`."""
         raise NotImplementedError
 
     def lobe(self, points: ShadingPoints) -> tuple[Float, Color3f]:
