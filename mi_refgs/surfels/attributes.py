@@ -64,7 +64,8 @@ class Attribute:
     ) -> np.ndarray:  # (count, width) float64
         """Initial raw values around the activated `value`, for SH what the constant coefficient adds;
         InputError for one that the activation cannot return."""
-        given = np.asarray(self.initial if value is None else value, dtype=np.float64)
+        value = self.initial if value is None else value
+        given, shown = np.asarray(value, dtype=np.float64), abbreviated(value)
         columns = 3 if self.harmonics else width
         by_row = given[:, None] if columns == 1 and given.shape == (count,) else given
         try:
@@ -74,16 +75,14 @@ class Attribute:
             raise InputError(f"shape {given.shape}", "surfels", self.name, remedy) from error
         if self.activation == "sigmoid":
             if not np.all((value >= 0) & (value <= 1)):
-                remedy = "start it between 0 and 1"
-                raise InputError(f"{abbreviated(given)} is out of range", "surfels", self.name, remedy)
+                raise InputError(f"{shown} is out of range", "surfels", self.name, "start it between 0 and 1")
             if self.jitter:
                 noise = rng.uniform(-self.jitter, self.jitter, (count, width))
                 return logit(np.clip(value + noise, *JITTER_RANGE))
             return logit(value)
         if self.activation == "exp":
             if not np.all((value > 0) & (value < np.inf)):
-                remedy = "start it above 0"
-                raise InputError(f"{abbreviated(given)} is out of range", "surfels", self.name, remedy)
+                raise InputError(f"{shown} is out of range", "surfels", self.name, "start it above 0")
             value = np.log(value)
         if self.harmonics:
             return np.hstack([value / SH_DC, np.zeros((count, width - 3))])
