@@ -62,6 +62,11 @@ class LossInputs:
         return LossInputs(frame, image, target, light, log_gain, photographed)
 
 
+def _gain(inputs: LossInputs) -> Float | None:
+    squares = [dr.square(value) for value in inputs.log_gain or ()]
+    return squares[0] + squares[1] + squares[2] if squares else None
+
+
 def _ssim(inputs: LossInputs) -> Float:
     camera = inputs.target.camera
     return losses.d_ssim(inputs.image, inputs.target.image, camera.width, camera.height)
@@ -98,7 +103,7 @@ def _photographed(inputs: LossInputs) -> Float | None:
 
 
 register_loss(Loss("l1", lambda of: losses.l1(of.image, of.target.image)))
-register_loss(Loss("gain", lambda of: of.log_gain and sum(map(dr.square, of.log_gain))))
+register_loss(Loss("gain", _gain))
 register_loss(Loss("ssim", _ssim))
 register_loss(Loss("normal", _normal, normals=True))
 register_loss(Loss("smooth", _smooth, normals=True))
