@@ -101,14 +101,13 @@ def find_photographs(folder: Path, tell: Tell = lambda _: None) -> list[Photogra
     if not folder.is_dir():
         what = "is no video" if folder.exists() else "no such folder"
         raise InputError(what, folder, "photographs", "give a folder with JPEG or PNG files")
-    paths, captures = image_files(folder, deep=False), {*(file.parent for file in folder.rglob(REPORT))}
-    captures |= {path.parent for path in folder.rglob(WORK)}
+    paths, below = image_files(folder, deep=False), [*folder.rglob("*")]
+    captures = {path.parent for path in below if path.name in (REPORT, WORK)}
     inner = [p for p in image_files(folder, deep=True) if captures.isdisjoint(p.parents)]
     inner = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
     if len(paths) < FEWEST:
         paths = inner
-    files = (path for path in folder.rglob("*") if path.suffix.lower() in OTHER_ENDINGS)
-    other = Counter(path.suffix for path in files).most_common(1)
+    other = Counter(path.suffix for path in below if path.suffix.lower() in OTHER_ENDINGS).most_common(1)
     if len(paths) < FEWEST:
         remedy = f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"
         raise InputError(f"contains {counted(len(paths), 'JPEG or PNG file')}", folder, "photographs", remedy)

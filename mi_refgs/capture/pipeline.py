@@ -72,8 +72,7 @@ def capture(
     if region is None and drawn is not None and not drawn.estimated:  # a user's, of the last capture's world
         region = drawn if known else None
         if not known:
-            (folder / REGION_FILE).rename(folder / OLD_REGION)
-            tell(f"{folder / REGION_FILE}: moved to {OLD_REGION}, as its cameras are replaced")
+            _set_aside(folder / REGION_FILE, OLD_REGION, "cameras", tell)
     if not known:
         shutil.rmtree(work)
         work.mkdir()
@@ -95,10 +94,7 @@ def capture(
     before = read_json(last) if last.is_file() else {}
     if before.get("key") != key:
         if (folder / MASKS).is_dir() and not before.get("masks"):  # a user's
-            places = (folder / f"{OLD_MASKS}{i or ''}" for i in itertools.count())
-            place = next(path for path in places if not path.exists())
-            (folder / MASKS).rename(place)
-            tell(f"{folder / MASKS}: moved to {place.name}, as its images are replaced")
+            _set_aside(folder / MASKS, OLD_MASKS, "images", tell)
         for stale in (*folder.glob(f"{SPARSE}/*.bin"), last):  # without them the folder is no data set
             stale.unlink(missing_ok=True)
         output.write_images([copies[name] for name in solved.names], straight, mask_files, folder)
@@ -124,6 +120,14 @@ def capture(
     }
     write_json(last, report)
     return report
+
+
+def _set_aside(path: Path, old: str, of: str, tell: Tell) -> None:
+    """Rename what a user made for cameras or images that are replaced: `old`, or a numbered name like it."""
+    wanted = path.with_name(old)
+    places = (wanted.with_stem(f"{wanted.stem}{i or ''}") for i in itertools.count())
+    place = path.rename(next(other for other in places if not other.exists()))
+    tell(f"{path}: moved to {place.name}, as its {of} are replaced")
 
 
 def _hash(inputs: list[Any]) -> str:

@@ -54,17 +54,15 @@ class Provenance:
         if self.data is None or not self.has_data:
             gone = "its data set is unknown" if self.data is None else f"{self.data} is gone"
             raise InputError(gone, "views", split, "use cameras(), or restore the data set")
-        warn_of_changes(self.method, self.data, self.images)
-        views = with_region(read_views(self.method, self.data, split, truth), self.region)
-        return with_poses(views, self.records.get(CAMERAS, {}))
+        views = read_views(self.method, self.data, split, truth)
+        warn_of_changes(views, self.method, self.images)
+        return with_poses(with_region(views, self.region), self.records.get(CAMERAS, {}))
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
         """Return the named cameras of some splits, without images; around the surfels without a data set. Of
         several splits one that cannot be read is left out, with a warning."""
         if self.data is None or not self.has_data:
             return [shot for shot in shots_around(trained.surfels) if shot.split in splits]
-        if "train" in splits:
-            warn_of_changes(self.method, self.data, self.images)
         relative, shots = (lambda path: Path(os.path.relpath(path, self.data))), list[Shot]()
         for split in splits:
             try:
@@ -74,6 +72,8 @@ class Provenance:
                     raise
                 warnings.warn(f"{split} views are left out: {error}", RuntimeWarning, stacklevel=3)
                 continue
+            if split == "train":
+                warn_of_changes(data, self.method, self.images)
             for view in with_poses(data, self.records.get(CAMERAS, {})).views:
                 if (file := view.file) is not None:  # paths are relative to the data set
                     mask = file.mask and replace(file.mask, path=relative(file.mask.path))

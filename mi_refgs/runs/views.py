@@ -68,14 +68,15 @@ def views_of_run(
     """A split of the data set of a run (or at `path`), with the run's region of interest; test views may be
     those of `measured_views`. Raises InputError as `read_dataset` and `Run.region` do, and if the run records
     no data set or it is gone."""
+    known = run.images() if path is None else {}  # a data set that is named is taken as it is
     if path is None:
         record, path = run.path / DATASET, run.dataset()
         if path is None:
             raise InputError("the run records no data set", record, "path", "name one with --data")
         if not os.path.isdir(path):  # False for impossible names too
             raise InputError(f"{path} is gone", record, "path", "name the data set's folder with --data")
-        warn_of_changes(method, path, run.images())
     views = measured_views(method, path) if measured else read_views(method, path, split)
+    warn_of_changes(views, method, known)
     return with_region(views, run.region())
 
 
@@ -96,12 +97,15 @@ def changed(views: Dataset, known: Mapping[str, str]) -> list[str]:
     return [name for name in {**known, **now} if known.get(name) != now.get(name)]
 
 
-def warn_of_changes(method: Method, path: Path, known: Mapping[str, str]) -> None:
-    """Warn if the training images of a data set are not those that a run began with."""
+def warn_of_changes(views: Dataset, method: Method, known: Mapping[str, str]) -> None:
+    """Warn if the training images of the data set of these views are not those that a run began with."""
+    if not known:
+        return
     with contextlib.suppress(InputError):  # of images that are gone, readers of the split tell
-        if known and (other := changed(read_views(method, path, "train", truth=False), known)):
-            what = f"{path}: {len(other)} images or cameras are not as when the fit began, such as {other[0]}"
-            warnings.warn(f"{what}; fit again, or restore them", RuntimeWarning, stacklevel=3)
+        train = views if views.split == "train" else read_views(method, views.path, "train", truth=False)
+        if other := changed(train, known):
+            what = f"{len(other)} images or cameras are not as when the fit began, such as {other[0]}"
+            warnings.warn(f"{views.path}: {what}; fit again, or restore them", RuntimeWarning, stacklevel=3)
 
 
 def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:
