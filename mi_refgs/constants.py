@@ -20,16 +20,13 @@ ALPHA_MIN = 1.0 / 255.0  # below one 8-bit step α is skipped: the declared disc
 TRANSMITTANCE_MIN = 1e-4  # T at which a pixel ends: 8 bits show no more. [3DGS, appendix C]
 LOW_PASS_INV_VARIANCE = 12.0  # 1/pixel²: the variance of a pixel's box; 2DGS has 2. [docs/decisions.md]
 
-EDGE_ON_COSINE = (
-    1e-4  # |cos| of plane and ray below which a surfel is culled: its intersection loses every digit
-)
+EDGE_ON_COSINE = 1e-4  # |cos| of plane and ray below which a surfel is culled: its point has no digits left
 
 SIZE_RANGE = 1e7
 """Bounds of a standard deviation over the surfel's depth, 1/SIZE_RANGE and SIZE_RANGE: below, the low-pass
 decides, above it is a plane. Fourth powers of such ratios fit float32."""
 
 SORT_REACH = 1.0  # deviations up to which a surfel's plane tells its depth in a tile: best near-mirrors
-
 SORT_DEPTH_RANGE = 5.0  # factor by which a surfel's depth in a tile may exceed its centre's in the sort
 GAUSSIAN_LOW_PASS = 0.3  # pixel²: added to a 3D Gaussian's screen covariance, as elsewhere. [3DGS, code]
 

@@ -41,10 +41,6 @@ class UnknownNameError(InputError):
     """A registry has nothing of this name."""
 
 
-class SceneError(InputError):
-    """A scene lacks what a request needs. Where a run is read, its folder precedes the message."""
-
-
 @contextlib.contextmanager
 def within(file: object = None, field: str | None = None) -> Iterator[None]:
     """Let every InputError inside say that its place is in `file` and `field`."""

@@ -170,8 +170,8 @@ def step_times(surfels: int, size: int, steps: int) -> dict[str, Row]:
         result[name] = {
             "step_ms": round(float(np.median(times)), 2),
             "splat_ms": round(splat_ms, 2),
-            "launches": sum(row.launches for row in phases),
-            "phases_ms": {row.phase: round(row.ms, 2) for row in phases},
+            "launches": sum(row["launches"] for row in phases),
+            "phases_ms": {row["phase"]: round(row["ms"], 2) for row in phases},
         }
     return result
 

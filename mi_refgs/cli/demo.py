@@ -27,11 +27,13 @@ class Demo:
 
     def run(self) -> Result:
         from mi_refgs.evaluation.evaluate import SHEET, read_metrics
+        from mi_refgs.io.ownership import own_folder
         from mi_refgs.reconstruction.fit import fit
         from mi_refgs.runs.run import Run
         from mi_refgs.synthesis.make_dataset import make_dataset
 
         # Refuse a folder with a foreign or unreadable run before the data set is traced.
+        own_folder(self.output, "demo")
         data, output = self.output / "data", self.output / (self.preset or "quick")
         run = Run(output)
         if run.exists():

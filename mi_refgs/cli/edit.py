@@ -25,10 +25,10 @@ class Edit:
     def run(self) -> Result:
         from mi_refgs.editing.change import assignments
         from mi_refgs.editing.selection import parse_condition
-        from mi_refgs.io.ownership import require_own
         from mi_refgs.reconstruction.reconstruction import load
+        from mi_refgs.runs.run import Run
 
-        require_own(self.output, "")
+        Run(self.output).require_none()
         options = vars(self.selection) | vars(self.change)
         options["set"] = sum(options["set"], ())
         # Both are checked before the run is read, which takes seconds.

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, make_dataclass
 from typing import Annotated, Any
 
 from mi_refgs.cli.command import OptionalOutput, OtherData, Rendering, Result, RunFolder, optional, separated
-from mi_refgs.errors import InputError, SceneError
+from mi_refgs.errors import InputError
 from mi_refgs.io.progress import say
 
 MOST_LISTED = 12  # files that are named one by one; the default export writes 10
@@ -40,8 +40,11 @@ class Export:
             raise InputError("names no file", "--to", remedy="say with -o which file or folder to write")
         folder = Run(self.run_folder)
         method = folder.method()
-        state = folder.load_checkpoint()
-        fitted = newest(folder, method) if state is None else TrainedScene.from_state(method, state)
+        state, saved = folder.load_checkpoint(), folder.checkpoints()
+        if state is None or int(state["iteration"]) < int(saved[-1].stem):  # damaged: of the artefacts, too
+            fitted = newest(folder, method)
+        else:
+            fitted = TrainedScene.from_state(method, state)
         source = Provenance.of(folder).with_data(self.data)
         if source.data is not None and not source.has_data:
             say(f"note: {source.data} is gone; cameras are around the object, or give --data")
@@ -49,10 +52,7 @@ class Export:
         target = self.output or folder.path
         if names:
             say(f"{target}: writing {', '.join(names)}")
-            try:
-                written = write(fitted, names, target, shots, options, folder.path)
-            except SceneError as error:
-                raise error.at(folder.path) from error
+            written = write(fitted, names, target, shots, options, folder.path)
             files = [str(path) for paths in written.values() for path in paths]
         else:
             if target.resolve() != folder.path.resolve():
@@ -65,7 +65,7 @@ class Export:
 
 def command() -> type[Export]:
     """Return the class of the command, with the options of all registered formats."""
-    from mi_refgs.formats import FORMATS, options_of
+    from mi_refgs.formats.format import FORMATS, options_of
 
     fields: list[Any] = []
     for option in options_of(FORMATS).values():

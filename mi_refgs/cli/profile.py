@@ -1,12 +1,12 @@
 """`refgs profile`: where the time of a training step goes."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Annotated
 
 from tyro.conf import arg
 
 from mi_refgs.cli.command import OtherData, Rendering, Result, RunFolder
-from mi_refgs.errors import require_between
+from mi_refgs.errors import InputError, require_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +30,12 @@ class Profile:
         require_between(self.steps, "--steps", 1)
         folder = Run(self.run_folder)
         method = folder.method()
+        if not folder.checkpoints():
+            raise InputError("none", folder.path, "checkpoints", "measure the run that was fitted")
         trainer = Trainer(method, views_of_run(folder, method, "train", self.data), folder)
         rows = phases_of(stepper(trainer, trainer.method.stage_at(max(trainer.iteration, 1))[0]), self.steps)
         lines = [f"{'phase':<20}{'ms':>10}{'launches':>10}{'share':>8}"]
-        lines += [f"{row.phase:<20}{row.ms:>10.2f}{row.launches:>10}{row.share:>8.0%}" for row in rows]
-        ms, launches = (sum(getattr(row, name) for row in rows) for name in ("ms", "launches"))
+        lines += ["{phase:<20}{ms:>10.2f}{launches:>10}{share:>8.0%}".format(**row) for row in rows]
+        ms, launches = (sum(row[name] for row in rows) for name in ("ms", "launches"))
         lines.append(f"{'sum':<20}{ms:>10.2f}{launches:>10}")
-        return Result({"phases": [asdict(row) for row in rows]}, "\n".join(lines))
+        return Result({"phases": rows}, "\n".join(lines))

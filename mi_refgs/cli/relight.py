@@ -49,6 +49,6 @@ class Relight:
             factors = ", ".join(f"{x:.3f}" for x in result["scale"])
             lines += caption_lines(result["caption"])
             lines.append(f"PSNR                            {result['psnr']:.2f} dB")
-            scaled = f"PSNR after per-channel scaling  {result['psnr_scaled']:.2f} dB"
-            lines.append(f"{scaled}  (relit image × {factors})")
+            scaled = f"{result['psnr_scaled']:.2f} dB  (relit image × {factors})"
+            lines.append(f"PSNR after per-channel scaling  {scaled}")
         return Result(result, "\n".join(lines))

@@ -71,18 +71,16 @@ class Render:
 def read(path: Path, aovs: list[str], object_only: bool) -> Any:
     """Load the scene of a Mitsuba XML, or of a run: its scene.xml, first written if a checkpoint is newer,
     or while another process trains it the newest checkpoint."""
-    from mi_refgs.reconstruction.provenance import Provenance
-    from mi_refgs.reconstruction.reconstruction import Reconstruction
+    from mi_refgs.reconstruction.reconstruction import load
     from mi_refgs.render.load_scene import load_scene
-    from mi_refgs.runs.export import fresh, write_if_stale
+    from mi_refgs.runs.export import fresh
     from mi_refgs.runs.run import Run
 
     run, scene = Run(path), path / "scene.xml" if path.is_dir() else path
     if run.exists() and (run.checkpoints() or not scene.is_file()):
-        source = Provenance.of(run)
-        trained = write_if_stale(run, source.method, source.first_camera)
-        if fresh(run, source.method) is not None:
-            return Reconstruction(trained, source).scene(aovs=aovs, object_only=object_only)
+        found = load(path)
+        if fresh(run, found.method) is not None:
+            return found.scene(aovs=aovs, object_only=object_only)
     if not scene.is_file():
         raise InputError("no such file", scene, "scene", "give a Mitsuba XML or a run folder")
     return load_scene(scene, aovs, object_only)

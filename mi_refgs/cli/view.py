@@ -1,5 +1,6 @@
 """`refgs view`: a page that renders a run in the browser."""
 
+import contextlib
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -32,11 +33,7 @@ class View:
         require_package("viser", "view", "view")
         page = serve(Run(self.run_folder), (self.host, self.port), self.output, self.data)
         say(f"open {page.url} in a browser; Ctrl-C ends it")
-        try:
+        with contextlib.suppress(KeyboardInterrupt), contextlib.closing(page):
             page.loop.run()
-        except KeyboardInterrupt:
-            pass
-        finally:
-            page.close()
         shown = page.loop.delivered
         return Result({"url": page.url, "images": shown}, f"{shown} images displayed")

@@ -13,6 +13,7 @@ from typing import Any
 from mi_refgs import __version__
 from mi_refgs.errors import InputError, require_between
 from mi_refgs.evaluation.evaluate import read_metrics
+from mi_refgs.evaluation.scores import SCORES
 from mi_refgs.fitting.decide import differences
 from mi_refgs.io.files import read_json, write_json
 from mi_refgs.io.ownership import RUN, own_folder
@@ -183,8 +184,9 @@ def finished(job: Job) -> bool:
     if not run.exists() or not (saved := run.checkpoints()):
         return False
     metrics, last = read_metrics(run) or {}, run.method().iterations
-    evaluated = metrics.get("iterations") == last == int(saved[-1].stem)
-    return evaluated and metrics.get("dataset") == job.data
+    evaluated = metrics.get("iterations") == last == int(saved[-1].stem) and metrics.get("samples") == 1
+    same = Path(metrics.get("dataset", "")).resolve() == Path(job.data).resolve()  # either may be a link
+    return evaluated and same and {score.key for score in SCORES} <= metrics.keys()
 
 
 def jobs_in(folder: Path) -> list[Job]:

@@ -52,7 +52,8 @@ def examine(data: Dataset) -> list[Finding]:
             numbers = {k: float(f"{x:.3g}") if isinstance(x, float) else x for k, x in measured[0].items()}
             level, odd = LEVELS[measured[1]], [view.name for view in measured[2]]
             which = f"{len(odd)} of {len(data.views)} views, such as '{odd[0]}'," if odd else "all views"
-            what = sentence.format(which=which, **numbers) + "; --force fits them" * (level == REFUSED)
+            forced = "; `refgs train --force` fits them" if level == REFUSED else ""
+            what = sentence.format(which=which, **numbers) + forced
             error = InputError(what, data.source or data.path, name)
             found.append(Finding(name, level, numbers | {"views": odd, "result": level}, error))
     return found

@@ -5,7 +5,7 @@ boundaries between phases notify the clock of the phase that the pass has reache
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import cycle
 from typing import Any
 
@@ -87,16 +87,9 @@ class _Boundary(dr.CustomOp):
         self.set_grad_in("values", δvalues)
 
 
-@dataclass(frozen=True)
-class Phase:
-    phase: str
-    ms: float  # median over steps
-    launches: int  # kernels
-    share: float  # of the sum of `ms`
-
-
-def phases_of(step: Callable[[], Any], steps: int) -> list[Phase]:
-    """Measure PHASES of a step in order; barriers between them undo fusion, so the sum is longer."""
+def phases_of(step: Callable[[], Any], steps: int) -> list[dict[str, Any]]:
+    """Measure PHASES of a step in order: name, median `ms`, `launches` of kernels, `share` of all ms.
+    Barriers between them undo fusion, so the sum is longer."""
     clocks = [PhaseClock() for _ in range(WARM_UP + steps)]
     for clock in clocks:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory), listening(clock):
@@ -106,7 +99,8 @@ def phases_of(step: Callable[[], Any], steps: int) -> list[Phase]:
     named = [phase for phase in PHASES if any(phase in clock.seconds for clock in clocks)]
     ms = {name: 1e3 * float(np.median([clock.seconds[name] for clock in clocks])) for name in named}
     whole = max(sum(ms.values()), 1e-9)
-    return [Phase(name, ms[name], clocks[-1].launches[name], ms[name] / whole) for name in named]
+    launches = clocks[-1].launches
+    return [dict(phase=n, ms=ms[n], launches=launches[n], share=ms[n] / whole) for n in named]
 
 
 def stepper(trainer: Trainer, name: str) -> Callable[[], None]:

@@ -101,15 +101,20 @@ class Decision(Event[Trainer]):
         return Row(component, begin, bool(gained >= self.gain), reason, psnr, better)
 
 
-def waiting(trainer: Trainer) -> list[str]:
-    """The components that validation views are still to decide."""
-    decisions = [event for event in trainer.method.event.values() if isinstance(event, Decision)]
-    return [name for decision in decisions for name in decision.pending(trainer.fit.decisions)]
+def waiting(trainer: Trainer) -> dict[str, bool]:
+    """The components that are not decided, and whether the fit is long enough to decide them."""
+    decisions, last = trainer.method.event.values(), trainer.method.iterations
+    return {
+        name: decision.trial_of(name).after < last
+        for decision in decisions
+        if isinstance(decision, Decision)
+        for name in decision.pending(trainer.fit.decisions)
+    }
 
 
 def validates(trainer: Trainer) -> bool:
     """Whether there are such components, and views enough to hold some out."""
-    return len(trainer.whole.views) >= HOLDOUT and bool(waiting(trainer))
+    return len(trainer.whole.views) >= HOLDOUT and any(waiting(trainer).values())
 
 
 def hold_out(trainer: Trainer) -> None:

@@ -213,9 +213,12 @@ def begin(
     else:
         run.create(trainer.method, views.folder, views.region, digests(views))
         run.write_json("checks.json", {one.name: one.numbers for one in found})
-        if len(views.views) < HOLDOUT and (names := waiting(trainer)):
+        left = waiting(trainer)
+        if len(views.views) < HOLDOUT and left:
             few = f"{len(views.views)} views: too few to hold some out"
-            tell(f"{views.path}: {few}, so {' and '.join(names)} are not decided")
+            tell(f"{views.path}: {few}, so {' and '.join(left)} are not decided")
+        for name in (name for name, in_time in left.items() if not in_time):
+            warn(f"{name}: is not tried in {method.iterations} iterations; add more")
     return trainer
 
 

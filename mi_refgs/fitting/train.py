@@ -88,7 +88,7 @@ class Trainer:
 
     def take(self, other: "Trainer", method: Method) -> None:
         """Continue with the state of another fit of the same views, which may not go on, by this method."""
-        self.setup, self.fit = FitSetup(method, self.data), other.fit
+        self.setup, self.fit, self.targets = FitSetup(method, self.data), other.fit, other.targets
         self.health.checked = self.iteration
 
     @property
@@ -230,7 +230,10 @@ class Trainer:
         light = fit.prefilter.light(fit.light, shading)
         given = (light, fit.occluder, fit.surroundings, fit.near, fit.turntable)
         scene = SurfelScene(fit.surfels, shading, *given)
-        aovs = ("normal",) if any(loss.normals for loss in losses_in_use(weights)) else ()
+        used = losses_in_use(weights)
+        aovs = ["normal"] if any(loss.normals for loss in used) else []
+        if shading.shaded_at == "pixel":
+            aovs += (name for loss in used if loss.maps for name in loss.attributes)
         request = Request(aovs, sh_degree=setup.sh_degree(iteration), attribution=attribution)
         frame = render(scene, camera, request)
         gain = per_view.log_gain(fit.params, index)

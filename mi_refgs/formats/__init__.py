@@ -1,6 +1,6 @@
 """Formats that `refgs export --to` and `Reconstruction.export` write. Their code is imported when it runs."""
 
-from mi_refgs.formats.format import FORMATS, Format, Option, Shot, options_of, write
+from mi_refgs.formats.format import FORMATS, Format, Option, Shot as Shot, write as write
 
 _OBJECT = Option("object", False, "without background Gaussians; splat files have no environment")
 _DEGREE = Option("degree", 3, "SH degree of the colours of exported Gaussians, 0 to 3")
@@ -19,5 +19,3 @@ for _name, _summary, _suffix, _write, *_more in (
     ("exr", "one view with all its layers", ".exr", "exr_layers:write", (_VIEW, _SAMPLES, _OBJECT)),
 ):
     FORMATS.register(Format(_name, _summary, _suffix, _write, *_more))
-
-__all__ = ["FORMATS", "Format", "Option", "Shot", "options_of", "write"]

@@ -14,7 +14,7 @@ import trimesh
 from scipy import ndimage
 
 from mi_refgs.data.view import evenly_spread
-from mi_refgs.errors import SceneError, require_between, require_package
+from mi_refgs.errors import InputError, require_between, require_package
 from mi_refgs.formats.format import Shot
 from mi_refgs.io.progress import warn
 from mi_refgs.kernels.device import upload
@@ -71,11 +71,11 @@ def bake(trained: TrainedScene, shots: tuple[Shot, ...], faces: int, texture: in
     scene = relightable(trained)
     if scene.mesh is None or scene.light is None:
         remedy = "fit one with occlusion, as `--for relighting` does, or longer: no mesh was extracted"
-        raise SceneError("the run has none", "mesh", remedy=remedy)
+        raise InputError("the run has none", "mesh", remedy=remedy)
     model = scene.shading.model
     if model.textures(scene.surfels.values(scene.shading.required_attributes)) is None:
         remedy = "export `scene.xml`, or another model"
-        raise SceneError(f"{model.name} has no textures", "reflectance", remedy=remedy)
+        raise InputError(f"{model.name} has no textures", "reflectance", remedy=remedy)
     owner: Any = next(kind for kind in type(model).__mro__ if "textures" in vars(kind))
     if lost := {*scene.shading.required_attributes} - {*owner.required_attributes(model, scene.shading)}:
         warn(f"{', '.join(lost)}: not exported; `{model.name}` needs a method `textures` that uses it")
@@ -106,7 +106,7 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     """Smooth a mesh, reduce it to at most about `faces` triangles by edge collapse, and remove floaters."""
     if not len(mesh.faces):
         what = "the run has none that textures could be baked to"
-        raise SceneError(what, "mesh", remedy="train it for longer")
+        raise InputError(what, "mesh", remedy="train it for longer")
     low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0).max()
     made = trimesh.Trimesh((mesh.vertices - low) / size, mesh.faces, process=False)
     made.merge_vertices()  # a seam of texture coordinates would tear

@@ -50,8 +50,8 @@ class SurfelOptions:
     primitive: str = "surfel"  # what is splatted
     # Attributes beside the geometry of the primitive.
     attributes: tuple[str, ...] = ("radiance_sh", "albedo", "metallic", "roughness", "indirect_sh")
-    count: int = field(default=20_000, metadata=at_least(1))  # initial surfels
-    # Densification stops at this number, times `capacity`.
+    count: int = field(default=20_000, metadata=at_least(1))  # initial surfels, set by the preset or `--set`
+    # Densification stops at this number, times `capacity`; set by the preset or `--set`.
     max_count: int = field(default=40_000, metadata=at_least(1))
     # Factor of `max_count`; a decision that raises it fills the room at once.
     capacity: float = field(default=1.0, metadata=at_least(1))
@@ -95,7 +95,7 @@ class SurroundingsOptions:
     """The scene outside the region of interest: background Gaussians and an environment behind everything."""
 
     primitive: str = "gaussian"  # what is splatted: needs no normals, and a surfel is a flat Gaussian
-    count: int = field(default=20_000, metadata=at_least(1))  # initial surfels
+    count: int = field(default=20_000, metadata=at_least(1))  # initial surfels, set by the preset or `--set`
     # Densification stops where both together have as many as both may.
     max_count: int = field(default=40_000, metadata=at_least(1))
     degree: int = field(default=2, metadata=between(0, MAX_SH_DEGREE))  # of radiance_sh
@@ -134,12 +134,14 @@ class Stage:
 class Rates:
     """Adam learning rates, raw units per step; those of positions in scene extents."""
 
-    attribute: dict[str, float] = field(default_factory=dict)  # by name; else its own default
+    # By name; else its own default.
+    attribute: dict[str, float] = field(default_factory=dict, metadata=at_least(0))
     rest: dict[str, float] = field(default_factory=dict)  # factors for SH degrees above 0; else their own
-    light: float = 0.01  # texels of the environment map
+    light: float = field(default=0.01, metadata=at_least(0))  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
     diffuse_relative: bool = False  # SH of the diffuse colour: over 1 - metallic, by which it is displayed
-    decay: float = 1.0  # log-linear factor of all other rates at the last iteration
+    # Log-linear factor of all other rates at the last iteration.
+    decay: float = field(default=1.0, metadata=at_least(1e-9))
 
     def of(self, name: str) -> float:
         return self.attribute.get(name, attribute(name).rate)
@@ -237,10 +239,11 @@ class Method:
     loss: dict[str, LossWeight] = field(default_factory=LOSS_WEIGHTS.copy)  # by name
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
-    seed: int = 0  # of initial surfels, order of views and random draws
-    checkpoint_every: int = 1_000  # iterations; a kill loses at most so many
-    preview_every: int = 1_000  # iterations; the last one has a preview, too
-    log_every: int = 50  # iterations
+    seed: int = field(default=0, metadata=at_least(0))  # of initial surfels, order of views and random draws
+    # Iterations; a kill loses at most so many, and the last one has a preview, too.
+    checkpoint_every: int = field(default=1_000, metadata=at_least(1))
+    preview_every: int = field(default=1_000, metadata=at_least(1))
+    log_every: int = field(default=50, metadata=at_least(1))
     name: str = ""  # filled in by `load`, as the others below: the file's stem
     file: str = ""
     preset: str = ""

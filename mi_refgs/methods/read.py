@@ -15,6 +15,7 @@ from mi_refgs.constants import DEFAULT_PRESET
 from mi_refgs.errors import InputError, UnknownNameError, abbreviated, within
 from mi_refgs.io.files import is_file, resource_dir
 from mi_refgs.methods.build import build, plain, scaled, settings as keys_of
+from mi_refgs.methods.extensions import EVENTS
 from mi_refgs.methods.method import LOSS_WEIGHTS, About, Method
 from mi_refgs.registry import load_again, plugin_files
 from mi_refgs.shade.light.kind import LIGHTS
@@ -52,10 +53,15 @@ def preset_of(text: str) -> Preset:
     return Preset(iterations, max(round(START_FRACTION * surfels), 1), surfels, sys.maxsize)
 
 
-def load(name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | None = None) -> Method:
-    """Read a method by name or TOML path, scaled to a preset; `assignments`, key=value, apply unscaled.
-    Raises InputError that names the file and the key for anything unknown or of the wrong type."""
-    path, chosen = _find(name, "--method", Path()), preset_of(preset)
+def load(
+    name: str,
+    preset: str = DEFAULT_PRESET,
+    assignments: Sequence[str] | None = None,
+    folder: Path = Path(),
+) -> Method:
+    """Read a method by name or TOML path in `folder`, scaled to a preset; `assignments`, key=value, apply
+    unscaled. Raises InputError that names the file and the key for anything unknown or of the wrong type."""
+    path, chosen = _find(name, "--method", folder), preset_of(preset)
     method = _built(_extended(path, []), path)
     table = plain(scaled(method, chosen.iterations / method.iterations))
     for part in table.keys() & {"surfels", "surroundings"}:
@@ -243,6 +249,7 @@ def _assign(table: dict[str, Any], assignment: str) -> None:
         for name in [name for name in table if name not in known]:
             del table[name]
     if parents == ["event"] and value is False:
-        table.pop(last, None)
+        if table.pop(last, None) is None:
+            EVENTS.find(last, "--set: event")
     else:
         table[last] = _with_tables_of_losses({last: value})[last]

@@ -25,7 +25,6 @@ from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light import Light
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.attributes import ATTRIBUTES
-from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 
 CHECK_SECONDS = 1.0  # least time between checks for unusable values: each waits for the device
@@ -110,8 +109,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def check(self) -> None:
         """Raise InputError for shapes that do not fit and for attributes that are required but absent."""
-        Surfels(self.surfels.raw)  # checks shapes; values are checked where a file is read
-        primitive_of(self.surfels.raw)
+        _ = Surfels(self.surfels.raw).primitive  # shapes and names; values are checked where a file is read
         self.shading.require_inputs(self.surfels.raw, mesh=self.occluder is not None)
         for name in self.aovs.values():
             if name in ATTRIBUTES and not self.surfels.has(name):

@@ -103,6 +103,8 @@ def light_of(shading: Shading, own: EnvironmentLight | None, to_world: Any, scen
 def used_emitters(shading: Shading, scene: Any) -> list[Any]:
     """The scene's emitters that light surfels if the integrator has no light, the environment first."""
     directional = ["DirectionalEmitter"] if shading.model.light == "filtered" else []
+    if shading.model.light == "none":
+        return []
     found = [one for one in scene.emitters() if one.is_environment() or one.class_name() in directional]
     return sorted(found, key=lambda one: not one.is_environment())
 
@@ -111,7 +113,7 @@ def warn_of_ignored(scene: Any, used: list[Any]) -> None:
     """One warning that names the emitters that are not `used`, and one that names the scene's shapes."""
     unused = [emitter for emitter in scene.emitters() if not any(emitter is one for one in used)]
     for found, what, instead in (
-        (unused, "use the scene's emitters", "its light is `light`, or an environment"),
+        (unused, "use the scene's emitters", "its light is `light`, or an environment, if its model has one"),
         (scene.shapes(), "render the scene's shapes", "it renders surfels, which its `mesh` occludes"),
     ):
         if found:

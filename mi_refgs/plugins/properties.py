@@ -82,12 +82,10 @@ def read_background(props: Any) -> tuple[Surfels | None, Any]:
     value = get(props, "background", None)
     if isinstance(value, str):
         return around, EnvironmentLight.from_file(_path(props, "background") or "")
+    if getattr(value, "ndim", 0) == 3:
+        return around, EnvironmentLight(mi.TensorXf(value))
     try:
-        if getattr(value, "ndim", 0) == 3:
-            return around, EnvironmentLight(mi.TensorXf(value))
         return around, None if value is None else mi.Color3f(value)
-    except InputError:
-        raise
     except Exception as error:
         found = f"{abbreviated(value)} is no colour"
         raise InputError(found, "refgs", "background", "give an rgb value or a map") from error

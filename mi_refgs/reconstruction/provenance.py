@@ -68,7 +68,7 @@ class Provenance:
             try:
                 data = read_views(self.method, self.data, split, truth=False)
             except InputError as error:
-                if split == splits[-1] and not shots:
+                if len(splits) == 1:
                     raise
                 warnings.warn(f"{split} views are left out: {error}", RuntimeWarning, stacklevel=3)
                 continue
@@ -79,7 +79,7 @@ class Provenance:
                     mask = file.mask and replace(file.mask, path=relative(file.mask.path))
                     file = replace(file, path=relative(file.path), mask=mask)
                 shots.append(Shot(view.name, split, view.camera(), file))
-        return shots
+        return shots or replace(self, data=None).shots(trained, *splits)
 
     def first_camera(self, trained: TrainedScene) -> Camera:
         """Return the camera of the first view; without a data set, the first around the surfels."""

@@ -53,6 +53,9 @@ def import_relightable(
     method = str(methods.for_purpose(PURPOSE) if method is None else method)
     wanted = runner.load_method(method, preset)
     made = import_splats(path, linear=linear, box=box)
+    if made.trained.light is not None:
+        remedy = "import it without --relightable, and relight that"
+        raise InputError("it has materials already", path, "vertex", remedy)
     chosen = [(split, enumerate(held_out(cameras or (), split))) for split in VIEWS]
     given = [Shot(f"{split}/r_{i:03d}", split, camera) for split, some in chosen for i, camera in some]
     views, owner = run.path / DATA, f"import of {path.resolve()}"

@@ -10,7 +10,6 @@ Both use the same splatter and the same `shade`; only deferred shading lets norm
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import drjit as dr
@@ -34,8 +33,6 @@ from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Color3f, Float, Point3f, TensorXf, Vector3f
-
-NO_TURNS: Mapping[str, Vector3f] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -165,9 +162,7 @@ class _View:
     def asked(self) -> frozenset[str]:
         return frozenset(self.request.aovs)
 
-    def blend(
-        self, slots: dict[str, Any], others: dict[str, Any], turns: Mapping[str, Vector3f] = NO_TURNS
-    ) -> GBuffer:
+    def blend(self, slots: dict[str, Any], others: dict[str, Any], turns: Mapping[str, Vector3f]) -> GBuffer:
         """Blend slots of the object's surfels together with those of the surroundings, in one sort; the first
         slot varies over a surfel by its `turns`."""
         few, place = len(features(slots)), None  # features that all surfels have; place of the attribution
@@ -227,7 +222,7 @@ def _shade_at_surfels(view: _View) -> Frame:
     slots |= asked_terms | materials
     if asked - {"depth"}:  # normals, terms and maps are those of the object: they need its opacity
         slots |= view.presence
-    buffer = view.blend(slots, view.others)
+    buffer = view.blend(slots, view.others, {})
 
     # Frame.
     blended = buffer.slots

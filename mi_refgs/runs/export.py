@@ -3,7 +3,7 @@ training seconds of these files, their names, and the shading options."""
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.io.files import BusyError, make_folder, read_json, write_json
 from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import Method
-from mi_refgs.occlusion.mesh import read_mesh, write_mesh
+from mi_refgs.occlusion.mesh import write_mesh
 from mi_refgs.render.scene_xml import write_scene_xml
 from mi_refgs.runs import trained_scene as names
 from mi_refgs.runs.run import Run
@@ -78,12 +78,8 @@ def fresh(run: Run, method: Method) -> TrainedScene | None:
 
 
 def newest(run: Run, method: Method) -> TrainedScene:
-    """The scene, with any mesh, of the newest checkpoint or newer artefacts; raises as
-    `TrainedScene.read`."""
-    if (newer := fresh(run, method)) is not None:
-        return newer
-    scene, mesh = TrainedScene.read(run.path, method.plugins), run.path / names.MESH
-    return replace(scene, mesh=read_mesh(mesh)) if scene.mesh is None and mesh.is_file() else scene
+    """The scene of the newest checkpoint or newer artefacts; raises as `TrainedScene.read`."""
+    return fresh(run, method) or TrainedScene.read(run.path, method.plugins)
 
 
 def write_if_stale(run: Run, method: Method, camera: Callable[[TrainedScene], Camera]) -> TrainedScene:

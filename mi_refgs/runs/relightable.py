@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mi_refgs.errors import SceneError
+from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.visibility import Occluder
@@ -44,9 +44,9 @@ def lacking(scene: TrainedScene) -> str:
 def relightable(scene: TrainedScene) -> TrainedScene:
     """Reduce a scene to attributes without light (`albedo_from_radiance` for an SH colour of `split_sum`):
     radiance, indirect and background go; interreflection is traced if there is a mesh; the light stays,
-    infinitely far. Raises SceneError for a scene without light, or whose model has no such attributes."""
+    infinitely far. Raises InputError for a scene without light, or whose model has no such attributes."""
     if why := lacking(scene):
-        raise SceneError(why, remedy="fit one with materials and a light, as `--for relighting` does")
+        raise InputError(why, remedy="fit one with materials and a light, as `--for relighting` does")
     shading = scene.shading.relit(scene.mesh is not None)
     assert scene.light is not None and shading is not None  # by `lacking`
     surfels, mesh = scene.surfels.detach(), scene.mesh

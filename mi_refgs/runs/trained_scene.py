@@ -113,7 +113,7 @@ class TrainedScene:
         fitted = TrainedScene(
             read_ply(folder / SURFELS),
             None if light is None else EnvironmentLight.from_file(light),
-            read_mesh(folder / MESH) if shading.occlusion else None,
+            read_mesh(folder / MESH) if shading.occlusion or (folder / MESH).is_file() else None,
             shading,
             iteration,
             seconds,

@@ -99,8 +99,7 @@ class Surfels:
         return primitive_of(self.raw)
 
     def validate(self) -> None:
-        """Raise InputError if a shape is wrong, an attribute missing, or a value not finite."""
-        self._check_shapes()
+        """Raise InputError if an attribute is missing, or a value not finite."""
         primitive_of(self.raw)  # raises
         for name, tensor in self.raw.items():
             bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0

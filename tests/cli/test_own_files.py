@@ -10,7 +10,7 @@ import pytest
 import mi_refgs
 from mi_refgs.cli import main
 from mi_refgs.errors import InputError
-from mi_refgs.formats import FORMATS, options_of
+from mi_refgs.formats.format import FORMATS, options_of
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.ownership import MARK, RUN_FILES, own_folder, owner_of
 from mi_refgs.reconstruction.new_light import NewLight

@@ -111,8 +111,12 @@ def test_job_is_finished_with_metrics_of_last_checkpoint(compared: Path, tmp_pat
     job = Job(**(json.loads((folder / "job.json").read_text()) | {"folder": str(folder)}))
     assert jobs.finished(job)
     metrics = json.loads((folder / "metrics.json").read_text())
-    changed = [json.dumps(metrics | change) for change in ({"iterations": 3}, {"dataset": str(tmp_path)})]
-    for text in (*changed, "{"):
+    (tmp_path / "link").symlink_to(job.data)
+    (folder / "metrics.json").write_text(json.dumps(metrics | {"dataset": str(tmp_path / "link")}))
+    assert jobs.finished(job)
+    changes: tuple[dict[str, object], ...] = ({"iterations": 3}, {"dataset": "elsewhere"}, {"samples": 9})
+    older = {name: value for name, value in metrics.items() if name != "ssim"}  # of another version
+    for text in (*(json.dumps(metrics | change) for change in changes), json.dumps(older), "{"):
         (folder / "metrics.json").write_text(text)
         assert not jobs.finished(job)
     (folder / "metrics.json").write_text(json.dumps(metrics))

@@ -138,6 +138,7 @@ def test_evaluate_scores_a_wrong_run(data: Path, tmp_path: Path) -> None:
 def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path) -> None:
     """Every key stays; the maps and the surface of the data set are gone here."""
     run = write_known_run(data, tmp_path / "run", occlusion=False)
+    (run.path / "mesh.ply").unlink()
     bare = tmp_path / "bare"
     (bare / "test").mkdir(parents=True)
     content = json.loads((data / "transforms_test.json").read_text())

@@ -1,6 +1,7 @@
 """`refgs profile`: time is booked where it is spent, and nothing is changed."""
 
 import json
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from mi_refgs.kernels import timing
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.splat import Composited, Footprints
+from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS
 
 PAUSE = 0.25
@@ -51,11 +53,11 @@ def test_time_is_of_innermost_phase(place: str, trainer: Trainer, monkeypatch: p
     """Each is inside `rest`."""
     monkeypatch.setattr(phases, "WARM_UP", 1)
     monkeypatch.setattr(phases, "PhaseClock", lambda: SleepyClock(place))
-    found = {row.phase: row for row in phases.phases_of(phases.stepper(trainer, "deferred"), 2)}
-    assert found[place].ms > 1e3 * PAUSE
-    assert max(row.ms for row in found.values() if row.phase != place) < 1e3 * PAUSE
-    assert sum(row.share for row in found.values()) == pytest.approx(1)
-    assert found["splat forward"].launches > 0 and set(found) == {*phases.PHASES}
+    found = {row["phase"]: row for row in phases.phases_of(phases.stepper(trainer, "deferred"), 2)}
+    assert found[place]["ms"] > 1e3 * PAUSE
+    assert max(row["ms"] for row in found.values() if row["phase"] != place) < 1e3 * PAUSE
+    assert sum(row["share"] for row in found.values()) == pytest.approx(1)
+    assert found["splat forward"]["launches"] > 0 and set(found) == {*phases.PHASES}
 
 
 class Notes:
@@ -104,3 +106,8 @@ def test_command_prints_a_table(finished: Path, capsys: pytest.CaptureFixture[st
     assert {"project", "splat forward", "optimiser"} <= {row["phase"] for row in rows}
     assert all(row["ms"] >= 0 and row["launches"] >= 0 and 0 <= row["share"] <= 1 for row in rows)
     assert {file: file.stat().st_mtime_ns for file in finished.rglob("*")} == before
+
+
+def test_what_was_not_fitted_has_no_step(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run", ignore=shutil.ignore_patterns("checkpoints"))
+    refused(["profile", tmp_path / "run"], "run: checkpoints: none; measure the run that was fitted")

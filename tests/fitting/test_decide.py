@@ -130,6 +130,31 @@ def test_components_stay_by_their_gain_alone(
     assert written == trainer.method and written.name == method.name
 
 
+def test_images_are_those_of_the_method_that_was_chosen(
+    file: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The chosen one has no coarse images, and names its file as it is beside the method's."""
+    text = Path(file).read_text().replace(f"{tmp_path}/", "")
+    Path(file).write_text(f"{text}[data]\ncoarse = [{{ until = 2_000, block = 2 }}]\n")
+    judged(monkeypatch, 0.01, 0.0)
+    method = methods.load(file, "quick", SETTINGS)
+    trainer, same = begin(method, views, Run(tmp_path / "run")), list[bool]()
+    trainer.train(lambda one: same.append(one.targets.options == one.method.data))
+    assert method.data.coarse and not trainer.method.data.coarse and same == [True] * 8
+
+
+def test_what_comes_too_late_holds_no_views_out(
+    file: str, views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged(monkeypatch, -0.2)
+    warn, run = Mock(), Run(tmp_path / "run")
+    trainer = begin(methods.load(file, "quick", [*SETTINGS, "iterations=5"]), views, run, warn=warn)
+    trainer.train()
+    assert summary(trainer) == [("colour_alone", 2, False)] and len(trainer.data.views) == 9
+    told = [call.args[0].partition(":")[0] for call in warn.mock_calls]
+    assert told[-2:] == ["surfels_2x", "surfels_4x"]
+
+
 @pytest.mark.parametrize("given", [{"data": {"downscale": 2}}, [" data.downscale=2"], ["data={downscale=2}"]])
 def test_settings_of_images_are_those_of_the_first_read(given: Settings, tmp_path: Path) -> None:
     method, views = chosen(write_data(tmp_path / "ball", truth=False), Choice(None, "20:60", given))

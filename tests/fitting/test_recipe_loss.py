@@ -58,6 +58,18 @@ def test_registered_loss_is_weighed_by_method_file(data: Path, method: Path) -> 
     assert without < early < weighed
 
 
+def test_loss_sees_attributes_that_the_model_does_not_shade(data: Path, method: Path) -> None:
+    seen = list[bool]()
+
+    def sure(inputs: mi_refgs.LossInputs) -> None:
+        seen.append("confidence" in inputs.frame.maps)
+
+    with registered("sure", sure, maps=True, attributes=("confidence",)):
+        names = ["radiance_sh", "albedo", "metallic", "roughness", "indirect_sh", "confidence"]
+        step_to(trainer_of(data, method, "loss.sure=1.0", f"surfels.attributes={names}"), 3)
+    assert seen == [False, True, True]  # forward, then deferred shading
+
+
 def test_photometric_loss_is_replaced_or_required(data: Path, method: Path) -> None:
     """L1 and SSIM are losses like others: without them a step lowers what is left."""
 

@@ -190,6 +190,7 @@ def test_assignments_are_applied_unscaled() -> None:
     assert isinstance(mesh, ExtractMesh) and isinstance(densify, Densify)
     assert (method.loss["ssim"].weight, mesh.resolution, densify.when.until) == (0.3, 64, 7)
     assert "mesh" not in methods.load("ref_gaussian", "quick", ["event.mesh=false"]).event
+    methods.load("ref_gaussian", "quick", ["event.cameras=false"])  # it has none
 
 
 STAGE = "iterations = 10\n[stage.a]\nuntil = 10\n"
@@ -258,6 +259,16 @@ def test_a_purpose_is_one_files_own(tmp_path: Path) -> None:
         ("surfels.attributes=['metallic', 'roughness']", "albedo"),
         ("loss.normal.rise=-5", r"loss\.normal\.rise: -5 is out of range; give 0 or more"),
         ("losses.ssim=1", "--set: unknown key 'losses'"),
+        ("event.densfy=false", "--set: event: 'densfy' is unknown; did you mean densify"),
+        ("seed=-1", "seed: -1 is out of range"),
+        ("log_every=0", "log_every: 0 is out of range; give 1 or more"),
+        ("preview_every=0", "preview_every: 0"),
+        ("checkpoint_every=0", "checkpoint_every: 0"),
+        ("rates.light=-1.0", r"rates\.light: -1"),
+        ("rates.decay=0.0", r"rates\.decay: 0"),
+        ("rates.attribute.position=-1.0", r"rates\.attribute: -1"),
+        ("light.radiance=-3.0", r"light\.radiance: -3"),
+        ("light={kind='constant', radiance=0.0}", r"light\.radiance: 0"),
         ("loss", "--set: loss: expected key=value"),
         ("iterations.x=1", "--set: iterations.x: 'iterations' is not a table"),
         ("surroundings.count=0", r"surroundings\.count: .*; give"),

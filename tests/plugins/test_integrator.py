@@ -63,6 +63,13 @@ def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
     assert "Disk 'floor', Rectangle 'lamp'" in shapes
     refused(lambda: scenes.image(lit(spot={"type": "spot"})), "refgs takes none of SpotLight 'spot'")
 
+    unlit = scenes.lit_scene(sky, reflectance="radiance")
+    with pytest.warns(RuntimeWarning, match="emitters .*'sky'.*if its model has one"):
+        scenes.image(unlit)
+    params = mi.traverse(unlit)
+    dr.enable_grad(params["sky.radiance.value"])
+    refused(lambda: dr.backward(mi.render(unlit, params)), "sky.radiance.value", "has no derivative")
+
 
 def test_the_lobe_of_a_directional_light_is_normalised() -> None:
     w = np.linspace(0, np.pi, 100_001)[1:]

@@ -19,6 +19,7 @@ from mi_refgs.io.exr import read_exr_image
 from mi_refgs.methods.read import load_resolved
 from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.runs.run import CAMERAS, Run
+from mi_refgs.shade.shading import Shading
 from tests.helpers import refused
 from tests.scenes.integrator import sky
 from tests.scenes.known import SIZE, with_background
@@ -96,6 +97,21 @@ def test_cameras_without_data_set_surround_the_object(balls: Reconstruction, tmp
     spread = np.ptp([camera.pose()[:3, 3] for camera in lost.turntable(4)], axis=0)
     assert spread[2] < 1e-6 and spread[0] > 1
     refused(lost.views, "gone is gone; use cameras")
+    (tmp_path / "gone").mkdir()  # there again, but empty
+    with pytest.warns(RuntimeWarning, match="views are left out: .*no layout"):
+        lost.edit(set=["roughness=0.5"]).save(tmp_path / "edited")
+    assert Camera.from_sensor(mi.load_file(str(tmp_path / "edited" / "scene.xml")).sensors()[0]).width == 512
+
+
+def test_a_saved_mesh_occludes_what_is_relit(balls: Reconstruction, tmp_path: Path) -> None:
+    """Also of a run whose own shading traces nothing."""
+    shading = Shading("pixel", "split_sum").untraced()
+    plain = balls.changed(replace(balls.trained, shading=shading))
+    loaded = mi_refgs.load(plain.save(tmp_path / "run").folder or Path())
+    assert loaded.trained.mesh is not None
+    relit = [one.relight(sky()) for one in (plain, loaded)]
+    assert all(one.trained.shading.occlusion for one in relit)
+    np.testing.assert_allclose(relit[1].render(0), relit[0].render(0), atol=1e-4)
 
 
 def test_training_cameras_are_those_that_the_fit_corrected(balls: Reconstruction, tmp_path: Path) -> None:

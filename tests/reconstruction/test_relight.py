@@ -176,7 +176,9 @@ def test_relight_warns_of_fitted_diffuse_colour(known: Path, tmp_path: Path) -> 
     assert not (folder / "sheet.png").exists()  # nor are the scores of test views replaced
     turned = relight(run, NewLight(known / "dusk.exr", rotate=90, exposure=-1), turntable=1)
     assert Path(turned["output"]) == tmp_path / "run/relight/dusk_r90_e-1"
-    # Fewer frames leave none of the old ones behind.
+    # Bad input leaves them; fewer frames leave none of the old ones behind.
+    refused(lambda: relight(run, NewLight(known / "dusk.exr"), turntable=1, samples=0), "samples")
+    assert (folder / "turntable/t_001.png").is_file()
     relight(run, NewLight(known / "dusk.exr"), turntable=1)
     assert [frame.name for frame in (folder / "turntable").glob("t_*.png")] == ["t_000.png"]
 
@@ -186,6 +188,8 @@ def test_relight_refuses_bad_input(known: Path, tmp_path: Path) -> None:
     refused(lambda: relight(run, light, known / "run"), "belongs to a run")
     refused(lambda: relight(run, light, known / "data"), "has other files")
     refused(lambda: relight(run, light, turntable=-1), "turntable: -1 is out of range")
+    turned = NewLight(known / "data" / "environment.exr")
+    refused(lambda: relight(run, turned, tmp_path / "out", turntable=1), "world directions", "add --world")
     refused(lambda: NewLight(light.path, rotate=float("nan")), "light: rotation: nan is no angle")
     bare = Run(shutil.copytree(run.path, tmp_path / "bare"))
     changes: dict[str, Any] = {"light": None, "mesh": None, "shading": Shading("surfel", "radiance")}

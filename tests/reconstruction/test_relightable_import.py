@@ -147,6 +147,10 @@ def test_scene_all_around_is_refused(ball: Path, tmp_path: Path) -> None:
     columns, hidden = ball_columns(), tmp_path / "hidden.ply"
     hidden.write_bytes(ply_bytes(columns | {"opacity": columns["opacity"] - 13}))
     refused(["import", hidden, *argv[2:]], hidden, "views of the surfels show nothing")
+    names = "refl_strength", "roughness", *(f"ori_color_{i}" for i in range(3))
+    known = tmp_path / "known.ply"
+    known.write_bytes(ply_bytes(columns | {name: np.zeros_like(columns["x"]) for name in names}))
+    refused(["import", known, *argv[2:]], "it has materials already", "without --relightable")
     assert not (tmp_path / "run").exists()
 
 

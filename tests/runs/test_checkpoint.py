@@ -84,6 +84,13 @@ def test_resume_goes_on_from_checkpoint_before_and_says_so(
     assert Run(run).checkpoints() == [before, newest]
 
 
+def test_export_keeps_the_fit_whose_checkpoint_is_damaged(run: Path) -> None:
+    before = [(run / name).read_bytes() for name in ("surfels.ply", "model.json")]
+    damage(Run(run).checkpoints()[-1], "half")
+    assert main(["export", str(run)]) == 0
+    assert [(run / name).read_bytes() for name in ("surfels.ply", "model.json")] == before
+
+
 def test_no_fit_begins_anew_over_damaged_checkpoints(run: Path, data: Path) -> None:
     for path in Run(run).checkpoints():
         damage(path, "half")

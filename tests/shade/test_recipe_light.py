@@ -15,8 +15,8 @@ from mi_refgs.cli import main
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.runs.run import Run
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.light import LIGHTS, FittedLight, LightKind
 from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.kind import LIGHTS, FittedLight, LightKind
 from mi_refgs.shade.points import safe_normalize
 from tests.helpers import unit, vector
 from tests.scenes.tiny import train_command, write_data, write_method

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 from mi_refgs import methods
@@ -32,10 +33,11 @@ class ColourAlone(Decision, Trial):
         if method.light is not None and (method.light.turntable or method.light.name != "learnt"):
             raise InputError("it is given", field="light")
         preset = method.preset or f"{method.iterations}:{method.surfels.max_count}"
-        plain = methods.plain(methods.load(self.method, preset))
+        here = Path(method.file).parent  # of a method file that names another one
+        plain = methods.plain(methods.load(self.method, preset, folder=here))
         keys = [(text, text.partition("=")[0].strip().split(".")) for text in method.assignments]
         fitting = [text for text, (*tables, _) in keys if table_at(plain, tables) is not None]
-        other = methods.load(self.method, preset, fitting)
+        other = methods.load(self.method, preset, fitting, here)
         kept = "iterations seed checkpoint_every preview_every log_every about name file preset assignments"
         own = {name: getattr(method, name) for name in kept.split()}
         data = replace(other.data, downscale=method.data.downscale, images=method.data.images)

@@ -1,6 +1,6 @@
 """A light that is the same from everywhere, and whose colour a fit learns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import drjit as dr
@@ -9,7 +9,7 @@ import numpy as np
 
 from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.shade.light.envmap import bounded, nearest_raw, softplus
-from mi_refgs.shade.light.kind import FittedLight, LightKind
+from mi_refgs.shade.light.kind import RADIANCE, FittedLight, LightKind
 from mi_refgs.types import Color3f, Float, TensorXf, Vector3f
 
 
@@ -37,7 +37,7 @@ class LearntColour(FittedLight):
 class Constant(LightKind):
     """The same light from everywhere, of one colour."""
 
-    radiance: float = 0.5  # initial
+    radiance: float = field(default=0.5, metadata=RADIANCE)  # initial
 
     name: ClassVar[str] = "constant"
 

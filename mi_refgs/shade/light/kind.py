@@ -7,6 +7,8 @@ from mi_refgs.registry import Registry
 from mi_refgs.shade.light.envmap import EnvironmentLight, FittedLight
 from mi_refgs.types import TensorXf
 
+RADIANCE = {"allowed": (lambda value: 1e-4 <= value <= 1e6, "a number from 0.0001 to 1e+06")}  # initial
+
 
 @dataclass(frozen=True)
 class LightKind:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mi_refgs.errors import InputError
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight, is_height
-from mi_refgs.shade.light.kind import LightKind
+from mi_refgs.shade.light.kind import RADIANCE, LightKind
 from mi_refgs.shade.light.latlong import OVERSAMPLING, Z_UP, environment_image
 from mi_refgs.shade.light.light_file import read_radiance
 from mi_refgs.types import TensorXf
@@ -48,7 +48,7 @@ class Map(LightKind):
 class Learnt(Map):
     """An environment map, each of whose texels is learnt."""
 
-    radiance: float = 0.5  # initial, everywhere
+    radiance: float = field(default=0.5, metadata=RADIANCE)  # initial, everywhere
 
     name: ClassVar[str] = "learnt"
 
