@@ -48,7 +48,21 @@ class Compare:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
             require_between(workers, "--workers", 1, 4 * cores)
             share = None if workers == 1 else max(cores // workers, 1)
-            planned = self._plan(workers, self.common.threads or share)
+            # The jobs, checked and written into their run folders.
+            methods = separated(self.methods)
+            if not methods:
+                raise InputError("none given", "--methods", remedy=f"name some of {METHODS}")
+            try:
+                seeds = [int(seed) for seed in separated(self.seeds) or ["0"]]
+            except ValueError as error:
+                what = f"{' '.join(self.seeds)}: not integers"
+                raise InputError(what, "--seeds", remedy="write them as 0 1") from error
+            plugins = tuple(str(file.absolute()) for file in self.common.plugin)
+            settings = self.preset or DEFAULT_PRESET, sum(self.set, ()), self.common.mitsuba_variant
+            shared = jobs.Shared(*settings, self.common.threads or share, plugins)
+            planned = jobs.plan(self.output, self.data, methods, seeds, shared)
+            jobs.begin(self.output, planned, workers, sys.argv[1:])
+            # Those that are not done.
             wanted = [job for job in planned if not jobs.finished(job)]
             say(f"{self.output}: {len(wanted)} of {len(planned)} jobs to do, {workers} at once")
             begin, numbers = time.perf_counter(), itertools.count(1)
@@ -73,22 +87,3 @@ class Compare:
         files = ", ".join(str(self.output / name) for name in (TABLE_TEXT, TABLE))
         text = f"{markdown(table)}\n{files}"
         return Result(dataclasses.asdict(table), text, 0 if table.complete else 3)
-
-    def _plan(self, workers: int, threads: int | None) -> list["Job"]:
-        """Return the checked jobs, after writing them into their run folders."""
-        from mi_refgs.compare import jobs
-
-        methods = separated(self.methods)
-        if not methods:
-            raise InputError("none given", "--methods", remedy=f"name some of {METHODS}")
-        try:
-            seeds = [int(seed) for seed in separated(self.seeds) or ["0"]]
-        except ValueError as error:
-            what = f"{' '.join(self.seeds)}: not integers"
-            raise InputError(what, "--seeds", remedy="write them as 0 1") from error
-        preset, settings = self.preset or DEFAULT_PRESET, sum(self.set, ())
-        plugins = tuple(str(file.absolute()) for file in self.common.plugin)
-        shared = jobs.Shared(preset, settings, self.common.mitsuba_variant, threads, plugins)
-        planned = jobs.plan(self.output, self.data, methods, seeds, shared)
-        jobs.begin(self.output, planned, workers, sys.argv[1:])
-        return planned

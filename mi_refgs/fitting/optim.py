@@ -85,7 +85,9 @@ class Skips:
                 skip |= ~dr.isfinite(loss)
             dr.scatter(self._skipped, number, place, skip)  # almost never active, so it costs nothing
         dr.eval(self._skipped, self.marks)
-        return dr.gather(mi.UInt32, self._skipped, place) != number
+        good = dr.gather(mi.UInt32, self._skipped, place) != number
+        dr.eval(good)  # once, not for each entry of each tensor
+        return good
 
     def report(self) -> Skipped:
         """The steps that were skipped since the last call; waits for the device."""

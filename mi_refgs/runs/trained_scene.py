@@ -19,15 +19,7 @@ from mi_refgs.registry import load_again
 from mi_refgs.render.passes import in_passes
 from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
 from mi_refgs.render.surroundings import Surroundings
-from mi_refgs.runs.checkpoint import (
-    PARAMS,
-    PHOTOGRAPHED,
-    channels_of,
-    light_of,
-    part,
-    surroundings_of,
-    tensors,
-)
+from mi_refgs.runs import checkpoint
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.near_field import NearField
@@ -61,19 +53,20 @@ class TrainedScene:
     @staticmethod
     def from_state(method: Method, state: Mapping[str, np.ndarray]) -> "TrainedScene":
         """The scene of a checkpoint."""
-        params, iteration, mesh = tensors(state, PARAMS), int(state["iteration"]), None
+        params, iteration, mesh = checkpoint.tensors(state, checkpoint.PARAMS), int(state["iteration"]), None
         if len(state.get("mesh/faces", ())):
             mesh = Mesh(state["mesh/vertices"], state["mesh/faces"], float(state["mesh/voxel"]))
         _, stage = method.stage_at(max(iteration, 1))
-        light, near = light_of(method.light, params), part(state, PHOTOGRAPHED)
+        light = checkpoint.light_of(method.light, params)
+        near = checkpoint.part(state, checkpoint.PHOTOGRAPHED)
         return TrainedScene(
-            Surfels(channels_of(params)),
+            Surfels(checkpoint.channels_of(params)),
             None if light is None else light.environment(),
             mesh,
             Shading.resolve(stage.shading, mesh is not None).antialiased(),
             iteration,
             float(state["seconds"]),
-            surroundings=surroundings_of(params),
+            surroundings=checkpoint.surroundings_of(params),
             near=NearField(near["centre"], near["nearness"]) if near else None,
             turntable=params.get(TURNTABLE),
         )

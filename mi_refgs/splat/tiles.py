@@ -1,8 +1,9 @@
 """Lists of the surfels that each tile may show, nearest first."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -66,19 +67,23 @@ def list_by_tile(
         corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(*camera.tile_offset)
         # Between the centres of the outermost pixels.
         touches = primitive.overlaps(row, corner + 0.5, corner + (tile_size - 0.5))
-        tile = mi.UInt32(tile_y * camera.tiles[0] + tile_x)
+        pairs = _join(mi.UInt32(tile_y * camera.tiles[0] + tile_x), surfel)
         depth = primitive.depth_near(row, corner + tile_size / 2)
-        dr.eval(found, touches, tile, surfel, depth)
-        kept = dr.compress(touches)
-        count += dr.width(kept)
+        # Scattered to where it belongs: to gather by `dr.compress` takes four times as long.
+        place = dr.prefix_reduce(dr.ReduceOp.Add, dr.select(touches, mi.UInt32(1), 0), exclusive=False)
+        dr.eval(touches, pairs, depth, place)
+        kept = int(place[-1])
+        count += kept
         if count > 1 << MAX_PAIR_BITS:
             size = f"{tiles:,} tiles of {camera.width} × {camera.height} pixels"
             remedy = "render fewer pixels, or remove the largest surfels"
             what = f"more than {1 << MAX_PAIR_BITS:,} surfels on the {size}"
             raise InputError(what, "splat", "surfels", remedy)
-        if dr.width(kept):
-            pairs = _join(*(dr.gather(mi.UInt32, x, kept) for x in (tile, surfel)))
-            found.append((pairs, dr.gather(mi.Float, depth, kept)))
+        if kept:
+            found.append((dr.empty(mi.UInt64, kept), dr.empty(mi.Float, kept)))
+            for part, values in zip(found[-1], (pairs, depth), strict=True):
+                dr.scatter(part, values, place - 1, touches, mode=dr.ReduceMode.NoConflicts)
+            dr.eval(found[-1])
     if not found:
         none = dr.zeros(mi.UInt32, tiles)
         return TileLists(camera, primitive, rows, mi.UInt32(), none, none, turned)
@@ -182,9 +187,15 @@ def _part(
     surfel = dr.zeros(mi.UInt32, pairs)
     dr.scatter(surfel, dr.arange(mi.UInt32, dr.width(count)), start, inside)
     surfel = dr.prefix_reduce(dr.ReduceOp.Max, surfel, exclusive=False)
-    place = dr.arange(mi.UInt32, pairs) - dr.gather(mi.UInt32, start, surfel)
-    span = dr.gather(mi.UInt32, span, surfel)
+    # In one access for each surfel: four gathers take ten times as long.
+    packed = PackedRows.pack(_bits(mi.Float, (start, span, *first)), 4)
+    start, span, left, top = _bits(mi.UInt32, packed.fetch(surfel))
+    place = dr.arange(mi.UInt32, pairs) - start
     # Exact below four million tiles, and in one instruction; integers are divided lane by lane.
     row = mi.UInt32((mi.Float(place) + 0.5) / mi.Float(span))
-    tile_x = mi.UInt32(dr.gather(mi.Int32, first[0], surfel)) + place - row * span
-    return surfel, tile_x, mi.UInt32(dr.gather(mi.Int32, first[1], surfel)) + row
+    return surfel, left + place - row * span, top + row
+
+
+def _bits(kind: type[Any], values: Iterable[Any]) -> list[Any]:
+    """The same bits as numbers of another type."""
+    return [dr.reinterpret_array(kind, value) for value in values]

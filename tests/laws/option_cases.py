@@ -78,7 +78,9 @@ RULES = [
          "shading: [a-z_]+: needs reflectance = "),
     Rule(("emitter", "map"), lambda emitter, map_: emitter == "tensor" and map_ == "9 x 14",
          "EnvironmentLight: raw: shape"),
-    # What no input can say: an emitter's rotation, tensors in a file, options that runs do not have.
+    # What no input can say: an emitter of a model without light, which warns; an emitter's rotation, tensors
+    # in a file, options that runs do not have.
+    Rule(("emitter", "shading"), lambda emitter, model: emitter == "scene" and _model(model).light == "none"),
     Rule(("emitter", "rotated"), lambda emitter, rotated: emitter == "tensor" and rotated),
     Rule(("map", "rotated"), lambda map_, rotated: map_ == "constant" and rotated),
     Rule(("input", "emitter"), lambda input_, emitter: input_ == "xml" and emitter == "tensor"),
