@@ -62,7 +62,6 @@ class Compare:
             shared = jobs.Shared(*settings, self.common.threads or share, plugins)
             planned = jobs.plan(self.output, self.data, methods, seeds, shared)
             jobs.begin(self.output, planned, workers, sys.argv[1:])
-            # Those that are not done.
             wanted = [job for job in planned if not jobs.finished(job)]
             say(f"{self.output}: {len(wanted)} of {len(planned)} jobs to do, {workers} at once")
             begin, numbers = time.perf_counter(), itertools.count(1)

@@ -2,8 +2,10 @@
 Patches of each view are compared with its neighbours at a series of depths [Collins 1996]; a pixel becomes a
 point if the patches at its best depth look alike, and the best depths of other views agree with it."""
 
+import itertools
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,10 +65,10 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     away = abs(np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1))) - 12)  # off the preferred angle
     np.fill_diagonal(away, np.inf)
     nearest = np.argsort(away, kind="stable")[:, : min(NEIGHBOURS, len(small) - 1)].tolist()
-    swept = []
-    for i, near in enumerate(nearest):
-        others = [(small[j], grey[j]) for j in near]
-        swept.append(_Swept(small[i], near, *_sweep(small[i], grey[i], others, nearness)))
+    others = [[(small[j], grey[j]) for j in near] for near in nearest]
+    with ThreadPoolExecutor() as pool:
+        found = pool.map(_sweep, small, grey, others, itertools.repeat(nearness))
+        swept = [_Swept(view, near, *best) for view, near, best in zip(small, nearest, found, strict=True)]
     tolerance = 0.75 * float(nearness[0] - nearness[1])  # within which two depths agree
     # The pixels whose depth others confirm, and the rest.
     position, on, off = [], [], []
