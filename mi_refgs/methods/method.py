@@ -240,10 +240,10 @@ class Method:
     rates: Rates = Rates()
     data: DataOptions = DataOptions()
     seed: int = field(default=0, metadata=at_least(0))  # of initial surfels, order of views and random draws
-    # Iterations; a kill loses at most so many, and the last one has a preview, too.
-    checkpoint_every: int = field(default=1_000, metadata=at_least(1))
+    checkpoint_every: int = field(default=1_000, metadata=at_least(1))  # iterations; a kill loses so many
+    # Iterations; the last one has a preview, too.
     preview_every: int = field(default=1_000, metadata=at_least(1))
-    log_every: int = field(default=50, metadata=at_least(1))
+    log_every: int = field(default=50, metadata=at_least(1))  # iterations
     name: str = ""  # filled in by `load`, as the others below: the file's stem
     file: str = ""
     preset: str = ""

@@ -17,6 +17,7 @@ from mi_refgs.surfels.primitives.primitive import Footprints, Primitive
 from mi_refgs.types import Bool, Float, Int32, UInt32, UInt64
 
 MAX_PAIR_BITS = 27  # log₂ of the largest number of surfel-tile pairs: 40 bytes each, 5 GB in all
+DEPTH_BITS = 24  # of the depth by which surfels of a tile are sorted
 CHUNK = 1 << 25  # tiles in footprints' rectangles that are tested together: 20 bytes each, 0.7 GB
 
 
@@ -67,7 +68,7 @@ def list_by_tile(
         corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(*camera.tile_offset)
         # Between the centres of the outermost pixels.
         touches = primitive.overlaps(row, corner + 0.5, corner + (tile_size - 0.5))
-        pairs = _join(mi.UInt32(tile_y * camera.tiles[0] + tile_x), surfel)
+        pairs = mi.UInt64(tile_y * camera.tiles[0] + tile_x) << 32 | mi.UInt64(surfel)
         depth = primitive.depth_near(row, corner + tile_size / 2)
         # Scattered to where it belongs: to gather by `dr.compress` takes four times as long.
         place = dr.prefix_reduce(dr.ReduceOp.Add, dr.select(touches, mi.UInt32(1), 0), exclusive=False)
@@ -88,7 +89,7 @@ def list_by_tile(
         none = dr.zeros(mi.UInt32, tiles)
         return TileLists(camera, primitive, rows, mi.UInt32(), none, none, turned)
     pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
-    tile, surfel = _sorted(pairs, depth, tiles)
+    tile, surfel = _sorted(pairs, depth, rows.count, tiles)
     lists = TileLists(camera, primitive, rows, surfel, *_runs(tile, tiles), turned)
     if few is None or few[1] >= len(features):
         return lists
@@ -98,42 +99,27 @@ def list_by_tile(
 
 
 @phase("sort")
-def _sorted(pairs: UInt64, depth: Float, tiles: int) -> tuple[UInt32, UInt32]:
-    """Tiles and surfels of pairs (tile, surfel), sorted by tile, then by depth."""
-    nearest_first = _nearest_first(depth)
-    pairs = _sorted_by(dr.gather(mi.UInt64, pairs, nearest_first), 0, (tiles - 1).bit_length())
-    tile, surfel = mi.UInt32(pairs >> 32), _lower(pairs)
-    dr.eval(tile, surfel)
-    return tile, surfel
-
-
-def _nearest_first(depth: Float) -> UInt32:
-    """Indices that sort `depth` by a radix sort of 24 bits (`dr.argsort`: 32). Bits of positive floats are in
-    their order; the last digits drop if the largest is more than four times the smallest."""
+def _sorted(pairs: UInt64, depth: Float, surfels: int, tiles: int) -> tuple[UInt32, UInt32]:
+    """Tiles and surfels of pairs (tile, surfel), sorted by tile, then by depth: a stable radix sort of one
+    integer of both, in three passes. Bits of positive floats are in their order; the last digits drop if the
+    largest depth is more than four times the smallest."""
+    high = (tiles - 1).bit_length()
+    low = max((surfels - 1).bit_length(), 64 - DEPTH_BITS - high)  # the same for most numbers of surfels
+    middle = 64 - low - high
     key = dr.reinterpret_array(mi.UInt32, depth)
     dr.eval(key)
     least = dr.min(key)
-    key = (key - least) >> (8 - dr.minimum(dr.lzcnt(dr.max(key) - least), 8))
-    entries = _join(key, dr.arange(mi.UInt32, dr.width(key)))
-    for digit in range(2):
-        entries = _sorted_by(entries, 12 * digit, 12)
-    return _lower(entries)
-
-
-def _join(upper: UInt32, lower: UInt32) -> UInt64:
-    """Join two mi.UInt32 to one mi.UInt64, for half the random reads of two arrays."""
-    return mi.UInt64(upper) << 32 | mi.UInt64(lower)
-
-
-def _lower(joined: UInt64) -> UInt32:
-    return mi.UInt32(joined & 0xFFFFFFFF)
-
-
-def _sorted_by(joined: UInt64, shift: int, bits: int) -> UInt64:
-    """Sort by some bits of the upper half: one pass of a stable counting sort."""
-    digit = mi.UInt32(joined >> (32 + shift)) & ((1 << bits) - 1)
-    dr.eval(joined, digit)
-    return dr.gather(mi.UInt64, joined, dr.detail.block_mkperm(digit, dr.width(digit), 1 << bits))
+    spare = 32 - middle
+    key = (key - least) >> (spare - dr.minimum(dr.lzcnt(dr.max(key) - least), spare))
+    joined = (pairs >> 32 << middle | mi.UInt64(key)) << low | (pairs & 0xFFFFFFFF)
+    half = middle // 2
+    for shift, bits in ((low, half), (low + half, middle - half), (low + middle, high)):
+        digit = mi.UInt32(joined >> shift) & ((1 << bits) - 1)
+        dr.eval(joined, digit)
+        joined = dr.gather(mi.UInt64, joined, dr.detail.block_mkperm(digit, dr.width(digit), 1 << bits))
+    tile, surfel = mi.UInt32(joined >> (low + middle)), mi.UInt32(joined & ((1 << low) - 1))
+    dr.eval(tile, surfel)
+    return tile, surfel
 
 
 def _runs(tile: UInt32, tiles: int) -> tuple[UInt32, UInt32]:
