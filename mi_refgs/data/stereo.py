@@ -66,7 +66,7 @@ def stereo(views: Sequence[View], region: Region) -> Stereo | None:
     np.fill_diagonal(away, np.inf)
     nearest = np.argsort(away, kind="stable")[:, : min(NEIGHBOURS, len(small) - 1)].tolist()
     others = [[(small[j], grey[j]) for j in near] for near in nearest]
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(8) as pool:  # each takes 0.1 GB
         found = pool.map(_sweep, small, grey, others, itertools.repeat(nearness))
         swept = [_Swept(view, near, *best) for view, near, best in zip(small, nearest, found, strict=True)]
     tolerance = 0.75 * float(nearness[0] - nearness[1])  # within which two depths agree

@@ -113,7 +113,7 @@ def waiting(trainer: Trainer) -> dict[str, bool]:
 
 
 def validates(trainer: Trainer) -> bool:
-    """Whether there are such components, and views enough to hold some out."""
+    """Whether some of them can be decided: in time, and with views enough to hold some out."""
     return len(trainer.whole.views) >= HOLDOUT and any(waiting(trainer).values())
 
 

@@ -102,9 +102,9 @@ def light_of(shading: Shading, own: EnvironmentLight | None, to_world: Any, scen
 
 def used_emitters(shading: Shading, scene: Any) -> list[Any]:
     """The scene's emitters that light surfels if the integrator has no light, the environment first."""
-    directional = ["DirectionalEmitter"] if shading.model.light == "filtered" else []
     if shading.model.light == "none":
         return []
+    directional = ["DirectionalEmitter"] if shading.model.light == "filtered" else []
     found = [one for one in scene.emitters() if one.is_environment() or one.class_name() in directional]
     return sorted(found, key=lambda one: not one.is_environment())
 

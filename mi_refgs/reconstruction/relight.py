@@ -60,13 +60,14 @@ def relight(
     test views of the run's data set, or of `data`, compared with ground truth under this light, if any; with
     `turntable`, so many cameras on a circle; without data both are around the object. Raises InputError for a
     run without light or materials, an unreadable light or data set, and a folder with other files."""
-    per_pixel = samples_per_axis(samples) ** 2  # refuses others
+    per_pixel = samples_per_axis(samples) ** 2  # refuses other numbers before anything is written
     # The views, and the ground truth under this light.
     fitted = load(run.path)
     fitted = replace(fitted, provenance=fitted.provenance.with_data(data))
     provenance, requested, true_views, no_truth = fitted.provenance, light, None, NO_TRUTH
     views = provenance.views("test", truth=False) if provenance.has_data and not turntable else None
-    known = truth_under(light, at) if (at := provenance.data) and provenance.has_data else None
+    source = provenance.data if provenance.has_data else None
+    known = None if source is None else truth_under(light, source)
     if views is not None and known is not None:
         try:
             true_views, light = _true_views(provenance.method, known[0], views), known[1]
