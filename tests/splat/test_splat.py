@@ -193,6 +193,20 @@ def test_tile_lists_are_in_the_oracles_order(kind: Primitive, seed: int, tile: t
     assert compared > 100
 
 
+@pytest.mark.parametrize(("surfels", "tile_count"), [(1, 1), (40_000, 3600), (1 << 27, 1 << 18)])
+def test_numbers_that_are_sorted_leave_depth_its_bits(
+    surfels: int, tile_count: int, rng: np.random.Generator
+) -> None:
+    """24, or 19 beside 2²⁷ surfels and 2¹⁸ tiles; equal keys keep their order."""
+    tile, surfel = (rng.integers(0, most, 3000, np.uint64) for most in (tile_count, surfels))
+    depth = rng.uniform(1, 4, 3000).astype(np.float32)  # two octaves fill 24 bits
+    found = tiles._sorted(mi.UInt64(tile << np.uint64(32) | surfel), mi.Float(depth), surfels, tile_count)
+    key = (depth.view(np.uint32) - depth.view(np.uint32).min()) >> (5 if surfels == 1 << 27 else 0)
+    order = np.lexsort((key, tile))
+    for ours, expected in zip(found, (tile, surfel), strict=True):
+        np.testing.assert_array_equal(ours.numpy(), expected[order])
+
+
 def test_reference_footprints_match_textbook_intersections() -> None:
     """Tangent coordinates (a, b) of the point where a ray meets a disc: ray t = p + a σ_u u + b σ_v v."""
     scene, tested = scenes.make_scene(8), 0
