@@ -90,6 +90,8 @@ class FilmImage:
     def _sensors(self) -> list[Any]:
         """The sensors of a `batch`, whose images are side by side in its film; else the sensor itself."""
         inner = [one for one in children_of(self.sensor).values() if isinstance(one, mi.Sensor)]
+        if inner and (*self.film.crop_size(),) != (*self.film.size(),):
+            raise InputError("a crop of a `batch`", "refgs", "film", "render its sensors one by one")
         return inner or [self.sensor]
 
     def _passes(self, most: int | None) -> list[tuple[Any, Band]]:

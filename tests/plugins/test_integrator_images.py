@@ -66,6 +66,8 @@ def test_a_batch_is_its_sensors_side_by_side() -> None:
         slopes.append(dr.grad(params[key]).numpy())
     np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-5)
     assert slopes[0] != 0
+    cropped = sensor(film={"width": 3 * WIDTH, "crop_width": WIDTH, "crop_height": 6})["film"]
+    refused(lambda: image(scene(batch | {"film": cropped})), "a crop of a `batch`", "one by one")
 
 
 def test_a_mirrored_sensor_shows_the_mirror_image() -> None:
