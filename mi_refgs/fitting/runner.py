@@ -217,8 +217,9 @@ def begin(
         if len(views.views) < HOLDOUT and left:
             few = f"{len(views.views)} views: too few to hold some out"
             tell(f"{views.path}: {few}, so {' and '.join(left)} are not decided")
-        for name in (name for name, in_time in left.items() if not in_time):
-            warn(f"{name}: is not tried in {method.iterations} iterations; add more")
+        for name, in_time in left.items():
+            if not in_time:
+                warn(f"{name}: is not tried in {method.iterations} iterations; add more")
     return trainer
 
 

@@ -61,19 +61,19 @@ def list_by_tile(
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     rows, turned = PackedRows.pack([*footprints.columns, *features, *turns]), len(turns) // 2
     tile_size, primitive = mi.Vector2f(*camera.tile), footprints.primitive
-    found: list[tuple[UInt64, Float]] = []
+    found: list[list[Any]] = []  # tiles, surfels and depths of pairs, part by part
     count = 0
     for surfel, tile_x, tile_y in _candidates(footprints, camera):
         row = rows.fetch(surfel)
         corner = tile_size * mi.Point2f(mi.Float(tile_x), mi.Float(tile_y)) - mi.Vector2f(*camera.tile_offset)
         # Between the centres of the outermost pixels.
         touches = primitive.overlaps(row, corner + 0.5, corner + (tile_size - 0.5))
-        pairs = mi.UInt64(tile_y * camera.tiles[0] + tile_x) << 32 | mi.UInt64(surfel)
         depth = primitive.depth_near(row, corner + tile_size / 2)
-        # Scattered to where it belongs: to gather by `dr.compress` takes four times as long.
-        place = dr.prefix_reduce(dr.ReduceOp.Add, dr.select(touches, mi.UInt32(1), 0), exclusive=False)
-        dr.eval(touches, pairs, depth, place)
-        kept = int(place[-1])
+        pairs = [mi.UInt32(tile_y * camera.tiles[0] + tile_x), surfel, depth]
+        # Those that touch are scattered: to gather them by `dr.compress` takes four times as long.
+        number = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt32(touches), exclusive=False)
+        dr.eval(touches, pairs, number)
+        kept = int(number[-1])
         count += kept
         if count > 1 << MAX_PAIR_BITS:
             size = f"{tiles:,} tiles of {camera.width} × {camera.height} pixels"
@@ -81,15 +81,15 @@ def list_by_tile(
             what = f"more than {1 << MAX_PAIR_BITS:,} surfels on the {size}"
             raise InputError(what, "splat", "surfels", remedy)
         if kept:
-            found.append((dr.empty(mi.UInt64, kept), dr.empty(mi.Float, kept)))
-            for part, values in zip(found[-1], (pairs, depth), strict=True):
-                dr.scatter(part, values, place - 1, touches, mode=dr.ReduceMode.NoConflicts)
+            found.append([dr.empty(type(values), kept) for values in pairs])
+            for part, values in zip(found[-1], pairs, strict=True):
+                dr.scatter(part, values, number - 1, touches, mode=dr.ReduceMode.NoConflicts)
             dr.eval(found[-1])
     if not found:
         none = dr.zeros(mi.UInt32, tiles)
         return TileLists(camera, primitive, rows, mi.UInt32(), none, none, turned)
-    pairs, depth = found[0] if len(found) == 1 else (dr.concat(list(x)) for x in zip(*found, strict=True))
-    tile, surfel = _sorted(pairs, depth, rows.count, tiles)
+    every = found[0] if len(found) == 1 else [dr.concat(list(x)) for x in zip(*found, strict=True)]
+    tile, surfel = _sorted(every[0], every[1], every[2], rows.count, tiles)
     lists = TileLists(camera, primitive, rows, surfel, *_runs(tile, tiles), turned)
     if few is None or few[1] >= len(features):
         return lists
@@ -99,9 +99,9 @@ def list_by_tile(
 
 
 @phase("sort")
-def _sorted(pairs: UInt64, depth: Float, surfels: int, tiles: int) -> tuple[UInt32, UInt32]:
-    """Tiles and surfels of pairs (tile, surfel), sorted by tile, then by depth: a stable radix sort of one
-    integer of both, in three passes. Bits of positive floats are in their order; the last digits drop if the
+def _sorted(tile: UInt32, surfel: UInt32, depth: Float, surfels: int, tiles: int) -> tuple[UInt32, UInt32]:
+    """Tiles and surfels of pairs, sorted by tile, then by depth: a stable radix sort of one integer of all
+    three, in three passes. Bits of positive floats are in their order; the last digits drop if the
     largest depth is more than four times the smallest."""
     high = (tiles - 1).bit_length()
     low = max((surfels - 1).bit_length(), 64 - DEPTH_BITS - high)  # the same for most numbers of surfels
@@ -111,7 +111,7 @@ def _sorted(pairs: UInt64, depth: Float, surfels: int, tiles: int) -> tuple[UInt
     least = dr.min(key)
     spare = 32 - middle
     key = (key - least) >> (spare - dr.minimum(dr.lzcnt(dr.max(key) - least), spare))
-    joined = (pairs >> 32 << middle | mi.UInt64(key)) << low | (pairs & 0xFFFFFFFF)
+    joined = (mi.UInt64(tile) << middle | mi.UInt64(key)) << low | mi.UInt64(surfel)
     half = middle // 2
     for shift, bits in ((low, half), (low + half, middle - half), (low + middle, high)):
         digit = mi.UInt32(joined >> shift) & ((1 << bits) - 1)

@@ -198,9 +198,9 @@ def test_numbers_that_are_sorted_leave_depth_its_bits(
     surfels: int, tile_count: int, rng: np.random.Generator
 ) -> None:
     """24, or 19 beside 2²⁷ surfels and 2¹⁸ tiles; equal keys keep their order."""
-    tile, surfel = (rng.integers(0, most, 3000, np.uint64) for most in (tile_count, surfels))
+    tile, surfel = (rng.integers(0, most, 3000, np.uint32) for most in (tile_count, surfels))
     depth = rng.uniform(1, 4, 3000).astype(np.float32)  # two octaves fill 24 bits
-    found = tiles._sorted(mi.UInt64(tile << np.uint64(32) | surfel), mi.Float(depth), surfels, tile_count)
+    found = tiles._sorted(mi.UInt32(tile), mi.UInt32(surfel), mi.Float(depth), surfels, tile_count)
     key = (depth.view(np.uint32) - depth.view(np.uint32).min()) >> (5 if surfels == 1 << 27 else 0)
     order = np.lexsort((key, tile))
     for ours, expected in zip(found, (tile, surfel), strict=True):
