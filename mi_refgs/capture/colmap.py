@@ -29,15 +29,19 @@ Result = TypeVar("Result")
 T = TypeVar("T")
 
 
-def load() -> Any:
-    """Import pycolmap; raises InputError that says how to install it."""
-    return require_package("pycolmap", "capture", "capture")
+class _Pycolmap:
+    """The package, imported when something of it is read; raises InputError that says how to install it."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(require_package("pycolmap", "capture", "capture"), name)
+
+
+pycolmap: Any = _Pycolmap()
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
     """Silence COLMAP's log; errors are exceptions."""
-    pycolmap = load()
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
     try:
@@ -48,7 +52,6 @@ def quiet() -> Iterator[None]:
 
 def _run(call: Callable[[Any], Result]) -> Result:
     """Run `call(cancellation token)` in a thread, so that Ctrl-C stops it."""
-    pycolmap = load()
     token = pycolmap.CancellationToken()
     with quiet(), ThreadPoolExecutor(1) as pool:
         pycolmap.set_random_seed(SEED)
@@ -73,7 +76,6 @@ def _in_parts(items: Sequence[T], size: int, what: str, work: Callable[[Sequence
 
 def begin(database: Path, folder: Path, groups: Sequence[tuple[Sequence[str], str, Sequence[float]]]) -> None:
     """Create a database with the images of cameras: (names in `folder`, model, parameters or none) each."""
-    pycolmap = load()
     temporary = database.parent / "begun.db"
     for stale in database.parent.glob("begun.db*"):
         stale.unlink()
@@ -89,7 +91,6 @@ def begin(database: Path, folder: Path, groups: Sequence[tuple[Sequence[str], st
 
 def extract(database: Path, folder: Path, names: Sequence[str]) -> None:
     """Detect SIFT features of the images that have none yet."""
-    pycolmap = load()
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.sift.max_num_features = 3000  # two cores match 30 pairs a second; time grows with its square
@@ -103,7 +104,6 @@ def extract(database: Path, folder: Path, names: Sequence[str]) -> None:
 
 def match(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
     """Match the pairs of images that have no matches yet, verified by a two-view geometry."""
-    pycolmap = load()
     listed = database.with_suffix(".pairs.txt")
     matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
     matching.use_gpu = False
@@ -121,7 +121,6 @@ def match(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
 
 def features(database: Path) -> dict[str, np.ndarray]:
     """Feature descriptors (N, 128) uint8 of each image by name."""
-    pycolmap = load()
     with quiet(), closing(pycolmap.Database.open(database)) as opened:
         return {
             image.name: np.asarray(opened.read_descriptors(image.image_id).data).reshape(-1, 128)
@@ -133,7 +132,6 @@ def features(database: Path) -> dict[str, np.ndarray]:
 
 def reconstruct(database: Path, folder: Path, output: Path, count: int) -> list[Any]:
     """Reconstruct each connected group of images: pycolmap.Reconstructions, the largest first."""
-    pycolmap = load()
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
@@ -221,7 +219,6 @@ class Solved:
 
 def adjust(model: Reconstruction) -> None:
     """Bundle adjustment of everything but the principal points."""
-    pycolmap = load()
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
     options.print_summary = False
     for image in model.reg_image_ids():
@@ -234,7 +231,6 @@ def adjust(model: Reconstruction) -> None:
 
 def best_lens(model: Reconstruction) -> Reconstruction:
     """The reconstruction with the simplest lens model that fits the observations, bundle-adjusted."""
-    pycolmap = load()
     best, error = model, np.inf
     for kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV"):  # from few to many parameters
         copy = pycolmap.Reconstruction(model)

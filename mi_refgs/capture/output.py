@@ -123,8 +123,7 @@ def write_model(
     folder: Path,
 ) -> None:
     """Write COLMAP's binary files of the undistorted reconstruction."""
-    pycolmap = colmap.load()
-    written = pycolmap.Reconstruction(model)
+    written = colmap.pycolmap.Reconstruction(model)
     for i in written.reg_image_ids():
         image = written.images[i]
         camera, lens = straight[image.name], model.cameras[image.camera_id]
@@ -133,7 +132,7 @@ def write_model(
             seen = ray * camera.focal + camera.centre
             point.xy = np.where(np.isfinite(seen), seen, 0)
         own = written.cameras[image.camera_id]
-        own.model, own.width, own.height = pycolmap.CameraModelId.PINHOLE, *camera.size
+        own.model, own.width, own.height = colmap.pycolmap.CameraModelId.PINHOLE, *camera.size
         own.params = [*camera.focal, *camera.centre]
         image.name = photographs[image.name].name
     folder.mkdir(parents=True, exist_ok=True)

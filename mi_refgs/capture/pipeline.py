@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.capture import colmap, output
-from mi_refgs.capture.colmap import Solved
+from mi_refgs.capture.colmap import Solved, pycolmap
 from mi_refgs.capture.frame import upright_unit
 from mi_refgs.capture.output import MASKS, SPARSE
 from mi_refgs.capture.photographs import REPORT, WORK, Photograph, find_masks, find_photographs
@@ -50,7 +50,7 @@ def capture(
     world, by default what a user saved there, else estimated. Returns the content of capture.json. Raises
     InputError for unusable input, and without pycolmap."""
     # Photographs and options.
-    pycolmap = colmap.load()
+    version = VERSION, pycolmap.__version__
     if camera not in (None, *MODELS):
         remedy = f"give one of {', '.join(MODELS)}"
         raise InputError(f"{camera}: unknown lens model", "--camera-model", remedy=remedy)
@@ -63,7 +63,7 @@ def capture(
     if masks is None and (ignored := [path for path in source.glob("*/") if MASK.search(path.name)]):
         tell(f"not used: {ignored[0]}; --masks {ignored[0]} would read masks there")
     output.prepare(folder, [source] if masks is None else [source, masks])
-    inputs = [VERSION, pycolmap.__version__, camera, [(p.name, p.digest, p.lying) for p in photographs]]
+    inputs = [*version, camera, [(p.name, p.digest, p.lying) for p in photographs]]
     copies = {photograph.copy: photograph for photograph in photographs}
     # Cameras of the largest group, transformed to an upright world.
     work, given = folder / WORK, _hash(inputs)

@@ -33,11 +33,15 @@ def main(folder: Path) -> int:
     except KeyboardInterrupt:
         return STOPPED
     except InputError as error:
-        return _failed(folder, str(error))
+        reason = str(error)
     except Exception as error:
         traceback.print_exc()
-        return _failed(folder, f"{type(error).__name__}: {error} (job.log has the details)")
-    return DONE
+        reason = f"{type(error).__name__}: {error} (job.log has the details)"
+    else:
+        return DONE
+    say(reason)
+    Job.read(folder).run.write_json(FAILED, {"reason": reason})
+    return FAILURE
 
 
 def fit_and_measure(job: Job) -> None:
@@ -72,12 +76,6 @@ def _end_with_parent() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(GRACE)
     os._exit(STOPPED)
-
-
-def _failed(folder: Path, reason: str) -> int:
-    say(reason)
-    Job.read(folder).run.write_json(FAILED, {"reason": reason})
-    return FAILURE
 
 
 if __name__ == "__main__":

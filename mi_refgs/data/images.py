@@ -17,18 +17,9 @@ import numpy as np
 
 from mi_refgs.data.lens import Undistortion
 from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.io import images as io
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import is_file
-from mi_refgs.io.images import (
-    ENDINGS,
-    box_downscale,
-    image_header,
-    read_bytes,
-    read_grey,
-    read_mask,
-    whole_blocks,
-    with_ending,
-)
 
 CACHE_BYTES = 2**30  # of decoded images that a data set keeps: 28 of 12 Mpx, a thousand of 600 × 600
 BAND = 256  # rows of a file that are converted to floating point at a time, for less memory
@@ -49,8 +40,8 @@ class Mask:
     def read(self) -> np.ndarray:
         """Alpha (H, W) float32."""
         if self.below is None:
-            return read_mask(self.path)
-        return (read_grey(self.path)[0] < self.below).astype(np.float32)
+            return io.read_mask(self.path)
+        return (io.read_grey(self.path)[0] < self.below).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -67,7 +58,7 @@ class ImageFile:
     @classmethod
     def of(cls, path: Path, downscale: float, mask: Mask | None = None) -> "ImageFile":
         """The image in a file, of which only the header is read."""
-        width, height, _ = image_header(path)
+        width, height, _ = io.image_header(path)
         if min(width, height) < downscale:
             what = f"{width} × {height} pixels are less than a block of {downscale}²"
             raise InputError(what, path, "downscale", "give a smaller number")
@@ -76,7 +67,7 @@ class ImageFile:
     @property
     def size(self) -> tuple[int, int]:
         """Of the view's image."""
-        return whole_blocks(self.width, self.downscale), whole_blocks(self.height, self.downscale)
+        return io.whole_blocks(self.width, self.downscale), io.whole_blocks(self.height, self.downscale)
 
     @property
     def is_linear_radiance(self) -> bool:
@@ -84,7 +75,7 @@ class ImageFile:
 
     def has_alpha(self) -> bool:
         """Whether there is alpha, by the file's header."""
-        return self.mask is not None or image_header(self.path)[2]
+        return self.mask is not None or io.image_header(self.path)[2]
 
     def decode(self) -> np.ndarray:
         """(H, W, 3 or 4): uint8 as in the file, else float32, averaged and premultiplied."""
@@ -96,7 +87,7 @@ class ImageFile:
             if pixels.shape[-1] < 3:
                 raise InputError("no R, G, B", self.path, "channels", "export a colour image")
         else:
-            pixels, factor = read_bytes(self.path, 1 if self.mask else int(self.downscale))
+            pixels, factor = io.read_bytes(self.path, 1 if self.mask else int(self.downscale))
             if self.downscale == 1 and self.mask is None and self.undistortion is None:
                 return pixels
         mask = None if self.mask is None else self.mask.read()
@@ -123,7 +114,7 @@ class ImageFile:
                 band = np.concatenate([colour, covered], axis=-1)
             if band.shape[-1] == 4 and not linear:
                 band[..., :3] *= band[..., 3:]
-            bands.append(box_downscale(band, block))
+            bands.append(io.box_downscale(band, block))
         averaged = np.concatenate(bands)
         return averaged if self.undistortion is None else self.undistortion.resample(averaged)
 
@@ -218,7 +209,7 @@ def image_files(folder: Path, deep: bool) -> list[Path]:
     """The images of a folder by name, `deep` with those of subfolders; neither hidden ones nor masks."""
     files = folder.glob("**/*" if deep else "*")
     seen = (p for p in files if not any(part.startswith(".") for part in p.relative_to(folder).parts))
-    paths = sorted(p for p in seen if p.suffix.lower() in ENDINGS)
+    paths = sorted(p for p in seen if p.suffix.lower() in io.ENDINGS)
     masks = {f"{path.with_suffix('')}{mark}" for path in paths for mark in MARKS[1:]}
     return [path for path in paths if str(path.with_suffix("")) not in masks]
 
@@ -232,9 +223,9 @@ def find_image(folders: Sequence[Path], name: str, tell: Callable[[str, str, obj
     for start, folder in product(starts, folders):
         if parts[start:] and parts[start] not in ("", os.curdir, os.pardir):
             file = folder.joinpath(*parts[start:])
-            found = file if is_file(file) else with_ending(file)
+            found = file if is_file(file) else io.with_ending(file)
             if found is None and not file.suffix[1:].isdigit():  # a number is part of the name
-                found = with_ending(file.with_suffix(""), (file.suffix.lower(), *ENDINGS, ".exr"))
+                found = io.with_ending(file.with_suffix(""), (file.suffix.lower(), *io.ENDINGS, ".exr"))
             if found is not None:
                 if start:
                     tell("the path leads elsewhere, and its last parts are read", name, abbreviated(name))
@@ -268,7 +259,7 @@ def mask_in(folder: Path, name: str, beside: bool = False) -> Path:
 
 
 def _mask_file(folder: Path, name: str, marks: Sequence[str]) -> Path | None:
-    endings = (*ENDINGS, *(ending.upper() for ending in ENDINGS))
+    endings = (*io.ENDINGS, *(ending.upper() for ending in io.ENDINGS))
     stems = (name, str(Path(name).with_suffix("")))
     files = (folder / f"{stem}{mark}{ending}" for stem, mark, ending in product(stems, marks, endings))
     return next((file for file in files if is_file(file)), None)
@@ -282,7 +273,7 @@ def block_mean(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean over what is covered in each block, (h, w, C), 0 without coverage; covered fraction (h, w, 1)."""
     covered = covered.astype(np.float32)
-    fraction, total = box_downscale(covered, downscale), box_downscale(pixels * covered, downscale)
+    fraction, total = io.box_downscale(covered, downscale), io.box_downscale(pixels * covered, downscale)
     if straight is not None:  # linear interpolation, so that no weight is negative
         fraction, total = straight.resample(fraction, order=1), straight.resample(total, order=1)
     return np.where(fraction > 0, total / np.maximum(fraction, 1e-12), 0).astype(np.float32), fraction

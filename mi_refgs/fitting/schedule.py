@@ -17,20 +17,9 @@ from mi_refgs.fitting import row_rates
 from mi_refgs.fitting.events import place
 from mi_refgs.fitting.optim import LearningRate
 from mi_refgs.kernels.device import upload
+from mi_refgs.methods import method as leaf
 from mi_refgs.methods.extensions import EVENTS, Event
-from mi_refgs.methods.method import (
-    AROUND,
-    BACKGROUND,
-    GAIN,
-    LIGHT,
-    LIGHT_ROTATION,
-    LIGHT_SCALE,
-    PER_VIEW,
-    POSE,
-    TURNTABLE,
-    Method,
-    Rates,
-)
+from mi_refgs.methods.method import Method, Rates
 from mi_refgs.runs.checkpoint import PARAMS, part
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.shade.light.kind import FittedLight
@@ -42,10 +31,10 @@ from mi_refgs.types import Float, TensorXf
 
 DEFAULT_RATES = Rates()
 LEARNT_BESIDE = {
-    GAIN: (1e-3, 1e-4),
-    POSE: (2e-3, 6e-5),
-    LIGHT_ROTATION: (1e-2, 1e-4),
-    LIGHT_SCALE: (1e-2, 1e-4),
+    leaf.GAIN: (1e-3, 1e-4),
+    leaf.POSE: (2e-3, 6e-5),
+    leaf.LIGHT_ROTATION: (1e-2, 1e-4),
+    leaf.LIGHT_SCALE: (1e-2, 1e-4),
 }
 """Rates at start and end: of log gains, of radians or half widths, of radians and log scale of a light."""
 POSITION_STEPS, POSITION_FINAL = 0.6, 1.6e-6
@@ -138,18 +127,18 @@ class FitSetup:
             assert self.data.region is not None
             distance = row_rates.ByDistance(self.data.region.centre, extent)
             table["position"] = replace(table["position"], by_row=distance)
-            groups |= {AROUND + name: group for name, group in table.items()}
-            groups[BACKGROUND] = LearningRate(around.rate, around.rate * rates.decay, iterations)
+            groups |= {leaf.AROUND + name: group for name, group in table.items()}
+            groups[leaf.BACKGROUND] = LearningRate(around.rate, around.rate * rates.decay, iterations)
         if self.method.light is not None and self.method.light.learns:
             final = rates.light * rates.decay
             by_row = row_rates.relative if rates.light_relative else None
-            groups[LIGHT] = LearningRate(rates.light, final, iterations, by_row=by_row)
+            groups[leaf.LIGHT] = LearningRate(rates.light, final, iterations, by_row=by_row)
         for name, (rate, final) in LEARNT_BESIDE.items():
             if name in params:
                 groups[name] = LearningRate(rate, final, iterations)
-        if POSE in groups:  # whose corrections begin late
+        if leaf.POSE in groups:  # whose corrections begin late
             after = getattr(self.method.event.get("cameras"), "after", 0)
-            groups[POSE] = replace(groups[POSE], begin=after)
+            groups[leaf.POSE] = replace(groups[leaf.POSE], begin=after)
         return groups
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
@@ -159,17 +148,17 @@ class FitSetup:
         wanted: dict[str, tuple[int, ...]] = {name: (surfels.columns(name),) for name in surfels.names}
         if self.open_scene and around is not None:
             background = replace(surfels, primitive=around.primitive, degree={"radiance_sh": around.degree})
-            wanted |= {AROUND + name: (background.columns(name),) for name in around.names}
-            wanted[BACKGROUND] = (2 * around.height, 3)
+            wanted |= {leaf.AROUND + name: (background.columns(name),) for name in around.names}
+            wanted[leaf.BACKGROUND] = (2 * around.height, 3)
         if light is not None:
-            wanted[LIGHT] = light.shape()[1:]
-            wanted |= {f"{LIGHT}_{name}": (3,) for name in light.placement}
-            wanted |= {TURNTABLE: (3,)} if light.turntable else {}
+            wanted[leaf.LIGHT] = light.shape()[1:]
+            wanted |= {f"{leaf.LIGHT}_{name}": (3,) for name in light.placement}
+            wanted |= {leaf.TURNTABLE: (3,)} if light.turntable else {}
         found = {
-            name: values.shape if name in PER_VIEW else values.shape[1:]
+            name: values.shape if name in leaf.PER_VIEW else values.shape[1:]
             for name, values in part(state, PARAMS).items()
         }
-        per_view = {GAIN: (len(self.data.views), 3), POSE: (len(self.data.views), 6)}
+        per_view = {leaf.GAIN: (len(self.data.views), 3), leaf.POSE: (len(self.data.views), 6)}
         wanted |= {name: shape for name, shape in per_view.items() if name in found}
         for name in wanted | found:
             if found.get(name) != wanted.get(name):

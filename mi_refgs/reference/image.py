@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, maximum_filter
 
 from mi_refgs import constants as c
 from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, ray_slopes, rotation_axes, sigmoid
@@ -188,9 +188,14 @@ class Resolve:
         self.ray = rays(scene.camera, x, y)
         self.depth: Array | None = None  # (P,) of a scene with a background; else that of the sums
         self.along = self.ray @ scene.camera.to_world[:3, 2]  # camera-z depth per length
-        self.found = {}
+        self.found, self.at_nodes = {}, [{}] * 4  # visibility at the pixels' centres, and at each of `_nodes`
         if scene.visibility is not None:
-            self.found["visibility"] = scene.visibility(unit(sums[:, :3]), self.ray)[:, None]
+            seen = scene.visibility(unit(sums[:, :3]), self.ray)
+            self.found["visibility"] = seen[:, None]
+            if scene.antialias:  # where no ray around is blocked, none of a node is
+                near = maximum_filter(seen.reshape(scene.camera.height, -1) < 1, 3, mode="nearest").ravel()
+                traced = (scene.visibility(unit(n), ray) for n, ray in self._nodes(sums[:, :3]))
+                self.at_nodes = [{"visibility": np.where(near, free, 1)[:, None]} for free in traced]
 
     def __call__(self, sums: Array, taps: Taps) -> Array:
         scene, alpha = self.scene, sums[:, -1:]
@@ -205,9 +210,10 @@ class Resolve:
             maps |= {name: blended[name] for name in ("radiance", *TERMS) if name in blended}
         else:
             terms: list[Array] = []
-            nodes = [(blended["normal"], self.ray, self.found)]
-            nodes = self._nodes(blended["normal"], alpha) if scene.antialias else nodes
-            for normal, ray, visible in nodes:
+            nodes, seen = [(blended["normal"], self.ray)], [self.found]
+            if scene.antialias:
+                nodes, seen = self._nodes(blended["normal"]), self.at_nodes
+            for (normal, ray), visible in zip(nodes, seen, strict=True):
                 found: Taps = []
                 points = Points(normal, -ray, values | visible, position)
                 here = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
@@ -218,20 +224,15 @@ class Resolve:
             maps["radiance"] = sum(terms[1:], terms[0]) * alpha
         return np.concatenate([maps[name] for name in self.maps()], axis=1)
 
-    def _nodes(self, normal: Array, alpha: Array) -> list[tuple[Array, Array, dict[str, Array]]]:
-        """Normals, unit rays and visibility (P, …) at the nodes of 2 × 2 Gauss-Legendre points per pixel."""
-        camera, shape, found = self.scene.camera, (self.scene.camera.height, self.scene.camera.width, -1), []
+    def _nodes(self, normal: Array) -> list[tuple[Array, Array]]:
+        """Normals and unit rays (P, 3) at the nodes of 2 × 2 Gauss-Legendre points per pixel."""
+        camera, found = self.scene.camera, []
         y, x = (axis.ravel() + 0.5 for axis in np.mgrid[: camera.height, : camera.width])
         nodes = np.polynomial.legendre.leggauss(2)[0] / 2
         for dy in nodes:
             for dx in nodes:
-                at = [bilinear_map(v.reshape(shape), x + dx, y + dy) for v in (normal, alpha)]
-                visible = {}
-                if "visibility" in self.found:
-                    weighted = bilinear_map((alpha * self.found["visibility"]).reshape(shape), x + dx, y + dy)
-                    some = at[1].real > 0
-                    visible["visibility"] = np.where(some, weighted / np.where(some, at[1], 1), 1)
-                found.append((at[0], rays(camera, x + dx, y + dy), visible))
+                at = bilinear_map(normal.reshape(camera.height, camera.width, 3), x + dx, y + dy)
+                found.append((at, rays(camera, x + dx, y + dy)))
         return found
 
     def maps(self) -> dict[str, int]:

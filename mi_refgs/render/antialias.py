@@ -1,7 +1,7 @@
 """Antialiasing of reflections: each pixel, composited once, is shaded at four interpolated points."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import drjit as dr
 import mitsuba as mi
@@ -10,37 +10,62 @@ from mi_refgs.render.stencil import neighbours
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.splat import Camera
 from mi_refgs.splat.lanes import CompactedPixels
-from mi_refgs.types import Float
+from mi_refgs.types import Float, UInt32, Vector3f
 
 NODE = 0.5 / math.sqrt(3)  # pixels from the centre, per axis: Gauss-Legendre, exact for cubic radiance
 NODES = [(x, y) for y in (-1, 1) for x in (-1, 1)]  # quadrant of each point
 STEPS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # steps to the neighbours
 
+Trace = Callable[[ShadingPoints, UInt32], ShadingPoints]  # points of the pixels of these places
+
 
 def averaged(
     shade: Callable[[ShadingPoints], RadianceTerms],
     points: ShadingPoints,  # (P,) at the pixels' centres, with the normals as they were blended
-    alpha: Float,  # (P,) by which normals are premultiplied
     camera: Camera,
     pixels: CompactedPixels | None,  # those of the P; None: all, in raster order
-    visibility: bool,
+    trace: Trace | None = None,
 ) -> RadianceTerms:
-    """Mean over each pixel of the radiance at NODES, under AD. Normals, as blended, and visibility (if
-    `visibility`), weighted by alpha, are interpolated; materials are the centre's: textures stay sharp."""
+    """Mean over each pixel of the radiance at NODES, under AD. Normals, as blended, are interpolated;
+    materials are the centre's: textures stay sharp. Beside blocked rays, those of the nodes are traced."""
     ray = None if pixels is None else pixels.raster
-    normal = [_interpolated(plane, camera, pixels) for plane in points.normal]
-    free = None
-    if visibility:
-        total = _interpolated(alpha, camera, pixels)
-        visible = _interpolated(alpha * points.visibility, camera, pixels)
-        free = [dr.select(t > 0, v / dr.select(t > 0, t, 1), 1) for v, t in zip(visible, total, strict=True)]
-    found = []
-    for i, (x, y) in enumerate(NODES):
+    normals = [_interpolated(plane, camera, pixels) for plane in points.normal]
+    nodes = []
+    for (x, y), *normal in zip(NODES, *normals, strict=True):
         view = -dr.normalize(camera.rays(ray, (NODE * x, NODE * y)))
-        at_node = ShadingPoints(mi.Vector3f(*(plane[i] for plane in normal)), view, points.attributes)
-        found.append(shade(at_node if free is None else at_node.replaced(visibility=free[i])).known())
+        nodes.append(ShadingPoints(mi.Vector3f(*normal), view, points.attributes))
+    if trace is not None:
+        blocked = dr.select(points.visibility < 1, mi.Float(1), mi.Float(0))
+        near = sum(neighbours(blocked, camera.width, camera.height, STEPS, pixels), blocked) > 0
+        nodes = _traced(nodes, trace, dr.compress(near))
+    found = [shade(node).known() for node in nodes]
     mean = {name: sum(terms[name] for terms in found) / len(found) for name in found[0]}
     return RadianceTerms(**mean)
+
+
+def _traced(nodes: list[ShadingPoints], trace: Trace, chosen: UInt32) -> list[ShadingPoints]:
+    """The nodes with what the rays of the chosen pixels find, all traced together."""
+    if not (count := dr.width(chosen)):
+        return nodes
+    every = dr.tile(chosen, len(nodes))
+
+    def joined(vectors: Iterable[Vector3f]) -> Vector3f:
+        planes = zip(*(dr.gather(type(vector), vector, chosen) for vector in vectors), strict=True)
+        return mi.Vector3f(*(dr.concat(plane) for plane in planes))
+
+    normal, view = joined(node.normal for node in nodes), joined(node.view for node in nodes)
+    attributes = {name: dr.gather(type(x), x, every) for name, x in nodes[0].attributes.items()}
+    found = trace(ShadingPoints(normal, view, attributes), every)
+    traced = []
+    for i, node in enumerate(nodes):
+        own = dr.arange(mi.UInt32, count) + i * count
+        for name, elsewhere in (("visibility", 1), ("indirect", 0)):
+            if (values := found.get(name)) is not None:
+                whole = dr.full(type(values), elsewhere, dr.width(node.view))
+                dr.scatter(whole, dr.gather(type(values), values, own), chosen)
+                node = node.replaced(**{name: whole})
+        traced.append(node)
+    return traced
 
 
 def _interpolated(plane: Float, camera: Camera, pixels: CompactedPixels | None) -> list[Float]:

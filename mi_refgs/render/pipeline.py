@@ -32,7 +32,7 @@ from mi_refgs.splat.composite import composite_compact
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
-from mi_refgs.types import Color3f, Float, Point3f, TensorXf, Vector3f
+from mi_refgs.types import Color3f, Float, Point3f, TensorXf, UInt32, Vector3f
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,8 @@ def _shade_at_pixels(view: _View) -> Frame:
         assert scene.occluder is not None  # by `Shading.require_inputs`
         covered = dr.detach(alpha) > COVERAGE_FLOOR
         context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
-        points = trace(points, context, shading)
+        # With `antialias`, rays of the nodes find what is shaded.
+        points = trace(points, context, replace(shading, traced_bounces=0) if shading.antialias else shading)
         if (seen := points.get("visibility")) is not None:  # a model may trace its own rays
             maps["visibility"] = seen
 
@@ -271,9 +272,12 @@ def _shade_at_pixels(view: _View) -> Frame:
         light = scene.light_at(camera.along(ray, buffer.depth))
     shaded_at = partial(shade, light=light, shading=shading)
     if shading.antialias:
-        # Traced radiance exists only where the pixel's own ray is blocked: the rest would have none.
-        interpolated = "visibility" in maps and not shading.traced_bounces
-        shaded = averaged(shaded_at, points, alpha, camera, buffer.pixels, interpolated)
+
+        def again(at: ShadingPoints, of: UInt32) -> ShadingPoints:
+            place = of if index is None else dr.gather(mi.UInt32, index, of)
+            return trace(at, replace(context, ray=-at.view, covered=True, pixel=place), shading)
+
+        shaded = averaged(shaded_at, points, camera, buffer.pixels, again if "visibility" in maps else None)
     else:
         shaded = shaded_at(points)
     terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()

@@ -115,17 +115,23 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
         mirror = reflect(view=points.view, normal=facing)
     if sampled:
         visibility, indirect = _average(points, context, scene, start, options)
-    elif scene is None:
+    else:
         visibility = occluder.visible(point, mirror, facing, seen)
         dr.eval(visibility)  # now, once: every kernel of the adjoint that reads it would trace the rays again
-    else:
-        hit = scene.trace(point, mirror, facing, seen, bounces)
-        dr.eval(hit)
-        visibility = dr.select(hit.valid, mi.Float(0), mi.Float(1))
-        indirect = dr.select(hit.valid, scene.radiance(hit, mirror), 0)
-    if scene is None:
-        return points.replaced(visibility=visibility)
+        indirect = points.get("indirect")
+        indirect = indirect if scene is None else _met(scene, (point, mirror, facing), visibility, bounces)
     return points.replaced(visibility=visibility, indirect=indirect)
+
+
+def _met(scene: MeshRadiance, ray: tuple[Point3f, Vector3f, Vector3f], free: Float, bounces: int) -> Color3f:
+    """Radiance of what rays (N,) meet, 0 where `free`. Those that are blocked are few, and shaded alone."""
+    found, blocked = dr.zeros(mi.Color3f, dr.width(free)), dr.compress(free == 0)
+    if dr.width(blocked):
+        point, direction, normal = (dr.gather(type(x), x, blocked) for x in ray)
+        hit = scene.trace(point, direction, normal, True, bounces)
+        dr.eval(hit)
+        dr.scatter(found, dr.select(hit.valid, scene.radiance(hit, direction), 0), blocked)
+    return found
 
 
 def _average(
@@ -135,7 +141,7 @@ def _average(
     start: tuple[Point3f, Vector3f, Bool],
     options: ShadingOptions,
 ) -> tuple[Float, Color3f | None]:
-    """Mean visibility over samples of the lobe, and mean radiance of the blocked ones (None: no `scene`)."""
+    """Mean visibility over samples of the lobe, and of a `scene` mean radiance of the blocked ones."""
     point, facing, seen = start
     count = dr.opaque(mi.UInt32, options.visibility_rays)
     with dr.suspend_grad():
@@ -170,7 +176,7 @@ def _average(
     visibility = dr.select(every > 0, free / dr.select(every > 0, every, 1), 1)
     if scene is None:
         dr.eval(visibility)
-        return dr.detach(visibility), None
+        return dr.detach(visibility), points.get("indirect")
     total = total * _firefly_clamp(dr.detach(total), largest, free * unblocked, mi.Float(count), lobe.α)
     indirect = total * dr.select(blocked > 0, dr.rcp(dr.select(blocked > 0, blocked, 1)), 0)
     dr.eval(visibility, indirect)

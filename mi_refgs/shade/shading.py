@@ -143,7 +143,8 @@ def trace(points: ShadingPoints, context: TraceContext, shading: Shading) -> Sha
     if shading.model.visibility == "own":
         return shading.model.trace(points, context, shading)
     points = reflection(points, context, shading)
-    return points.replaced(ambient=ambient_of_pixels(context)) if shading.ambient_rays else points
+    missing = shading.ambient_rays and points.get("ambient") is None
+    return points.replaced(ambient=ambient_of_pixels(context)) if missing else points
 
 
 @phase("shade forward")

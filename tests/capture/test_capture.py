@@ -59,7 +59,7 @@ def _made(folder: Path) -> Path:
 
 
 def _model(data: Path) -> Any:
-    return colmap.load().Reconstruction(data / "sparse" / "0")
+    return colmap.pycolmap.Reconstruction(data / "sparse" / "0")
 
 
 @needs_colmap
