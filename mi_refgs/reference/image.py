@@ -188,7 +188,8 @@ class Resolve:
         self.ray = rays(scene.camera, x, y)
         self.depth: Array | None = None  # (P,) of a scene with a background; else that of the sums
         self.along = self.ray @ scene.camera.to_world[:3, 2]  # camera-z depth per length
-        self.found, self.at_nodes = {}, [{}] * 4  # visibility at the pixels' centres, and at each of `_nodes`
+        self.found = {}  # visibility at the pixels' centres
+        self.at_nodes: list[dict[str, Array]] = [{}] * 4  # at each of `_nodes`
         if scene.visibility is not None:
             seen = scene.visibility(unit(sums[:, :3]), self.ray)
             self.found["visibility"] = seen[:, None]
@@ -210,9 +211,8 @@ class Resolve:
             maps |= {name: blended[name] for name in ("radiance", *TERMS) if name in blended}
         else:
             terms: list[Array] = []
-            nodes, seen = [(blended["normal"], self.ray)], [self.found]
-            if scene.antialias:
-                nodes, seen = self._nodes(blended["normal"]), self.at_nodes
+            nodes = self._nodes(blended["normal"]) if scene.antialias else [(blended["normal"], self.ray)]
+            seen = self.at_nodes if scene.antialias else [self.found]
             for (normal, ray), visible in zip(nodes, seen, strict=True):
                 found: Taps = []
                 points = Points(normal, -ray, values | visible, position)
