@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.ndimage import map_coordinates, maximum_filter
+from scipy.ndimage import map_coordinates
 
 from mi_refgs import constants as c
 from mi_refgs.reference.camera import QUATERNION_FLOOR, PinholeCamera, ray_slopes, rotation_axes, sigmoid
@@ -188,15 +188,9 @@ class Resolve:
         self.ray = rays(scene.camera, x, y)
         self.depth: Array | None = None  # (P,) of a scene with a background; else that of the sums
         self.along = self.ray @ scene.camera.to_world[:3, 2]  # camera-z depth per length
-        self.found = {}  # visibility at the pixels' centres
-        self.at_nodes: list[dict[str, Array]] = [{}] * 4  # at each of `_nodes`
+        self.found = {}
         if scene.visibility is not None:
-            seen = scene.visibility(unit(sums[:, :3]), self.ray)
-            self.found["visibility"] = seen[:, None]
-            if scene.antialias:  # where no ray around is blocked, none of a node is
-                near = maximum_filter(seen.reshape(scene.camera.height, -1) < 1, 3, mode="nearest").ravel()
-                traced = (scene.visibility(unit(n), ray) for n, ray in self._nodes(sums[:, :3]))
-                self.at_nodes = [{"visibility": np.where(near, free, 1)[:, None]} for free in traced]
+            self.found["visibility"] = scene.visibility(unit(sums[:, :3]), self.ray)[:, None]
 
     def __call__(self, sums: Array, taps: Taps) -> Array:
         scene, alpha = self.scene, sums[:, -1:]
@@ -211,9 +205,9 @@ class Resolve:
             maps |= {name: blended[name] for name in ("radiance", *TERMS) if name in blended}
         else:
             terms: list[Array] = []
-            nodes = self._nodes(blended["normal"]) if scene.antialias else [(blended["normal"], self.ray)]
-            seen = self.at_nodes if scene.antialias else [self.found]
-            for (normal, ray), visible in zip(nodes, seen, strict=True):
+            nodes = [(blended["normal"], self.ray, self.found)]
+            nodes = self._nodes(blended["normal"], alpha) if scene.antialias else nodes
+            for normal, ray, visible in nodes:
                 found: Taps = []
                 points = Points(normal, -ray, values | visible, position)
                 here = MODELS[scene.reflectance](points, scene.light, self.features.options, found)
@@ -224,15 +218,17 @@ class Resolve:
             maps["radiance"] = sum(terms[1:], terms[0]) * alpha
         return np.concatenate([maps[name] for name in self.maps()], axis=1)
 
-    def _nodes(self, normal: Array) -> list[tuple[Array, Array]]:
-        """Normals and unit rays (P, 3) at the nodes of 2 × 2 Gauss-Legendre points per pixel."""
-        camera, found = self.scene.camera, []
+    def _nodes(self, normal: Array, alpha: Array) -> list[tuple[Array, Array, dict[str, Array]]]:
+        """Normals, unit rays and visibility (P, …) at the nodes of 2 × 2 Gauss-Legendre points per pixel."""
+        camera, shape, found = self.scene.camera, (self.scene.camera.height, self.scene.camera.width, -1), []
         y, x = (axis.ravel() + 0.5 for axis in np.mgrid[: camera.height, : camera.width])
         nodes = np.polynomial.legendre.leggauss(2)[0] / 2
+        visible = {n: np.where(alpha.real > c.COVERAGE_FLOOR, v, 1) for n, v in self.found.items()}
+        maps = [values.reshape(shape) for values in (normal, *visible.values())]
         for dy in nodes:
             for dx in nodes:
-                at = bilinear_map(normal.reshape(camera.height, camera.width, 3), x + dx, y + dy)
-                found.append((at, rays(camera, x + dx, y + dy)))
+                at, *seen = (bilinear_map(values, x + dx, y + dy) for values in maps)
+                found.append((at, rays(camera, x + dx, y + dy), dict(zip(visible, seen, strict=True))))
         return found
 
     def maps(self) -> dict[str, int]:

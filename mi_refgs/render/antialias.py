@@ -26,18 +26,21 @@ def averaged(
     pixels: CompactedPixels | None,  # those of the P; None: all, in raster order
     trace: Trace | None = None,
 ) -> RadianceTerms:
-    """Mean over each pixel of the radiance at NODES, under AD. Normals, as blended, are interpolated;
-    materials are the centre's: textures stay sharp. Beside blocked rays, those of the nodes are traced."""
+    """Mean over each pixel of the radiance at NODES, under AD. Normals and visibility are interpolated, or
+    beside blocked rays those of NODES found by `trace`; materials are the centre's: textures stay sharp."""
     ray = None if pixels is None else pixels.raster
     normals = [_interpolated(plane, camera, pixels) for plane in points.normal]
     nodes = []
     for (x, y), *normal in zip(NODES, *normals, strict=True):
         view = -dr.normalize(camera.rays(ray, (NODE * x, NODE * y)))
         nodes.append(ShadingPoints(mi.Vector3f(*normal), view, points.attributes))
-    if trace is not None:
-        blocked = dr.select(points.visibility < 1, mi.Float(1), mi.Float(0))
-        near = sum(neighbours(blocked, camera.width, camera.height, STEPS, pixels), blocked) > 0
-        nodes = _traced(nodes, trace, dr.compress(near))
+    if (seen := points.get("visibility")) is not None:
+        blocked = 1 - seen  # 0 beside the object, too
+        free = (1 - x for x in _interpolated(blocked, camera, pixels))
+        nodes = [node.replaced(visibility=x) for node, x in zip(nodes, free, strict=True)]
+        if trace is not None:
+            near = sum(neighbours(blocked, camera.width, camera.height, STEPS, pixels), blocked) > 0
+            nodes = _traced(nodes, trace, dr.compress(near))
     found = [shade(node).known() for node in nodes]
     mean = {name: sum(terms[name] for terms in found) / len(found) for name in found[0]}
     return RadianceTerms(**mean)

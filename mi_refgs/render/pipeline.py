@@ -257,12 +257,12 @@ def _shade_at_pixels(view: _View) -> Frame:
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
 
     # Visibility along the mirror direction, where there is something to reflect.
+    at_nodes = shading.antialias and shading.traced_bounces > 0 and shading.model.visibility == "mirror"
     if shading.occlusion:
         assert scene.occluder is not None  # by `Shading.require_inputs`
         covered = dr.detach(alpha) > COVERAGE_FLOOR
         context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
-        # With `antialias`, rays of the nodes find what is shaded.
-        points = trace(points, context, replace(shading, traced_bounces=0) if shading.antialias else shading)
+        points = trace(points, context, replace(shading, traced_bounces=0) if at_nodes else shading)
         if (seen := points.get("visibility")) is not None:  # a model may trace its own rays
             maps["visibility"] = seen
 
@@ -277,7 +277,7 @@ def _shade_at_pixels(view: _View) -> Frame:
             place = of if index is None else dr.gather(mi.UInt32, index, of)
             return trace(at, replace(context, ray=-at.view, covered=True, pixel=place), shading)
 
-        shaded = averaged(shaded_at, points, camera, buffer.pixels, again if "visibility" in maps else None)
+        shaded = averaged(shaded_at, points, camera, buffer.pixels, again if at_nodes else None)
     else:
         shaded = shaded_at(points)
     terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()

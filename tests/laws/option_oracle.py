@@ -49,7 +49,7 @@ class Oracle:
         self.camera, self.corner, self.per_axis = camera_of(shown)
         self.pixels = np.arange(self.camera.width * self.camera.height)
         self.own = [*surfels_of(first).raw]
-        self.seen: dict[bytes, Array] = {}  # visibility (P,) by rays, of the first image
+        self.visible: Array | None = None
 
         first = {name: np.asarray(x, np.float64) for name, x in first.items()}
         own, around = self._tables(first)
@@ -93,16 +93,16 @@ class Oracle:
         if chosen.occlusion and chosen.model.visibility == "mirror":
             scene = replace(scene, visibility=self._visibility)
         found = image.render(scene)
-        visible = next(iter(self.seen.values()), np.ones(len(self.pixels)))  # that of the pixels' centres
+        visible = np.ones(len(self.pixels)) if self.visible is None else self.visible
         return found.maps | {"visibility": visible[:, None]}, found.band
 
     def _visibility(self, normal: Array, ray: Array) -> Array:
         """Visibility (P,) of the mirror direction, that of the first image."""
-        if (key := ray.tobytes()) not in self.seen:
+        if self.visible is None:
             found, eye = mesh(), self.camera.to_world[:3, 3]
-            given = found.vertices, found.faces, eye, normal, ray, OFFSET_VOXELS * found.voxel
-            self.seen[key] = occlusion.mirror_visibility(*given)
-        return self.seen[key]
+            offset = OFFSET_VOXELS * found.voxel
+            self.visible = occlusion.mirror_visibility(found.vertices, found.faces, eye, normal, ray, offset)
+        return self.visible
 
     def _blocks(self, values: Array) -> Array:
         k = self.per_axis

@@ -9,27 +9,11 @@ from graphlib import TopologicalSorter
 from tests.helpers import ROOT
 
 FLOORS: list[set[str]] = [
-    {"constants", "errors", "llvm", "types"},
-    {"registry"},
-    {"kernels"},
-    {"io"},
-    {"surfels"},
-    {"splat"},
-    {"data"},
-    {"occlusion"},
-    {"shade"},
-    {"render"},
-    {"capture", "methods", "plugins", "synthesis"},
-    {"runs"},
-    {"fitting"},
-    {"evaluation"},
-    {"compare", "editing"},
-    {"formats"},
-    {"reconstruction"},
-    {"viewer"},
-    {"cli", "public"},
-    {"__main__"},
-]
+    {"constants", "errors", "llvm", "types"}, {"registry"}, {"kernels"}, {"io"}, {"surfels"}, {"splat"},
+    {"data"}, {"occlusion"}, {"shade"}, {"render"}, {"capture", "methods", "plugins", "synthesis"}, {"runs"},
+    {"fitting"}, {"evaluation"}, {"compare", "editing"}, {"formats"}, {"reconstruction"}, {"viewer"},
+    {"cli", "public"}, {"__main__"},
+]  # fmt: skip
 """Folders and modules of the package from the ground up: each imports from the floors below it only.
 
 Those of one floor do not import each other. `reference` imports `constants` only, and nothing of the package

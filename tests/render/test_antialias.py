@@ -1,7 +1,5 @@
 """Reflections averaged over a pixel: the float64 reference, and the quadrature."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 
@@ -13,18 +11,23 @@ from scipy.ndimage import minimum_filter
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference.image import bilinear_map
 from mi_refgs.render.antialias import averaged
+from mi_refgs.render.pipeline import SurfelScene, render
+from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.shading import Shading
+from mi_refgs.splat import Camera
+from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
-from tests.scenes.splats import seen_from
+from tests.scenes import corner
+from tests.scenes.splats import discs, seen_from
 
 WIDTH, HEIGHT = 9, 7
 NODES = np.polynomial.legendre.leggauss(2)[0] / 2  # the Gauss-Legendre rule's two, pixels from the centre
 
 
 def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
-    """Normals are interpolated, also beside holes and at the border; rays are traced again in and beside
-    pixels whose ray is blocked, also partly. Elsewhere all light is visible."""
+    """Normals and visibility are interpolated, also beside holes and at the border; or rays are traced in and
+    beside pixels whose ray is blocked, also partly. Elsewhere all light is visible."""
     alpha = rng.uniform(0.2, 1, (HEIGHT, WIDTH, 1))
     alpha[[0, 2, 5, 6], [3, 2, 8, 0]] = 0
     alpha[3:6, 3:6] = 0  # a pixel whose neighbours are empty, too
@@ -40,20 +43,48 @@ def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
 
     def radiance(at: ShadingPoints) -> RadianceTerms:
         n = at.normal
-        return RadianceTerms(mi.Color3f(n.x * n.y, n.z, n.z**3), mi.Color3f(at.visibility), at.indirect)
+        return RadianceTerms(
+            mi.Color3f(n.x * n.y, n.z, n.z**3), mi.Color3f(at.visibility), at.get("indirect")
+        )
 
     points = ShadingPoints(normal, -dr.normalize(view.rays()), given)
-    found = averaged(radiance, points, view, None, trace)
     near = (minimum_filter(visibility, 3) < 1).ravel()
     assert near.any() and not near.all()
-    (y, x), expected = (axis.ravel() + 0.5 for axis in np.mgrid[:HEIGHT, :WIDTH]), np.zeros((3, 3, len(tint)))
+    y, x = (axis.ravel() + 0.5 for axis in np.mgrid[:HEIGHT, :WIDTH])
+    expected = np.zeros((2, 3, 3, len(tint)))
     for dx, dy in itertools.product(NODES, NODES):
         n = bilinear_map(normals, x + dx, y + dy).T
+        diffuse, nothing = [n[0] * n[1], n[2], n[2] ** 3], np.zeros((3, len(tint)))
+        free = bilinear_map(visibility[..., None], x + dx, y + dy)[:, 0]
         seen = np.where(near, -dr.normalize(view.rays(None, (float(dx), float(dy)))).x.numpy(), 1)
         beyond = np.where(near, [tint, np.arange(len(tint)), n[2]], 0)
-        expected += np.array([[n[0] * n[1], n[2], n[2] ** 3], [seen] * 3, beyond]) / 4
-    for term, values in zip(found.known().values(), expected, strict=True):
-        np.testing.assert_allclose(term.numpy(), values, atol=1e-5)
+        expected += np.array([[diffuse, [free] * 3, nothing], [diffuse, [seen] * 3, beyond]]) / 4
+    for own, values in zip((None, trace), expected, strict=True):
+        found = averaged(radiance, points, view, None, own)
+        for term, wanted in zip((found.diffuse, found.specular, found.indirect), values, strict=True):
+            np.testing.assert_allclose(0 * wanted if term is None else term.numpy(), wanted, atol=1e-5)
+
+
+def test_rays_of_nodes_leave_from_their_own_places(rng: np.random.Generator) -> None:
+    """On a plane mirror before a wall, traced radiance is the mean of images whose pixels are moved."""
+    wall = corner.wall_surfels(rng.normal(size=(400, 3))).to_numpy()
+    floor = discs(position=[[0.6, 0, 0]], rotation=[[-1, 0, 0, 1]], scale=[[3.0, 3.0]])
+    raw = {name: np.concatenate([x, np.reshape(floor.get(name, x[0]), (1, -1))]) for name, x in wall.items()}
+    surfels, light = (
+        Surfels.from_numpy(raw),
+        EnvironmentLight.from_radiance(corner.gradient_sky()).prefilter(),
+    )
+    view = Camera.look_at(corner.EYE, (0.7, 0, 0), (0, 1, 0), fov=9, size=8)
+
+    def image(view: Camera, antialias: bool = False) -> np.ndarray:
+        shading = Shading(diffuse="irradiance", occlusion=True, traced_bounces=1, antialias=antialias)
+        scene = SurfelScene(surfels, shading, light, corner.with_materials(corner.corner(), surfels))
+        return render(scene, view).radiance.numpy()
+
+    steps = itertools.product(NODES.tolist(), repeat=2)
+    expected = sum(image(replace(view, cx=view.cx - x, cy=view.cy - y)) / 4 for x, y in steps)
+    np.testing.assert_allclose(image(view, antialias=True), expected, atol=1e-5)
+    assert np.abs(image(view) - expected).max() > 1e-3
 
 
 def test_points_integrate_cubic_radiance_exactly() -> None:
