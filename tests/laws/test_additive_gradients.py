@@ -101,6 +101,7 @@ SCENES: dict[str, Callable[[Path], Any]] = {
     "antialiased": lambda _: model_scene("split_sum", antialias=True),
     "indirect light": lambda folder: model_scene("split_sum", mesh=hollow_mesh(folder)),
     "traced bounces": lambda folder: traced(folder, traced_bounces=1, ambient_rays=4, visibility_rays=2),
+    "traced at nodes": lambda folder: traced(folder, traced_bounces=2, antialias=True),
     "envmap": lambda folder: lit(map_of(16, 32, folder)),
     "resampled envmap": lambda folder: lit(map_of(16, 24, folder)),
     "constant": lambda _: lit({"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1, 2]}}),
@@ -121,7 +122,7 @@ def trained(scene: Any) -> list[str]:
 
 def numbers(value: Any) -> Any:
     """The numbers of a parameter (mi.Float), under AD."""
-    if not hasattr(value, "matrix"):
+    if dr.is_array_v(value):
         return dr.ravel(value)
     return dr.concat([value.matrix[i, j] for i in range(4) for j in range(4)])
 
