@@ -191,7 +191,7 @@ def _fitted(fit: Fit, data: Path, run: Path, place: Workplace) -> Row:
     scores = refgs("eval", run, *threads)
     row |= {key: scores[key] for key in SCORES}
     if fit.method == "relighting":
-        relit = [refgs("relight", run, "--envmap", path, "--samples", 4, *threads) for path in place.maps()]
+        relit = [refgs("relight", run, "--envmap", path, *threads) for path in place.maps()]
         row["relit"] = {x.stem: found["psnr_scaled"] for x, found in zip(place.maps(), relit, strict=True)}
     return row
 

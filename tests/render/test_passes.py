@@ -26,7 +26,7 @@ SHADINGS = {
     "pixel": Shading(),
     "surfel": Shading(at="surfel"),
     "mirror rays": Shading(occlusion=True),
-    "lobe rays": Shading(occlusion=True, visibility_rays=4),
+    "lobe rays": Shading(antialias=True, occlusion=True, visibility_rays=4, traced_bounces=1),
     "antialias": Shading(antialias=True),
     "antialiased rays": Shading(antialias=True, occlusion=True),
     "irradiance": Shading(diffuse="irradiance", occlusion=True, ambient_rays=8),
