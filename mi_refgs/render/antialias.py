@@ -50,25 +50,25 @@ def _traced(nodes: list[ShadingPoints], trace: Trace, chosen: UInt32) -> list[Sh
     """The nodes with what the rays of the chosen pixels find, all traced together."""
     if not (count := dr.width(chosen)):
         return nodes
-    every = dr.tile(chosen, len(nodes))
+    # Literal sizes, also those of expanded adjoints, would be other kernels in each step of a fit.
+    lane, size = dr.arange(mi.UInt32, len(nodes) * count), dr.opaque(mi.UInt32, count)
+    every = dr.gather(mi.UInt32, chosen, lane % size)
 
     def joined(vectors: Iterable[Vector3f]) -> Vector3f:
-        planes = zip(*(dr.gather(type(vector), vector, chosen) for vector in vectors), strict=True)
-        return mi.Vector3f(*(dr.concat(plane) for plane in planes))
+        return sum(dr.gather(type(v), v, every, lane // size == i) for i, v in enumerate(vectors))
 
     normal, view = joined(node.normal for node in nodes), joined(node.view for node in nodes)
     attributes = {name: dr.gather(type(x), x, every) for name, x in nodes[0].attributes.items()}
     found = trace(ShadingPoints(normal, view, attributes), every)
-    traced = []
     for i, node in enumerate(nodes):
-        own = dr.arange(mi.UInt32, count) + i * count
+        own = dr.arange(mi.UInt32, count) + i * size
         for name, elsewhere in (("visibility", 1), ("indirect", 0)):
             if (values := found.get(name)) is not None:
                 whole = dr.full(type(values), elsewhere, dr.width(node.view))
-                dr.scatter(whole, dr.gather(type(values), values, own), chosen)
-                node = node.replaced(**{name: whole})
-        traced.append(node)
-    return traced
+                values = dr.gather(type(values), values, own, mode=dr.ReduceMode.NoConflicts)
+                dr.scatter(whole, values, chosen)
+                nodes[i] = nodes[i].replaced(**{name: whole})
+    return nodes
 
 
 def _interpolated(plane: Float, camera: Camera, pixels: CompactedPixels | None) -> list[Float]:
