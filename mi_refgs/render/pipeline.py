@@ -257,12 +257,13 @@ def _shade_at_pixels(view: _View) -> Frame:
     maps = {name: values[name] for name in scene.surfels.raw if name in values}
 
     # Visibility along the mirror direction, where there is something to reflect.
-    at_nodes = shading.antialias and shading.traced_bounces > 0 and shading.model.visibility == "mirror"
+    at_nodes = shading.antialias and shading.traced_bounces > 0
+    unshaded = at_nodes and shading.model.visibility == "mirror"  # of the centre, visibility is enough
     if shading.occlusion:
         assert scene.occluder is not None  # by `Shading.require_inputs`
         covered = dr.detach(alpha) > COVERAGE_FLOOR
         context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
-        points = trace(points, context, replace(shading, traced_bounces=0) if at_nodes else shading)
+        points = trace(points, context, replace(shading, traced_bounces=0) if unshaded else shading)
         if (seen := points.get("visibility")) is not None:  # a model may trace its own rays
             maps["visibility"] = seen
 

@@ -78,7 +78,7 @@ class Shading(ShadingOptions):
         return replace(self, antialias=False, **UNTRACED)
 
     def antialiased(self) -> "Shading":
-        """With `antialias` where it has an effect: for displayed images; the steps of a fit go without."""
+        """With `antialias` where it has an effect: for displayed images."""
         able = self.shaded_at == "pixel" and "antialias" in self.model.honoured
         return replace(self, antialias=True) if able else self
 
