@@ -70,10 +70,8 @@ def test_rays_of_nodes_leave_from_their_own_places(rng: np.random.Generator) -> 
     wall = corner.wall_surfels(rng.normal(size=(400, 3))).to_numpy()
     floor = discs(position=[[0.6, 0, 0]], rotation=[[-1, 0, 0, 1]], scale=[[3.0, 3.0]])
     raw = {name: np.concatenate([x, np.reshape(floor.get(name, x[0]), (1, -1))]) for name, x in wall.items()}
-    surfels, light = (
-        Surfels.from_numpy(raw),
-        EnvironmentLight.from_radiance(corner.gradient_sky()).prefilter(),
-    )
+    surfels = Surfels.from_numpy(raw)
+    light = EnvironmentLight.from_radiance(corner.gradient_sky()).prefilter()
     view = Camera.look_at(corner.EYE, (0.7, 0, 0), (0, 1, 0), fov=9, size=8)
 
     def image(view: Camera, antialias: bool = False) -> np.ndarray:
