@@ -142,6 +142,7 @@ for _declared in (
     Attribute("metallic", (1,), "sigmoid", 5e-3, ("metallic",), 0.01, aov="Y"),
     Attribute("roughness", (1,), "sigmoid", 5e-3, ("roughness",), 0.1, aov="Y"),
     Attribute("indirect_sh", SH_WIDTHS, "harmonics", 7.5e-3, ("ind",), rest_rate=0.05),
+    Attribute("residual_sh", SH_WIDTHS, "harmonics", 0.08, ("res",), rest_rate=0.3),
     Attribute("tint", (3,), "sigmoid", 7.5e-3, _numbered("tint"), 0.5, aov="RGB"),
     Attribute("normal_offset", (3,), "identity", 1e-3, _numbered("offset")),
     Attribute("curvature", (3,), "identity", 0.2, _numbered("curvature"), geometry=True),

@@ -44,8 +44,9 @@ def every_channel(model: str, diffuse: Any, gaussians: bool) -> dict[str, np.nda
 
 def model_scene(model: str, diffuse: str = "sh", gaussians: bool = False, **changes: Any) -> Any:
     raw = every_channel(model, diffuse, gaussians)
-    if "mesh" in changes and "traced_bounces" not in changes:
-        raw["indirect_sh"] = raw_channels(COUNT)["indirect_sh"]
+    if "mesh" in changes:
+        name = "residual_sh" if "traced_bounces" in changes else "indirect_sh"
+        raw[name] = raw_channels(COUNT)["indirect_sh"]
     chosen = {"reflectance": model, "diffuse": diffuse, **changes}
     lit = {"light": None} if MODELS[model].light == "none" else {}
     return scenes.scene(raw=raw, aovs="a:alpha,d:depth,n:normal,s:diffuse", **chosen, **lit)

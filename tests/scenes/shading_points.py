@@ -24,6 +24,7 @@ RANGES: dict[str, tuple[float, float, tuple[int, ...]]] = {
     "radiance": (0.1, 2, (3,)),
     "visibility": (0, 1, ()),
     "indirect": (0.1, 1, (3,)),
+    "residual": (-0.09, 1, (3,)),
     "ambient": (0, 2, (3,)),
     "incident": (-0.5, 0.5, (9, 3)),
 }

@@ -35,7 +35,7 @@ CASES: dict[str, tuple[Shading, tuple[str, ...]]] = {
     "SH, visibility": (Shading(), ("radiance", *MATERIALS, "visibility")),
     "SH, dominant, indirect": (Shading(dominant=True), ("radiance", *MATERIALS, *BLOCKED)),
     "irradiance, ambient": (irradiance(), (*MATERIALS, "ambient")),
-    "dominant": (irradiance(dominant=True), (*MATERIALS, *BLOCKED)),
+    "dominant, residual": (irradiance(dominant=True), (*MATERIALS, *BLOCKED, "residual")),
     "mirror": (Shading("pixel", "mirror"), ("radiance", "metallic")),
     "gaussian_shader": (Shading("surfel", "gaussian_shader"), ("radiance", "tint", "roughness")),
     "monte_carlo, occluded": (
@@ -146,8 +146,9 @@ def test_degenerate_points_stay_finite(shading: Shading, names: tuple[str, ...])
     ends = (-1.0, 0.0, 0.3, 1.0, 7.0), (0.0, 1.0), (0.0, 0.5, 1.0, 1.5, -3.0, 1e6)
     n, v, r, m, a = (np.array(x, np.float64) for x in zip(*product(normals, views, *ends), strict=True))
     values = shading_values(np.random.default_rng(0), names, len(a))
-    extreme = {"normal": n, "view": v, "roughness": r, "metallic": m, "indirect": 0 * n}
+    extreme = {"normal": n, "view": v, "roughness": r, "metallic": m}
     extreme |= {"albedo": np.tile(a[:, None], 3), "tint": np.tile(a[:, None], 3)}
+    extreme |= {"indirect": 0 * n, "residual": 0 * n}
     points = points_of(values | {name: x for name, x in extreme.items() if name in values})
     leaves = [part for name in values if name != "free" for part in flat(getattr(points, name))]
     raw = EnvironmentLight.from_radiance(MAP).raw

@@ -19,7 +19,7 @@ from mi_refgs.types import Bool, Color3f, Float, Point3f, UInt32, Vector3f
 Lookup = Literal["none", "radiance", "filtered"]
 Rays = Literal["none", "mirror", "own"]
 
-LIT = ("radiance_sh", "indirect_sh")  # attributes that are fitted to one light
+LIT = ("radiance_sh", "indirect_sh", "residual_sh")  # attributes that are fitted to one light
 
 
 @dataclass(frozen=True)

@@ -56,11 +56,13 @@ class SplitSum(Reflectance):
         values = {name: surfels.value(name) for name in MATERIALS}
         if options.diffuse == "sh":
             values["radiance"] = seen.harmonic_colour(surfels.value("radiance_sh"))
-        if options.occlusion and surfels.has("indirect_sh") and not options.traced_bounces:
+        name = "residual_sh" if options.traced_bounces else "indirect_sh"
+        if options.occlusion and surfels.has(name):
             # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must
             # train from there.
             mirrored = reflect(view=-seen.direction, normal=seen.normal)
-            values["indirect"] = clamp_positive(eval_sh(surfels.value("indirect_sh"), mirrored))
+            found = eval_sh(surfels.value(name), mirrored)
+            values |= {"residual": found} if options.traced_bounces else {"indirect": clamp_positive(found)}
         return values
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
@@ -87,6 +89,8 @@ class SplitSum(Reflectance):
         if visibility is not None:
             specular *= visibility
             if blocking is not None:
+                if (residual := points.get("residual")) is not None:
+                    blocking = clamp_positive(blocking + residual)
                 indirect = (1 - visibility) * blocking * reflectance
 
         # Diffuse base under the specular layer.
