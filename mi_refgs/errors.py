@@ -29,7 +29,7 @@ class InputError(ValueError):
 
     def at(self, file: object = None, field: str | None = None) -> Self:
         """A copy whose place is inside `file` and `field`, which precede the place that it had."""
-        within = ": ".join(_given(field, self.file, self.field))
+        within = ": ".join(_given(field, None if self.file == file else self.file, self.field))
         return type(self)(self.what, file, within or None, self.remedy)
 
 

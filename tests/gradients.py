@@ -36,6 +36,11 @@ def surfels(folder: Path) -> mi.Scene:
     return scenes.open_scene(raw=raw, mesh=scenes.plane_mesh(folder), aovs="n:normal,d:depth,c:confidence")
 
 
+def traced(folder: Path) -> mi.Scene:
+    raw = {name.replace("indirect", "residual"): values for name, values in raw_channels().items()}
+    return scenes.scene(raw=raw, mesh=scenes.plane_mesh(folder), traced_bounces=1)
+
+
 def emitters(_: Path) -> mi.Scene:
     turned = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 40)
     sky = {"type": "envmap", "bitmap": mi.Bitmap(scenes.sky()), "to_world": turned}
@@ -63,6 +68,7 @@ def path_traced(_: Path) -> mi.Scene:
 SCENES: dict[str, tuple[Callable[[Path], mi.Scene], str]] = {
     "refgs_bsdf": (path_traced, "ball.bsdf."),
     "surfels": (surfels, ""),
+    "traced": (traced, "integrator.r"),
     "Gaussian shader": (gaussian_shader, "integrator."),
     "emitters": (emitters, "s"),
     "constant": (lambda _: scenes.lit_scene({"type": "constant"}), "sky."),

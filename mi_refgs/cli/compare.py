@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional
 
@@ -57,10 +57,11 @@ class Compare:
             except ValueError as error:
                 what = f"{' '.join(self.seeds)}: not integers"
                 raise InputError(what, "--seeds", remedy="write them as 0 1") from error
-            plugins = tuple(str(file.absolute()) for file in self.common.plugin)
-            settings = self.preset or DEFAULT_PRESET, sum(self.set, ()), self.common.mitsuba_variant
-            shared = jobs.Shared(*settings, self.common.threads or share, plugins)
-            planned = jobs.plan(self.output, self.data, methods, seeds, shared)
+            shared: dict[str, Any] = {"preset": self.preset or DEFAULT_PRESET, "settings": sum(self.set, ())}
+            shared["mitsuba_variant"] = self.common.mitsuba_variant
+            shared["threads"] = self.common.threads or share
+            shared["plugins"] = tuple(str(file.absolute()) for file in self.common.plugin)
+            planned = jobs.plan(self.output, self.data, methods, seeds, **shared)
             jobs.begin(self.output, planned, workers, sys.argv[1:])
             wanted = [job for job in planned if not jobs.finished(job)]
             say(f"{self.output}: {len(wanted)} of {len(planned)} jobs to do, {workers} at once")

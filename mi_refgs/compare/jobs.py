@@ -29,25 +29,19 @@ JOB, FAILED = "job.json", "failed.json"  # of a run folder: its job, and why it 
 MAX_SEED = 2**31 - 1
 
 
-@dataclass(frozen=True)
-class Shared:
-    """What all jobs of a comparison have in common."""
-
-    preset: str
-    settings: tuple[str, ...] = ()  # KEY=VALUE
-    mitsuba_variant: str = "llvm_ad_rgb"
-    threads: int | None = None  # None: every core
-    plugins: tuple[str, ...] = ()  # absolute paths of files to run before
-
-
 @dataclass(frozen=True, kw_only=True)
-class Job(Shared):
+class Job:
     """One fit and its evaluation, in values that can be sent to another process."""
 
     folder: str  # of the run, absolute
     data: str  # folder of the data set, absolute
     variant: str  # the method: a name of the package's, or the absolute path of a .toml
     seed: int
+    preset: str  # this and what follows have all jobs of a comparison in common
+    settings: tuple[str, ...] = ()  # KEY=VALUE
+    mitsuba_variant: str = "llvm_ad_rgb"
+    threads: int | None = None  # None: every core
+    plugins: tuple[str, ...] = ()  # absolute paths of files to run before
 
     @property
     def run(self) -> Run:
@@ -83,10 +77,10 @@ class Job(Shared):
 
 
 def plan(
-    folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], shared: Shared
+    folder: Path, data: Sequence[Path], methods: Sequence[str], seeds: Sequence[int], **shared: Any
 ) -> list[Job]:
-    """Plan and check the jobs of a comparison; seeds vary slowest. Raises InputError for data without test
-    views, methods that do not load, equal names, and a comparison or runs with other settings."""
+    """Plan and check the jobs of a comparison, with what they share; seeds vary slowest. Raises InputError
+    for data without test views, methods that do not load, equal names, and other settings than before."""
     data = [Path(os.path.abspath(path)) for path in data]  # a link keeps its own name
     for option, names, remedy in (
         ("DATA", [path.name for path in data], "give the folders different names"),
@@ -97,15 +91,15 @@ def plan(
             raise InputError(f"'{twice[0]}' is given twice", option, remedy=remedy)
     for seed in seeds:
         require_between(seed, "--seeds", 0, MAX_SEED)
-    if any(setting.partition("=")[0].strip() == "seed" for setting in shared.settings):
+    if any(setting.partition("=")[0].strip() == "seed" for setting in shared.get("settings", ())):
         raise InputError("a comparison takes its seeds from --seeds", "--set", "seed", "drop it here")
     jobs = []
     for seed, path, method in itertools.product(seeds, data, methods):
         run = str(folder.resolve() / RUNS / path.name / Path(method).stem / f"seed{seed}")
         variant = str(Path(method).resolve()) if method.endswith(".toml") else method
-        jobs.append(Job(folder=run, data=str(path), variant=variant, seed=seed, **vars(shared)))
+        jobs.append(Job(folder=run, data=str(path), variant=variant, seed=seed, **shared))
     before = settings_of(folder)
-    for option, now in (("preset", shared.preset), ("set", list(shared.settings))):
+    for option, now in (("preset", jobs[0].preset), ("set", list(jobs[0].settings))):
         if (then := before.get(option, now)) != now:
             what = f"the comparison was begun with {then}, not {now}"
             raise InputError(what, folder / SETTINGS, f"--{option}", "repeat that, or choose another -o")

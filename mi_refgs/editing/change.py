@@ -82,9 +82,10 @@ def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list
     """Return what of a fit does not follow a change: values that depend on its light."""
     shading, surfels = scene.shading, scene.surfels
     names = [assignment.name.partition(".")[0] for assignment in made]
-    indirect = shading.occlusion and surfels.has("indirect_sh") and not shading.traced_bounces
+    harmonics = "residual_sh" if shading.traced_bounces else "indirect_sh"
+    indirect = shading.occlusion and surfels.has(harmonics)
     read = {*shading.required_attributes, *surfels.primitive.widths}
-    read |= {"indirect_sh"} if indirect else set()
+    read |= {harmonics} if indirect else set()
     why = f"no image of this run depends on it (its shading is {shading.reflectance}, {shading.diffuse})"
     notes = [f"{n}: {why}" for n in names if ("radiance_sh" if n == COLOUR else n) not in read]
     lit = shading.model.light != "none" and "radiance_sh" in read
@@ -97,7 +98,7 @@ def notes_of(scene: TrainedScene, made: Sequence[Assignment], cut: bool) -> list
         )
     if indirect and (cut or {*names} - {"roughness"}):
         trace = "; --materials traces rays instead" if has_materials else ""
-        notes.append(f"interreflection (indirect_sh) stays as it was fitted{trace}")
+        notes.append(f"interreflection ({harmonics}) stays as it was fitted{trace}")
     return notes
 
 

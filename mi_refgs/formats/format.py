@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, within
 from mi_refgs.io.files import make_folder
 from mi_refgs.io.ownership import own_folder, require_no_run
 from mi_refgs.registry import Registry
@@ -108,5 +108,6 @@ def write(
             require_no_data(target)
         else:
             own_folder(target.parent if made.suffix else target, owner)
-        found[made.name] = made.writer(trained, target, shots, **own)
+        with within(target):
+            found[made.name] = made.writer(trained, target, shots, **own)
     return found

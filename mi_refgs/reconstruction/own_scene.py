@@ -40,6 +40,7 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         if not lights or not all(emitter.is_environment() for emitter in lights):
             what, remedy = "its light is not an environment alone", "nest an `envmap` in the integrator"
             raise InputError(what, "from_params", "light", remedy)
+    integrator.surfels.detach().validate()
     with dr.suspend_grad():
         seen = light_of(integrator.shading, integrator.light, integrator.light_to_world, params)
     light = integrator.light

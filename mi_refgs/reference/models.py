@@ -73,9 +73,7 @@ def split_sum(points: Points, light: Light | None, options: Options, taps: Taps)
         scattered = _looked_up(light, irradiance(light, n), base, taps)
     blocked = np.zeros_like(scattered)
     if "visibility" in values and "indirect" in values:
-        found = values["indirect"]
-        found = positive(found + values["residual"]) if "residual" in values else found
-        blocked = (1 - free) * found * reflectance
+        blocked = (1 - free) * positive(values["indirect"] + values.get("residual", 0)) * reflectance
     return [scattered, reflected, blocked]
 
 

@@ -30,7 +30,7 @@ class ShadingOptions:
     occlusion: bool = field(default=False, metadata=NOT_A_SETTING)  # trace visibility; follows from a mesh
     dominant: bool = False  # look the light up along the lobe's dominant direction, not the mirror direction
     visibility_rays: int = number(1, 1, MAX_RAYS)  # specular-lobe samples per pixel; 1: the mirror ray
-    traced_bounces: int = number(0, 0, MAX_RAYS)  # of blocked rays, in place of the indirect SH attribute
+    traced_bounces: int = number(0, 0, MAX_RAYS)  # of blocked rays, not indirect_sh; and residual_sh
     ambient_rays: int = number(0, 0, MAX_RAYS)  # per mesh vertex, for the ambient visibility; 0: unoccluded
     directions: int = number(24, 1, MAX_DIRECTIONS)  # per hemisphere; R3DG uses 64, which takes twice as long
     antialias: bool = False  # average the reflection over each pixel, at interpolated normals

@@ -39,9 +39,9 @@ class ShadingPoints:
             raise InputError("missing", "shade", name, "the reflectance model needs it, so add it")
         return self.attributes[name]
 
-    def get(self, name: str) -> Any:
-        """An attribute, or None if the points do not have it."""
-        return self.attributes.get(name)
+    def get(self, name: str, otherwise: Any = None) -> Any:
+        """An attribute, or another value if the points do not have it."""
+        return self.attributes.get(name, otherwise)
 
     def replaced(self, **attributes: Any) -> "ShadingPoints":
         """The same points with these attributes; None removes one."""

@@ -194,8 +194,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: p
     first = json.loads(capsys.readouterr().out)
     assert Path(first["contact_sheet"]).is_file() and first["metrics"]["iterations"] == 2
     written = {path: path.stat().st_mtime_ns for path in (tmp_path / "demo").rglob("*.[ep]*")}
-    assert main(command) == 0
-    assert json.loads(capsys.readouterr().out) == first
+    assert main(command) == 0 and json.loads(capsys.readouterr().out) == first
     assert {path: path.stat().st_mtime_ns for path in written} == written
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs
-from mi_refgs.compare.jobs import Job, Shared
+from mi_refgs.compare.jobs import Job
 from mi_refgs.compare.table import write
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import decide
@@ -159,7 +159,7 @@ def test_killed_cluster_worker_is_replaced(data: Path, variants: Paths, tmp_path
     """Another worker goes on from the checkpoint; the log has each iteration once."""
     distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
     settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
-    [job] = jobs.plan(tmp_path, [data], [str(variants[1])], [0], Shared("quick", settings, threads=1))
+    [job] = jobs.plan(tmp_path, [data], [str(variants[1])], [0], preset="quick", settings=settings, threads=1)
     reports, killed = list[tuple[Job, str | None]](), list[int]()
 
     def kill(address: str) -> None:
@@ -214,7 +214,7 @@ def test_different_sizes_are_refused(compared: Path, data: Path, variants: Paths
         refused(command(data, folder, *chosen), "20 × 20", "10 × 10", "smaller")
         assert not (folder / "runs/ball/smaller").exists()
     photographs = write_open_data(tmp_path / "open")  # are scored at one size
-    assert jobs.plan(tmp_path / "new", [photographs], [str(variants[0]), str(smaller)], [0], Shared("quick"))
+    assert jobs.plan(tmp_path / "new", [photographs], [str(variants[0]), str(smaller)], [0], preset="quick")
     metrics = copy / "runs/ball/other/seed1/metrics.json"
     metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"image_size": [10, 10]}))
     refused(["compare", "-o", copy], "20 × 20", "10 × 10", "runs/ball/other/seed1")
@@ -237,7 +237,7 @@ def test_unreadable_run_is_a_failed_row(compared: Path, tmp_path: Path) -> None:
 
 def test_a_decided_run_is_accepted(data: Path, tmp_path: Path) -> None:
     """A finished fit that went on with another method is not taken for one of other settings."""
-    job = jobs.plan(tmp_path / "out", [data], ["auto"], [0], Shared("quick", threads=1))[0]
+    job = jobs.plan(tmp_path / "out", [data], ["auto"], [0], preset="quick", threads=1)[0]
     rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x")]
     chosen = decide.as_decided(job.method(), rows)
     job.run.create(chosen, str(data))

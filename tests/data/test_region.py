@@ -30,16 +30,12 @@ def test_region_pixels_are_those_whose_rays_hit_it(planes: tuple[Plane, ...]) ->
         view = replace(view_from(np.array(origin)), width=30, height=20, fx=25.0, fy=28.0, cx=12.0, cy=11.0)
         rays = unit(np.array(view.camera().rays()).T)
         steps = origin + np.linspace(0, 6, 3000)[:, None, None] * rays
-        sure, never = (replace(region, radius=0.4 + e, planes=shifted(region, -e)) for e in (-4e-3, 4e-3))
+        moved = {e: tuple((a, b, c, d - e) for a, b, c, d in region.planes) for e in (-4e-3, 4e-3)}
+        sure, never = (replace(region, radius=0.4 + e, planes=planes) for e, planes in moved.items())
         found = region_pixels(view, region).ravel()
         assert np.all(found[sure.contains(steps).any(axis=0)])
         assert not np.any(found[~never.contains(steps).any(axis=0)]) and found.any()
     assert not region_pixels(view_from(np.array([2.0, 1.0, 0.5])), Region((6.0, 3.0, 1.5), 0.4)).any()
-
-
-def shifted(region: Region, distance: float) -> tuple[Plane, ...]:
-    """The planes of a region, moved along their normals."""
-    return tuple((a, b, c, d + distance) for a, b, c, d in region.planes)
 
 
 def test_contraction_is_identity_inside_and_bounded_by_two() -> None:

@@ -35,10 +35,6 @@ TRACED_LIGHT: dict[str, Any] = {"diffuse": "irradiance", "ambient_rays": 32, "vi
 TRACED_LIGHT["traced_bounces"] = 1
 
 
-def camera_at(pose: np.ndarray) -> Camera:
-    return Camera.from_pose(SIZE, SIZE, -1.6 * SIZE, -1.6 * SIZE, SIZE / 2, SIZE / 2, pose, 0.01)
-
-
 FRONT = look_at(np.array([0.3, -3.2, 0.7]), np.zeros(3))
 
 
@@ -59,7 +55,8 @@ def balls(light: Any = None, **shading: Any) -> TrainedScene:
 
 def image(scene: TrainedScene, pose: np.ndarray = FRONT) -> np.ndarray:
     """Premultiplied linear RGBA (H·W, 4)."""
-    frame = scene.renderer(aovs=False)(camera_at(pose))
+    camera = Camera.from_pose(SIZE, SIZE, -1.6 * SIZE, -1.6 * SIZE, SIZE / 2, SIZE / 2, pose, 0.01)
+    frame = scene.renderer(aovs=False)(camera)
     return np.stack([np.array(x, np.float64) for x in (*frame.radiance, frame.alpha)], axis=1)
 
 
@@ -228,8 +225,7 @@ def test_an_edited_run_is_a_run(finished: Path, tmp_path: Path, capsys: pytest.C
     out = capsys.readouterr().out
     assert main(["edit", str(new), "-o", str(newer), "--set", "metallic=0.25", "--json"]) == 0
     second = json.loads(capsys.readouterr().out)
-    assert contents(finished) == before
-    assert not (new / "checkpoints").exists()
+    assert contents(finished) == before and not (new / "checkpoints").exists()
     record = json.loads((newer / "edit.json").read_text())["edits"]
     assert [edit["selected"] == edit["of"] for edit in record] == [False, True]
     assert record[0]["where"] == "x > 0" and record[0]["set"] == ["roughness=0.5"]

@@ -226,8 +226,7 @@ def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: 
     step_to(trainer, 25)
     assert trainer.fit.occluder.vertex_surfels is at_vertices  # found once per mesh
     after, _, misses_after = dr.detail.launch_stats()
-    assert misses_after == misses
-    assert (after - launches) / 3 < most
+    assert misses_after == misses and (after - launches) / 3 < most
 
 
 def test_shared_light_learns_sum_of_gradients(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:

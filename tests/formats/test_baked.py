@@ -253,4 +253,5 @@ def test_incomplete_runs(exported: Exported, tmp_path: Path, change: dict[str, A
         raw = exported.trained.surfels.raw.items()
         change = {"surfels": Surfels({k: v for k, v in raw if k not in ("albedo", "metallic")})}
     scene = replace(exported.trained, shading=Shading(diffuse="irradiance", occlusion=False), **change)
-    assert refused(lambda: write(scene, ["mitsuba"], tmp_path, exported.shots)).startswith(message)
+    found = refused(lambda: write(scene, ["mitsuba"], tmp_path, exported.shots))
+    assert found.startswith(f"{tmp_path}: {message}")

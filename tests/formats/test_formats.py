@@ -78,7 +78,7 @@ def test_several_formats_are_written_into_a_folder(plain: list[Any], finished: P
             "--level: no option of cameras; leave it out, or choose a format that has it (plain)",
         ),
         (["--to", "plain", "-o", "OUT.ply"], "suffix: plain writes .txt"),
-        (["--to", "exr", "-o", "OUT.exr", "--view", "9"], "--view: 9 is out of range; give 0 to 4"),
+        (["--to", "exr", "-o", "OUT.exr", "--view", "9"], "exr: --view: 9 is out of range; give 0 to 4"),
         (["--to", "gltf-mesh", "-o", "OUT.glb", "--faces=3"], "--faces: 3 is out of range"),
     ],
 )

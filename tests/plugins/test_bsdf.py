@@ -111,8 +111,7 @@ def test_white_furnace_is_the_split_sum(roughness: float) -> None:
         wi = seen_at(n_dot_v)
         a, b = (x[0] for x in split_sum(mi.Float(n_dot_v), mi.Float(roughness)))
         white = mean_weight(mi.load_dict(bsdf(roughness, 1.0, 1.0)), wi)
-        assert abs(white.x[0] - (a + b)) < 2e-3
-        assert white.x[0] <= 1 + 1e-5
+        assert abs(white.x[0] - (a + b)) < 2e-3 and white.x[0] <= 1 + 1e-5
         mixed = mi.load_dict(bsdf(roughness, 0.25))
         f0 = 0.04 * 0.75 + 0.25 * ALBEDO
         diffuse = (1 - f0 * a - b) * 0.75 * ALBEDO

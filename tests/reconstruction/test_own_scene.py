@@ -66,6 +66,9 @@ def test_other_states_are_refused(balls: Reconstruction) -> None:
     refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
     refused(lambda: make(arrays), "shading: light: reflectance = split_sum needs one")
     refused(lambda: make(arrays | {"opacity": np.full_like(arrays["opacity"], np.nan)}), "NaN")
+    params = mi.traverse(balls.scene())
+    params.update({"refgs.opacity": params["refgs.opacity"] * np.nan})
+    refused(lambda: make(params), "NaN")
     sun = {"type": "directional", "direction": [0, 0, -1]}
     surfels = {"type": "refgs", **balls.trained.surfels.raw, "reflectance": "split_sum"}
     lit = mi.load_dict({"type": "scene", "refgs": surfels, "sun": sun})

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +12,7 @@ from scipy.ndimage import minimum_filter
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference.image import bilinear_map
 from mi_refgs.render.antialias import averaged
-from mi_refgs.render.pipeline import SurfelScene, render
+from mi_refgs.render.pipeline import Request, SurfelScene, render
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.shade.shading import Shading
@@ -65,24 +66,39 @@ def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
             np.testing.assert_allclose(0 * wanted if term is None else term.numpy(), wanted, atol=1e-5)
 
 
-def test_rays_of_nodes_leave_from_their_own_places(rng: np.random.Generator) -> None:
-    """On a plane mirror before a wall, traced radiance is the mean of images whose pixels are moved."""
-    wall = corner.wall_surfels(rng.normal(size=(400, 3))).to_numpy()
+def mirror_before_wall(x: float = 0, y: float = 0, more: Any = (), **options: Any) -> Any:
+    """A plane mirror before a wall, in pixels moved by (x, y); all surfels have `more` attributes."""
+    wall = corner.wall_surfels(np.random.default_rng(0).normal(size=(400, 3))).to_numpy()
     floor = discs(position=[[0.6, 0, 0]], rotation=[[-1, 0, 0, 1]], scale=[[3.0, 3.0]])
     raw = {name: np.concatenate([x, np.reshape(floor.get(name, x[0]), (1, -1))]) for name, x in wall.items()}
-    surfels = Surfels.from_numpy(raw)
+    raw |= {name: np.tile(np.float32(values), (401, 1)) for name, values in dict(more).items()}
+    surfels, shading = Surfels.from_numpy(raw), Shading(diffuse="irradiance", occlusion=True, **options)
     light = EnvironmentLight.from_radiance(corner.gradient_sky()).prefilter()
     view = Camera.look_at(corner.EYE, (0.7, 0, 0), (0, 1, 0), fov=9, size=8)
+    scene = SurfelScene(surfels, shading, light, corner.with_materials(corner.corner(), surfels))
+    return render(scene, replace(view, cx=view.cx - x, cy=view.cy - y), Request(("indirect",)))
 
-    def image(view: Camera, antialias: bool = False) -> np.ndarray:
-        shading = Shading(diffuse="irradiance", occlusion=True, traced_bounces=1, antialias=antialias)
-        scene = SurfelScene(surfels, shading, light, corner.with_materials(corner.corner(), surfels))
-        return render(scene, view).radiance.numpy()
 
+def test_rays_of_nodes_leave_from_their_own_places() -> None:
+    """Traced radiance is the mean of images whose pixels are moved."""
     steps = itertools.product(NODES.tolist(), repeat=2)
-    expected = sum(image(replace(view, cx=view.cx - x, cy=view.cy - y)) / 4 for x, y in steps)
-    np.testing.assert_allclose(image(view, antialias=True), expected, atol=1e-5)
-    assert np.abs(image(view) - expected).max() > 1e-3
+    expected = sum(mirror_before_wall(*step, traced_bounces=1).radiance.numpy() / 4 for step in steps)
+    found, centre = (mirror_before_wall(traced_bounces=1, antialias=each).radiance for each in (True, False))
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
+    assert np.abs(centre.numpy() - expected).max() > 1e-3
+
+
+def test_residual_adds_to_what_rays_meet() -> None:
+    """As much as `indirect_sh` of these values are alone, and never so that less than nothing is left."""
+
+    def indirect(bounces: int, **more: Any) -> Any:
+        return mirror_before_wall(more=more, traced_bounces=bounces).terms.indirect.numpy()
+
+    some = [1.5, 1.6, 1.7, 0.1, -0.2, 0.1, 0.2, 0.1, -0.2, 0.3, -0.1, 0.2]  # positive in all directions
+    met, added = indirect(1), indirect(0, indirect_sh=some)
+    np.testing.assert_allclose(indirect(1, residual_sh=some), met + added, atol=1e-5)
+    np.testing.assert_allclose(indirect(1, indirect_sh=some), met, atol=1e-6)
+    assert added.max() > 0.05 and not indirect(1, residual_sh=[-50.0, -50.0, -50.0]).any()
 
 
 def test_points_integrate_cubic_radiance_exactly() -> None:

@@ -117,5 +117,4 @@ def test_rays_start_at_covered_pixels_only(
 
     monkeypatch.setattr(Occluder, "first_hit", counted)
     covered = int((made.renderer()(view(0.4)).alpha.numpy() > 1e-3).sum())
-    assert 0 < covered < 0.7 * WIDTH * HEIGHT
-    assert hits == [covered]
+    assert 0 < covered < 0.7 * WIDTH * HEIGHT and hits == [covered]

@@ -33,8 +33,8 @@ def test_relightable_recovers_albedo_from_fitted_radiance(known: Path, with_mesh
     constant = (0.96 * irradiance * truth - mean - 0.5) / SH_DC
     linear = -slope[:, :, [1, 2, 0]] * [1, -1, 1] / np.sqrt(3 / (4 * np.pi))
     raw["radiance_sh"] = np.concatenate([constant, linear.transpose(0, 2, 1).reshape(-1, 9)], 1).astype("f4")
-    wrong = raw | {name: np.zeros((len(truth), 3), np.float32) for name in ("albedo", "indirect_sh")}
-    scene = TrainedScene(Surfels.from_numpy(wrong), light, mesh, Shading(occlusion=with_mesh), 1, 0.0)
+    others = dict.fromkeys(("albedo", "indirect_sh", "residual_sh"), np.zeros((len(truth), 3), np.float32))
+    scene = TrainedScene(Surfels.from_numpy(raw | others), light, mesh, Shading(occlusion=with_mesh), 1, 0.0)
     found = relightable(scene)
     assert set(found.surfels.raw) == set(raw) - {"radiance_sh"}
     assert found.shading.diffuse == "irradiance" and found.light is light

@@ -83,10 +83,8 @@ def test_limits_of_the_lobe() -> None:
 
 def true_fraction(place: np.ndarray, points: ShadingPoints, roughness: float, f0: float) -> np.ndarray:
     def fraction(p: np.ndarray, v: np.ndarray) -> Any:
-        def free(d: np.ndarray) -> np.ndarray:
-            return (~wall_blocks(p, d)[0])[:, None].astype(float)
-
-        return exact.traced_fraction(free, np.array([0, 1.0, 0]), unit(v), roughness, f0, 160)
+        seen = np.array([0, 1.0, 0]), unit(v), roughness, f0, 160
+        return exact.traced_fraction(lambda d: (~wall_blocks(p, d)[0])[:, None].astype(float), *seen)
 
     return np.array([*map(fraction, place, points.view.numpy().T.astype(np.float64))])
 

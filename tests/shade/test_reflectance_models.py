@@ -146,9 +146,8 @@ def test_degenerate_points_stay_finite(shading: Shading, names: tuple[str, ...])
     ends = (-1.0, 0.0, 0.3, 1.0, 7.0), (0.0, 1.0), (0.0, 0.5, 1.0, 1.5, -3.0, 1e6)
     n, v, r, m, a = (np.array(x, np.float64) for x in zip(*product(normals, views, *ends), strict=True))
     values = shading_values(np.random.default_rng(0), names, len(a))
-    extreme = {"normal": n, "view": v, "roughness": r, "metallic": m}
+    extreme = {"normal": n, "view": v, "roughness": r, "metallic": m, "indirect": 0 * n, "residual": 0 * n}
     extreme |= {"albedo": np.tile(a[:, None], 3), "tint": np.tile(a[:, None], 3)}
-    extreme |= {"indirect": 0 * n, "residual": 0 * n}
     points = points_of(values | {name: x for name, x in extreme.items() if name in values})
     leaves = [part for name in values if name != "free" for part in flat(getattr(points, name))]
     raw = EnvironmentLight.from_radiance(MAP).raw

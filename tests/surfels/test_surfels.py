@@ -91,7 +91,7 @@ def everything(surfels: Surfels) -> object:
     arrays += [entry for name in ("albedo", "tint", "normal_offset") for entry in surfels.value(name)]
     turns = surfels.primitive.turns(surfels, surfels.frame()[2])
     arrays += [entry for turn in turns.values() for entry in turn]
-    harmonics = [name for name in ATTRIBUTES if ATTRIBUTES[name].harmonics]
+    harmonics = (name for name in ATTRIBUTES if ATTRIBUTES[name].harmonics)
     arrays += [x for name in harmonics for colour in surfels.value(name) for x in colour]
     generator = np.random.default_rng(9)
     total = mi.Float(0)

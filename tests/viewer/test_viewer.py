@@ -96,8 +96,7 @@ def test_a_page_at_the_pose_of_a_test_view_renders_its_image(scene: TrainedScene
     draw, size = scene.renderer(aovs=False), (view.height, view.width)
     wanted = image_array(draw(view.camera()).radiance, *size)
     found = image_array(draw(back.camera(view.width, view.height)).radiance, *size)
-    assert wanted.max() > 0.1
-    assert np.abs(found - wanted).max() < 1e-5
+    assert wanted.max() > 0.1 and np.abs(found - wanted).max() < 1e-5
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 2, 3)])
@@ -223,8 +222,7 @@ def test_coarse_images_are_delivered_during_motion(loop: Loop) -> None:
     """Each is outdated by the time that it is drawn."""
     loop.plain.during = lambda: loop.move(fov=0.7 + 0.01 * len(loop.plain.cameras))
     loop.plain.during()
-    assert [loop.step() for _ in range(5)] == [0] * 5
-    assert len(loop.seen) == 5
+    assert [loop.step() for _ in range(5)] == [0] * 5 and len(loop.seen) == 5
     assert loop.plain.fovs() == pytest.approx([0.7 + 0.01 * i for i in range(5)])
 
 

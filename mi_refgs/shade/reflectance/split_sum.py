@@ -60,8 +60,7 @@ class SplitSum(Reflectance):
         if options.occlusion and surfels.has(name):
             # The mirror direction of the surfel's centre [Ref-Gaussian, §3.3]; starts at exactly 0 and must
             # train from there.
-            mirrored = reflect(view=-seen.direction, normal=seen.normal)
-            found = eval_sh(surfels.value(name), mirrored)
+            found = eval_sh(surfels.value(name), reflect(view=-seen.direction, normal=seen.normal))
             values |= {"residual": found} if options.traced_bounces else {"indirect": clamp_positive(found)}
         return values
 
@@ -69,10 +68,10 @@ class SplitSum(Reflectance):
         """Outgoing radiance towards the camera, as separate terms.
 
         With F0 = 0.04 (1 - metallic) + albedo metallic, S = F0 A(n·v, roughness) + B and the reflected
-        direction r (`lookup_direction`): specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, and
-        diffuse = (1 - metallic) radiance ("sh") or (1 - S) (1 - metallic) albedo irradiance(n) ambient
-        ("irradiance"; see `shade.ambient`). A point seen from behind keeps its mirror direction, with the
-        reflectance at grazing incidence. Under a constant light of 1 no more than 1 leaves with "irradiance".
+        direction r (`lookup_direction`): specular = V L(r, roughness) S, indirect = (1 - V) L_indirect S, of
+        `indirect` + `residual`, diffuse = (1 - metallic) radiance ("sh") or (1 - S) (1 - metallic) albedo
+        irradiance(n) ambient ("irradiance"; see `shade.ambient`). A point seen from behind keeps its mirror
+        direction, at grazing incidence. Under a constant light of 1 no more than 1 leaves with "irradiance".
 
         Finite for every finite input. Raises InputError for "sh" without a radiance."""
         # Directional reflectance, and the light in the specular lobe.
@@ -85,13 +84,11 @@ class SplitSum(Reflectance):
 
         # Visibility of that light, and what blocks it.
         indirect = None
-        visibility, blocking = points.get("visibility"), points.get("indirect")
+        visibility, met = points.get("visibility"), points.get("indirect")
         if visibility is not None:
             specular *= visibility
-            if blocking is not None:
-                if (residual := points.get("residual")) is not None:
-                    blocking = clamp_positive(blocking + residual)
-                indirect = (1 - visibility) * blocking * reflectance
+            if met is not None:
+                indirect = (1 - visibility) * clamp_positive(met + points.get("residual", 0)) * reflectance
 
         # Diffuse base under the specular layer.
         if options.diffuse == "irradiance":
