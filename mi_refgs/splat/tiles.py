@@ -71,9 +71,9 @@ def list_by_tile(
         depth = primitive.depth_near(row, corner + tile_size / 2)
         pairs = [mi.UInt32(tile_y * camera.tiles[0] + tile_x), surfel, depth]
         # Those that overlap are scattered: to gather them by `dr.compress` takes four times as long.
-        rank = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt32(overlaps), exclusive=False)
-        dr.eval(overlaps, pairs, rank)
-        kept = int(rank[-1])
+        place = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt32(overlaps), exclusive=False)
+        dr.eval(overlaps, pairs, place)
+        kept = int(place[-1])
         count += kept
         if count > 1 << MAX_PAIR_BITS:
             size = f"{tiles:,} tiles of {camera.width} × {camera.height} pixels"
@@ -83,7 +83,7 @@ def list_by_tile(
         if kept:
             found.append([dr.empty(type(values), kept) for values in pairs])
             for part, values in zip(found[-1], pairs, strict=True):
-                dr.scatter(part, values, rank - 1, overlaps, mode=dr.ReduceMode.NoConflicts)
+                dr.scatter(part, values, place - 1, overlaps, mode=dr.ReduceMode.NoConflicts)
             dr.eval(found[-1])
     if not found:
         none = dr.zeros(mi.UInt32, tiles)

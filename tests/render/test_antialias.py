@@ -66,8 +66,8 @@ def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
             np.testing.assert_allclose(0 * wanted if term is None else term.numpy(), wanted, atol=1e-5)
 
 
-def mirror_before_wall(x: float = 0, y: float = 0, more: Any = (), **options: Any) -> Any:
-    """A plane mirror before a wall, in pixels moved by (x, y); all surfels have `more` attributes."""
+def mirror_before_wall(dx: float = 0, dy: float = 0, more: Any = (), **options: Any) -> Any:
+    """A plane mirror before a wall, in pixels moved by (dx, dy); all surfels have `more` attributes."""
     wall = corner.wall_surfels(np.random.default_rng(0).normal(size=(400, 3))).to_numpy()
     floor = discs(position=[[0.6, 0, 0]], rotation=[[-1, 0, 0, 1]], scale=[[3.0, 3.0]])
     raw = {name: np.concatenate([x, np.reshape(floor.get(name, x[0]), (1, -1))]) for name, x in wall.items()}
@@ -76,7 +76,7 @@ def mirror_before_wall(x: float = 0, y: float = 0, more: Any = (), **options: An
     light = EnvironmentLight.from_radiance(corner.gradient_sky()).prefilter()
     view = Camera.look_at(corner.EYE, (0.7, 0, 0), (0, 1, 0), fov=9, size=8)
     scene = SurfelScene(surfels, shading, light, corner.with_materials(corner.corner(), surfels))
-    return render(scene, replace(view, cx=view.cx - x, cy=view.cy - y), Request(("indirect",)))
+    return render(scene, replace(view, cx=view.cx - dx, cy=view.cy - dy), Request(("indirect",)))
 
 
 def test_rays_of_nodes_leave_from_their_own_places() -> None:
