@@ -15,7 +15,6 @@ import argparse
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from benchmarks import pages, plots
 from benchmarks.common.build import RESULTS, commit, recorded, write_result
 from benchmarks.common.report import plain_parser
 from benchmarks.common.view import ROOT
-from benchmarks.fits import DECIDED, GROUPS, TIMED, Fit, Workplace, group
+from benchmarks.fits import DECIDED, GROUPS, TIMED, Workplace, group
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import is_file, read_json
 
@@ -41,15 +40,7 @@ class Part:
     arguments: str = ""
 
 
-TRACING = {"front": 5, "decisions": 20, "photographs": 14}  # minutes of path tracing in a group
-
-
-def _fits() -> Iterator[Part]:
-    done: set[Fit] = set()  # a fit of two groups is measured once
-    for name, fits in GROUPS.items():
-        minutes = sum(fit.minutes for fit in {*fits} - done) + TRACING.get(name, 0)
-        yield Part(name, round(minutes))
-        done |= {*fits}
+TRACING = {"images": 20, "photographs": 14}  # minutes of path tracing in a group
 
 
 PARTS = (
@@ -58,7 +49,10 @@ PARTS = (
     Part("visibility", 4, "--mesh {data}/meshes/bob_tri.obj"),
     Part("endtoend", 4),
     Part("stability", 15),
-    *_fits(),
+    *(
+        Part(name, round(sum(fit.minutes for fit in fits)) + TRACING.get(name, 0))
+        for name, fits in GROUPS.items()
+    ),
     Part("frames", 2, "--run {run}"),
     Part("oracle", 20, "{runs}"),
 )

@@ -74,10 +74,9 @@ class Fit:
 
     source: str
     method: str = "auto"
-    preset: str = "standard"
+    preset: str = "quick"
     threads: int = 1
     seed: int = 0
-    samples: int | None = None  # per pixel, of a second evaluation
 
     @property
     def name(self) -> str:
@@ -88,32 +87,27 @@ class Fit:
     @property
     def minutes(self) -> float:
         """Expected time with its evaluation, on an idle machine."""
-        length = SOURCES[self.source].minutes * (2 if self.preset == "standard" else 1)
         factors = {"relighting": 1.6, "auto": 1.0, "photographs": 2.4, "photographs_relighting": 2.4}
-        factor = factors.get(self.method, 0.8)
-        return length * factor + (self.samples or 0) / 8
+        return SOURCES[self.source].minutes * factors.get(self.method, 0.8)
 
 
-RING = Fit("mirror_ring", samples=4)
 SHINY = ("mirror_ring", "gold_cavities", "plastic_hollows")
 ROOMS = ("tabletop", "figure", "can")
 ABLATIONS = """ref_gaussian gaussians_3d no_interreflection no_material_aware no_pbr no_initial_stage
     no_deferred ref_gaussian_paper base_3dgs_dr base_gaussian_shader base_r3dg base_3dgs base_2dgs""".split()
 DECIDED_SCENES = ("mirror_ring", "glossy_demo", "chair", "studded", "plastic_hollows")
-DECIDED = [Fit(name, preset="quick", samples=16) for name in DECIDED_SCENES]
+DECIDED = [Fit(name) for name in DECIDED_SCENES]
 TIMED = DECIDED[0]  # the fit of which frames and the viewer are timed
 
 GROUPS: dict[str, list[Fit]] = {
-    "front": [RING, *(Fit(RING.source, method) for method in ("base_3dgs_dr", "base_2dgs", "relighting"))],
-    "decisions": DECIDED,
-    "images": [fit for own in DECIDED for fit in (own, Fit(own.source, "base_2dgs", "quick"))],
-    "relighting": [Fit(name, "relighting", "quick") for name in SHINY],
-    "methods": [Fit("glossy_demo", method, "quick") for method in ABLATIONS],
+    "images": [fit for own in DECIDED for fit in (own, Fit(own.source, "base_2dgs"))],
+    "relighting": [Fit(name, "relighting") for name in SHINY],
+    "methods": [Fit("glossy_demo", method) for method in ABLATIONS],
     "photographs": [
-        *(Fit(name, method, "quick") for name in ROOMS for method in ("photographs", "base_3dgs")),
-        Fit("glass_shelf", "photographs", "quick"),
+        *(Fit(name, method) for name in ROOMS for method in ("photographs", "base_3dgs")),
+        Fit("glass_shelf", "photographs"),
     ],
-    "photographs_relighting": [Fit(name, "photographs_relighting", "quick") for name in ROOMS],
+    "photographs_relighting": [Fit(name, "photographs_relighting") for name in ROOMS],
 }
 
 SCORES = """psnr_aligned psnr_aligned_region psnr psnr_region normal_mae_deg normal_mae_deg_concave
@@ -185,9 +179,6 @@ def _fitted(fit: Fit, data: Path, run: Path, place: Workplace) -> Row:
     options += ["--resume"] if run.exists() else []
     trained = refgs("train", data, "-o", run, "--preset", preset, *options)
     row: Row = {"decisions": trained.get("decisions", [])}
-    if fit.samples is not None:
-        scores = refgs("eval", run, "--samples", fit.samples, *threads)
-        row |= {"psnr_samples": scores["psnr"], "error_budget_samples": scores["error_budget"]}
     scores = refgs("eval", run, *threads)
     row |= {key: scores[key] for key in SCORES}
     if fit.method == "relighting":

@@ -38,7 +38,7 @@ FORMS = {
     "surfels": "{:,.0f}",
 }
 """How a number of a row is written; others are dB."""
-NUMBERS = ("psnr", "psnr_samples", "psnr_region", "albedo_psnr", *FORMS)
+NUMBERS = ("psnr", "psnr_region", "albedo_psnr", "relit_least", "relit_most", *FORMS)
 Column = tuple[str, str, dict[str, Any]]  # title; key; the rows of which it is, by their values
 
 
@@ -66,16 +66,14 @@ def _rooms(rows: list[Row]) -> list[Column]:
 
 
 TABLES: dict[str, tuple[Callable[[Row], str], Callable[[list[Row]], list[Column]]]] = {
-    "front": (_fit, lambda rows: _columns("PSNR=psnr", *SHAPE[:2], *TIME)),
     "images": (
         _about,
         lambda rows: [
-            *_columns("PSNR=psnr", "4 × 4 samples=psnr_samples", method="auto"),
+            *_columns("PSNR=psnr", *SHAPE, method="auto"),
             *_columns("2DGS, PSNR=psnr", "2DGS, normals=normal_mae_deg", method="base_2dgs"),
-            *_columns(*SHAPE, *TIME, method="auto"),
+            *_columns(*TRIALS, *TIME, method="auto"),
         ],
     ),
-    "decisions": (_fit, lambda rows: _columns(*TRIALS, "PSNR=psnr", *SHAPE[:2], *TIME)),
     "relighting": (
         _about,
         lambda rows: _columns(
@@ -113,12 +111,8 @@ def fits(group: str, result: Result) -> Values:
     found = {"table": table(["", *(head for head, _, _ in chosen)], body)}
     for row in reversed(rows):
         found |= {f"{row['source']}_{row['method']}_{key}": _cell([row], key) for key in NUMBERS}
-    scores = [score for row in rows for score in row.get("relit", {}).values()]
-    if relit := [score for score in scores if score is not None]:
-        found |= {"relit_least": f"{min(relit):.1f} dB", "relit_most": f"{max(relit):.1f} dB"}
-    if fine := rows[0].get("error_budget_samples"):
-        budget = rows[0]["error_budget"]
-        found["budget"] = _error_budget(budget, fine)
+    if budget := rows[0].get("error_budget"):
+        found["budget"] = _error_budget(budget)
         for name, of in budget.items():
             found |= {f"budget_{name}_{key}": _share(of[key]) for key in ("pixels", "squared_error")}
     return found
@@ -127,7 +121,9 @@ def fits(group: str, result: Result) -> Values:
 def _flat(row: Row) -> Row:
     """Return the row with its minutes, relit scores and trials as entries."""
     found = row | {"train_minutes": row["train_seconds"] / 60}
-    found |= {f"relit_{name}": score for name, score in row.get("relit", {}).items()}
+    if relit := row.get("relit"):
+        found |= {f"relit_{name}": score for name, score in relit.items()}
+        found |= {"relit_least": min(relit.values()), "relit_most": max(relit.values())}
     for trial in (trial for trial in row["decisions"] if trial["psnr_with"] is not None):
         gain = trial["psnr_with"] - trial["psnr_without"]
         found[trial["component"]] = f"{gain:+.1f} dB: {'chosen' if trial['stays'] else 'left out'}"
@@ -148,13 +144,12 @@ def _share(x: float) -> str:
     return f"{100 * x:.1f} %"
 
 
-def _error_budget(budget: dict[str, Any], fine: dict[str, Any]) -> str:
+def _error_budget(budget: dict[str, Any]) -> str:
     lines = []
     for name, found in budget.items():
-        angle = _cell([found], "normal_mae_deg")
-        squared = _share(found["squared_error"]), angle, _share(fine[name]["squared_error"])
-        lines.append([PIXEL_CLASSES[name], _share(found["pixels"]), *squared])
-    return table(["class", "pixels", "squared error", "normal error", "squared error, 4 × 4 samples"], lines)
+        shares = _share(found["pixels"]), _share(found["squared_error"])
+        lines.append([PIXEL_CLASSES[name], *shares, _cell([found], "normal_mae_deg")])
+    return table(["class", "pixels", "squared error", "normal error"], lines)
 
 
 # ---------- Splatter ----------

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import all as everything, pages, plots, tables
 from benchmarks.common.build import RESULTS, merged, read_result, recorded, write_result
-from benchmarks.fits import GROUPS, RING, SOURCES, Fit
+from benchmarks.fits import GROUPS, SOURCES, TIMED, Fit
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.scores import PIXEL_CLASSES
 from tests.helpers import ROOT, run_process
@@ -44,7 +44,7 @@ def test_measured_numbers_have_a_data_file(page: str) -> None:
 def row(**values: Any) -> dict[str, Any]:
     """The row of a fit as `benchmarks.fits` leaves it."""
     keys = (*tables.NUMBERS, "error_budget")
-    found = {"source": RING.source, "method": "auto", "preset": "quick", "threads": 1, "decisions": []}
+    found = {"source": TIMED.source, "method": "auto", "preset": "quick", "threads": 1, "decisions": []}
     found |= dict.fromkeys(keys, None) | {"psnr": 28.04, "train_seconds": 90.0, "build": "abc"}
     return found | values
 
@@ -54,25 +54,25 @@ def results(tmp_path: Path) -> Path:
     """A folder with two data files of one build."""
     build = recorded(dict)["build"] | {"commit": "abc", "clean": True}
     first = {"build": build, "seconds": 1.0, "rows": [row(), row(psnr=30.04), row(source="chair")]}
-    write_result(tmp_path / "front.json", first)
+    write_result(tmp_path / "images.json", first)
     write_result(tmp_path / "frames.json", {"build": build, "seconds": 1.0, "frames": [{"frame_ms": 7}]})
     return tmp_path
 
 
 def test_markers_are_filled(results: Path) -> None:
-    names = ("front.mirror_ring_auto_psnr", "frames.frames_0_frame_ms", "images.not_measured")
+    names = ("images.mirror_ring_auto_psnr", "frames.frames_0_frame_ms", "relighting.not_measured")
     text = " ".join(f"<!-- {name} -->?<!-- / -->" for name in names)
     assert re.sub(r"<!--.*?-->", "", pages.filled(text, results)) == "28.0 dB 7.00 ?"
-    found = pages.filled("<!-- front.table -->?<!-- / -->", results)
+    found = pages.filled("<!-- images.table -->?<!-- / -->", results)
     assert "| 29.0 dB ± 1.4 dB |" in found and "*Commit abc, " in found and "load " in found
     assert pages.filled(found, results) == found
     with pytest.raises(InputError, match="correct the marker"):
-        pages.filled("<!-- front.nothing -->?<!-- / -->", results)
+        pages.filled("<!-- images.nothing -->?<!-- / -->", results)
 
 
 def test_results_of_several_builds_are_refused(results: Path) -> None:
     with pytest.raises(InputError, match="several builds"):
-        tables.fits("front", {"build": {"commit": "abc"}, "rows": [row(), row(build="abd")]})
+        tables.fits("images", {"build": {"commit": "abc"}, "rows": [row(), row(build="abd")]})
     first = pages.values(results / "frames.json")["about"]
     with pytest.raises(InputError, match="abc and abd; measure all with one"):
         merged([first, first | {"commit": "abd"}])
@@ -91,7 +91,7 @@ def test_fits_exist() -> None:
     for group, planned in GROUPS.items():
         names = {f"{fit.source}_{fit.method}_{key}" for fit in planned for key in tables.NUMBERS}
         names |= {f"budget_{kind}_{key}" for kind in PIXEL_CLASSES for key in ("pixels", "squared_error")}
-        assert pages.names_of(group) <= names | {"table", "budget", "relit_least", "relit_most"}
+        assert pages.names_of(group) <= names | {"table", "budget"}
 
 
 @pytest.mark.parametrize("group", GROUPS)
