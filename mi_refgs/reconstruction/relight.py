@@ -41,7 +41,7 @@ FITTED_COLOUR = (
     "its diffuse part was fitted as a colour; albedo is that colour divided by the irradiance of the fitted "
     "light, with the errors of that light; `refgs train --for relighting` fits materials"
 )
-INSIDE = 0.99  # alpha from which a pixel is inside the object: the coverage of edges does not depend on light
+INSIDE = 0.99  # of the largest alpha: from there a pixel is inside, as coverage of edges depends on no light
 
 
 def relight(
@@ -155,7 +155,7 @@ def common_scale(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.
     """Fit the scale of radiance per channel (3,), which light and albedo of a fit share, by least squares of
     displayed colours inside the object over all images; 1 for a channel that is black in either."""
     a, b = (np.concatenate([p.reshape(-1, 4) for p in images]).astype(np.float64) for images in (ours, truth))
-    inside = np.flatnonzero(np.minimum(a[:, 3], b[:, 3]) > INSIDE)
+    inside = np.flatnonzero((alpha := np.minimum(a[:, 3], b[:, 3])) > INSIDE * min(1, alpha.max()))
     a, b = (x[inside[:: max(1, len(inside) // 200_000)]] for x in (a, b))
     scale = np.ones(3)
     for c in range(3):
