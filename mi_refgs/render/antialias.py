@@ -42,14 +42,14 @@ def averaged(
             near = sum(neighbours(blocked, camera.width, camera.height, STEPS, pixels), blocked) > 0
             nodes = _traced(nodes, trace, dr.compress(near))
     found = [shade(node).known() for node in nodes]
-    mean = {name: sum(terms[name] for terms in found) / len(found) for name in found[0]}
-    return RadianceTerms(**mean)
+    return RadianceTerms(**{name: sum(terms[name] for terms in found) / len(found) for name in found[0]})
 
 
 def _traced(nodes: list[ShadingPoints], trace: Trace, chosen: UInt32) -> list[ShadingPoints]:
     """The nodes with what the rays of the chosen pixels find, all traced together."""
     if not (count := dr.width(chosen)):
         return nodes
+    dr.eval(nodes)  # in one kernel, not in each gather's
     # Literal sizes, also those of expanded adjoints, would be other kernels in each step of a fit.
     lane, size = dr.arange(mi.UInt32, len(nodes) * count), dr.opaque(mi.UInt32, count)
     every = dr.gather(mi.UInt32, chosen, lane % size)

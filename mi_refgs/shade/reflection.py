@@ -118,8 +118,8 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
     else:
         visibility = occluder.visible(point, mirror, facing, seen)
         dr.eval(visibility)  # now, once: every kernel of the adjoint that reads it would trace the rays again
-        indirect = points.get("indirect")
-        indirect = indirect if scene is None else _met(scene, (point, mirror, facing), visibility, bounces)
+        ray = point, mirror, facing
+        indirect = points.get("indirect") if scene is None else _met(scene, ray, visibility, bounces)
     return points.replaced(visibility=visibility, indirect=indirect)
 
 
@@ -127,6 +127,7 @@ def _met(scene: MeshRadiance, ray: tuple[Point3f, Vector3f, Vector3f], free: Flo
     """Radiance of what rays (N,) meet, 0 where `free`. Those that are blocked are few, and shaded alone."""
     found, blocked = dr.zeros(mi.Color3f, dr.width(free)), dr.compress(free == 0)
     if dr.width(blocked):
+        dr.eval(ray)  # in one kernel, not in each gather's
         point, direction, normal = (dr.gather(type(x), x, blocked) for x in ray)
         hit = scene.trace(point, direction, normal, True, bounces)
         dr.eval(hit)
