@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
+from benchmarks.common.report import Row
+from benchmarks.common.timing import once, peak_bytes
 from mi_refgs import methods
 from mi_refgs.data.dataset import Dataset, View
 from mi_refgs.data.images import Pixels
@@ -53,3 +56,16 @@ def make_trainer(surfels: int, data: Dataset) -> Trainer:
         "event.reset_opacity=false",
     ]
     return Trainer(methods.load(METHOD, "standard", settings), data)
+
+
+def large_step(count: int, size: int, steps: int = 3) -> Row:
+    """Return milliseconds per step of the full method's last stage, and this process's largest memory.
+
+    Not in a `__main__`, whose functions a spawned process does not find."""
+    mi.set_variant("llvm_ad_rgb")
+    trainer = make_trainer(count, sphere_data(size, 2, np.random.default_rng(0)))
+    trainer.method.event["mesh"].apply(trainer)
+    trainer.fit.iteration = trainer.method.stages()[-1][1].until - steps - 1
+    times = [1e3 * once(trainer.step) for _ in range(steps + 1)]
+    found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}
+    return found | {"whole_process": peak_bytes()}

@@ -26,9 +26,9 @@ from scipy.optimize import nnls
 from tqdm import tqdm
 
 from benchmarks.common import timing
-from benchmarks.common.fits import make_trainer, sphere_data
+from benchmarks.common.fits import large_step, make_trainer, sphere_data
 from benchmarks.common.report import Row, benchmark
-from benchmarks.common.timing import once, peak_bytes
+from benchmarks.common.timing import once
 from benchmarks.splatting.cases import COLOUR, FEATURES, PAGE, SMALL, Settings, Workload, sphere
 from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability.cases import Case, sky
@@ -132,17 +132,6 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
         "large_step": large,
         "step": step_times(*settings.step, settings.steps),
     }
-
-
-def large_step(count: int, size: int, steps: int = 3) -> Row:
-    """Return milliseconds per step of the full method's last stage, and this process's largest memory."""
-    mi.set_variant("llvm_ad_rgb")
-    trainer = make_trainer(count, sphere_data(size, 2, np.random.default_rng(0)))
-    trainer.method.event["mesh"].apply(trainer)
-    trainer.fit.iteration = trainer.method.stages()[-1][1].until - steps - 1
-    times = [1e3 * once(trainer.step) for _ in range(steps + 1)]
-    found = {"surfels": trainer.surfels.count, "size": size, "ms": float(np.median(times[1:]))}
-    return found | {"whole_process": peak_bytes()}
 
 
 STEP_SECONDS = 1.0  # for which the splat of a step is timed by itself, at most
