@@ -112,13 +112,12 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
         scene = MeshRadiance(occluder, context.surfels, context.light, options, occluder.ambient)
     with dr.suspend_grad():
         start = point, facing, seen = context.start(dr.detach(points.normal))
-        mirror = reflect(view=points.view, normal=facing)
+        ray = point, reflect(view=points.view, normal=facing), facing
     if sampled:
         visibility, indirect = _average(points, context, scene, start, options)
     else:
-        visibility = occluder.visible(point, mirror, facing, seen)
+        visibility = occluder.visible(*ray, seen)
         dr.eval(visibility)  # now, once: every kernel of the adjoint that reads it would trace the rays again
-        ray = point, mirror, facing
         indirect = points.get("indirect") if scene is None else _met(scene, ray, visibility, bounces)
     return points.replaced(visibility=visibility, indirect=indirect)
 
