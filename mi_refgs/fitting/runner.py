@@ -26,7 +26,7 @@ from mi_refgs.io.progress import Tell, command_line
 from mi_refgs.methods.method import POSE, Method
 from mi_refgs.registry import plugin_options
 from mi_refgs.runs.export import write_if_stale
-from mi_refgs.runs.run import CAMERAS, EXPOSURE, Run
+from mi_refgs.runs.run import CAMERAS, DECISIONS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import MODEL
 from mi_refgs.runs.views import changed, digests, read_views, sized, with_region
 from mi_refgs.shade.light.placed import PlacedLight
@@ -207,11 +207,14 @@ def begin(
         views, surfaces = _with_stereo(views, tell)
         if not resumed:
             views = _around_object(views, surfaces, tell, warn)
-    trainer = Trainer(method, views, run, state, tell=tell, warn=warn)
+    trainer = Trainer(method, views, run if resumed else None, state, tell=tell, warn=warn)
     if resumed:
         run.rewind(trainer.iteration)
     else:
         run.create(trainer.method, views.folder, views.region, digests(views))
+        trainer.run = run
+        if trainer.fit.decisions:  # of before the first step
+            run.write_json(DECISIONS, trainer.fit.decisions)
         run.write_json("checks.json", {one.name: one.numbers for one in found})
         left = waiting(trainer)
         if len(views.views) < HOLDOUT and left:

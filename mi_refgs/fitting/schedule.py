@@ -137,8 +137,9 @@ class FitSetup:
             if name in params:
                 groups[name] = LearningRate(rate, final, iterations)
         if leaf.POSE in groups:  # whose corrections begin late
-            after = getattr(self.method.event.get("cameras"), "after", 0)
-            groups[leaf.POSE] = replace(groups[leaf.POSE], begin=after)
+            cameras: Any = self.method.event.get("cameras")
+            begin = 0 if cameras is None else cameras.begins(iterations)
+            groups[leaf.POSE] = replace(groups[leaf.POSE], begin=begin)
         return groups
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:

@@ -11,6 +11,7 @@ RUN_FILES = {
     *("config.toml", "dataset.json", "metrics.jsonl", "decisions.json", "exposure.json", "cameras.json"),
     *("surfels.ply", "mesh.ply", "surroundings.ply", "envmap.exr", "background.exr", "near_field.npz"),
     *("scene.xml", "model.json", "metrics.json", "contact_sheet.png", "edit.json", "checks.json"),
+    "light.json",
 }
 """What commands write in a run folder; a user's images and exports there have other names."""
 

@@ -36,10 +36,13 @@ class PerView(Event[Trainer]):
     # Iterations before they learn; absent: a fifth of all.
     after: int | None = field(default=None, metadata=ITERATIONS | at_least(0))
 
+    def begins(self, iterations: int) -> int:
+        """Iterations before they learn, of all."""
+        return iterations // 5 if self.after is None else self.after
+
     def waits(self, trainer: Trainer) -> bool:
         """Whether it is too early to render what they are fitted to."""
-        after = trainer.method.iterations // 5 if self.after is None else self.after
-        return trainer.iteration < after
+        return trainer.iteration < self.begins(trainer.method.iterations)
 
     def due(self, trainer: Trainer) -> bool:
         waits = (0 < trainer.iteration and self.waits(trainer)) or validates(trainer)
