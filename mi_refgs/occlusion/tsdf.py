@@ -56,17 +56,13 @@ def bounds_from_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fuse(
-    depths: Iterable[Float],
-    alphas: Iterable[Float],
-    cameras: Iterable[Camera],
-    bounds: tuple[np.ndarray, np.ndarray],
-    resolution: int,
+    views: Iterable[tuple[Float, Float, Camera]], bounds: tuple[np.ndarray, np.ndarray], resolution: int
 ) -> TSDF:
-    """Fuse depth maps into a signed distance field over `bounds`. [Curless and Levoy 1996; weights behind the
-    surface: Bylow et al. 2013]
+    """Fuse views (depth, alpha, camera) into a signed distance field over `bounds`. [Curless and Levoy 1996;
+    weights behind the surface: Bylow et al. 2013]
 
-    `resolution`: voxels along the longest side. Depths (expected camera z, scene units) and alphas, in
-    raster order, are read once; alpha < ALPHA_SOLID is free space. Detached. Raises InputError for a
+    `resolution`: voxels along the longest side. Depths (expected camera z, scene units) and alphas are in
+    raster order; alpha < ALPHA_SOLID is free space. Detached. Raises InputError for a
     resolution that does not fit."""
     lo, hi = (np.asarray(b, dtype=np.float64) for b in bounds)
     extent = hi - lo
@@ -77,7 +73,7 @@ def fuse(
     shape = np.ceil(extent / voxel - 1e-6).astype(int) + 1
     with dr.suspend_grad():
         grid = _Grid(shape, lo, voxel)
-        for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
+        for depth, alpha, camera in views:
             grid.integrate(depth, alpha, camera)
         return TSDF(grid.volume().reshape(shape), lo, voxel)
 

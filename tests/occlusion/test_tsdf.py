@@ -39,7 +39,7 @@ def fuse(depths: list[np.ndarray], poses: list[np.ndarray], resolution: int = 48
     flat = [mi.Float(d.ravel().astype(np.float32)) for d in depths]
     alpha = [dr.select(d > 0, mi.Float(0.6), 0.4) for d in flat]
     flat = [dr.select(d > 0, d, 3.5) for d in flat]  # a faint veil is no surface, whatever its depth
-    return tsdf.fuse(flat, alpha, [camera(p) for p in poses], BOX, resolution)
+    return tsdf.fuse(zip(flat, alpha, map(camera, poses), strict=True), BOX, resolution)
 
 
 def as_trimesh(mesh: meshes.Mesh) -> trimesh.Trimesh:
@@ -130,10 +130,10 @@ def test_nothing_seen_is_an_empty_mesh() -> None:
     poses = ring_of_views(2)
     for value in (0.0, np.nan, np.inf):
         depth, alpha = (dr.full(mi.Float, x, SIZE * SIZE) for x in (value, 1.0 if value else 0.0))
-        fused = tsdf.fuse([depth] * 2, [alpha] * 2, [camera(p) for p in poses], BOX, 16)
+        fused = tsdf.fuse([(depth, alpha, camera(p)) for p in poses], BOX, 16)
         assert np.isfinite(fused.volume).all()
         assert len(meshes.extract_mesh(fused).faces) == 0
-    assert (tsdf.fuse([], [], [], BOX, 16).volume == 1).all()
+    assert (tsdf.fuse([], BOX, 16).volume == 1).all()
 
 
 def test_all_views_share_one_kernel() -> None:
@@ -145,8 +145,9 @@ def test_all_views_share_one_kernel() -> None:
             yield Camera.from_pose(size, size, -FOCAL, -FOCAL, size / 2, size / 2, p)
 
     def run(size: int, count: int, shift: float) -> None:
-        image = [dr.full(mi.Float, 4, size * size)] * count
-        tsdf.fuse(iter(image), iter(image), views(size, count), (BOX[0] + shift, BOX[1] + shift), 24)
+        image = dr.full(mi.Float, 4, size * size)
+        seen = ((image, image, camera) for camera in views(size, count))
+        tsdf.fuse(seen, (BOX[0] + shift, BOX[1] + shift), 24)
 
     run(32, 2, 0.0)
     before = dr.detail.launch_stats()
@@ -172,7 +173,7 @@ def test_bounds_ignore_floaters_but_keep_thin_ends() -> None:
 
 
 def test_a_resolution_that_does_not_fit_is_refused() -> None:
-    refused(lambda: tsdf.fuse([], [], [], BOX, 4096), "resolution")
+    refused(lambda: tsdf.fuse([], BOX, 4096), "resolution")
 
 
 def test_a_part_of_a_mesh_has_whole_triangles_and_their_vertices_alone() -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import tee
 from typing import ClassVar
 
 from mi_refgs.data.view import evenly_spread
@@ -47,6 +46,5 @@ def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int = 12
     resolution: voxels along the longest side of the box around the surfels, 2 … 1023. Raises InputError
     without a finite position."""
     bounds = bounds_from_points(surfels.to_numpy()["position"])
-    views = tee(render_depth(surfels, camera) for camera in cameras)
-    depths, alphas = (depth for depth, _ in views[0]), (alpha for _, alpha in views[1])
-    return extract_mesh(fuse(depths, alphas, iter(cameras), bounds, resolution))
+    views = ((*render_depth(surfels, camera), camera) for camera in cameras)
+    return extract_mesh(fuse(views, bounds, resolution))
