@@ -136,10 +136,9 @@ class FitSetup:
         for name, (rate, final) in LEARNT_BESIDE.items():
             if name in params:
                 groups[name] = LearningRate(rate, final, iterations)
-        if leaf.POSE in groups:  # whose corrections begin late
-            cameras: Any = self.method.event.get("cameras")
-            begin = 0 if cameras is None else cameras.begins(iterations)
-            groups[leaf.POSE] = replace(groups[leaf.POSE], begin=begin)
+        cameras: Any = self.method.event.get("cameras")
+        if leaf.POSE in groups and cameras is not None:  # whose corrections begin late
+            groups[leaf.POSE] = replace(groups[leaf.POSE], begin=cameras.begins(iterations))
         return groups
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:

@@ -146,8 +146,7 @@ def test_all_views_share_one_kernel() -> None:
 
     def run(size: int, count: int, shift: float) -> None:
         image = dr.full(mi.Float, 4, size * size)
-        seen = ((image, image, camera) for camera in views(size, count))
-        tsdf.fuse(seen, (BOX[0] + shift, BOX[1] + shift), 24)
+        tsdf.fuse(((image, image, c) for c in views(size, count)), (BOX[0] + shift, BOX[1] + shift), 24)
 
     run(32, 2, 0.0)
     before = dr.detail.launch_stats()

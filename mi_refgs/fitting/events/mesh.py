@@ -45,6 +45,5 @@ def surface_of(surfels: Surfels, cameras: Sequence[Camera], resolution: int = 12
     """The surface of surfels as triangles, which occlude: fused from their depth in cameras from all around.
     resolution: voxels along the longest side of the box around the surfels, 2 … 1023. Raises InputError
     without a finite position."""
-    bounds = bounds_from_points(surfels.to_numpy()["position"])
     views = ((*render_depth(surfels, camera), camera) for camera in cameras)
-    return extract_mesh(fuse(views, bounds, resolution))
+    return extract_mesh(fuse(views, bounds_from_points(surfels.to_numpy()["position"]), resolution))
