@@ -123,7 +123,8 @@ def _flat(row: Row) -> Row:
     found = row | {"train_minutes": row["train_seconds"] / 60}
     if relit := row.get("relit"):
         found |= {f"relit_{name}": score for name, score in relit.items()}
-        found |= {"relit_least": min(relit.values()), "relit_most": max(relit.values())}
+        scores = [score for score in relit.values() if score is not None]
+        found |= {"relit_least": min(scores, default=None), "relit_most": max(scores, default=None)}
     for trial in (trial for trial in row["decisions"] if trial["psnr_with"] is not None):
         gain = trial["psnr_with"] - trial["psnr_without"]
         found[trial["component"]] = f"{gain:+.1f} dB: {'chosen' if trial['stays'] else 'left out'}"

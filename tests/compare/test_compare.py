@@ -62,8 +62,7 @@ def test_comparison_has_a_run_per_job(compared: Path) -> None:
 
 
 def test_failed_job_is_a_row_with_its_reason(compared: Path) -> None:
-    table = json.loads((compared / "table.json").read_text())
-    [scene] = table["scenes"]
+    [scene] = json.loads((compared / "table.json").read_text())["scenes"]
     tiny, other = scene["rows"]
     assert tiny["variant"] == "tiny" and tiny["seeds"] == [0] and list(tiny["failed"]) == ["1"]
     assert "seed1/checkpoints: output: cannot be created" in tiny["failed"]["1"]

@@ -327,8 +327,7 @@ def test_every_route_gives_one_image(
     state, folder = row["state"](made, tmp_path)
     crop_sensor_of(folder / SCENE, row["crop"])
     case = Case(state, folder, row["samples"], row["crop"], alone, tmp_path, part)
-    before = state if row["state"] is edited else made
-    expected = by_reconstruction(replace(case, made=before))
+    expected = by_reconstruction(replace(case, made=state if row["state"] is edited else made))
     assert 0.2 < np.mean(expected["alpha"] > 0.1) and expected[IMAGE][..., :3].max() > 0.1
     for name, route in ROUTES.items():
         assert_same(expected, route(case), name)

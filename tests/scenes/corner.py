@@ -140,5 +140,4 @@ def mirrored(place: np.ndarray, eye: np.ndarray = EYE) -> np.ndarray:
 def gradient_sky(h: int = 16) -> np.ndarray:
     up = np.linspace(0, np.pi, h)[:, None, None]
     around = ((np.arange(2 * h) + 0.5) * np.pi / h)[None, :, None]
-    tint = np.array([1.0, 0.8, 0.6])
-    return tint * (1.5 + np.cos(up)) + 0.4 * np.sin(up) * np.sin(around)
+    return np.array([1.0, 0.8, 0.6]) * (1.5 + np.cos(up)) + 0.4 * np.sin(up) * np.sin(around)

@@ -69,5 +69,4 @@ def exact_terms(values: dict[str, Any], light: Light, options: ShadingOptions) -
     free = values["free"][:, None] >> np.arange(options.directions) & 1 if "free" in values else None
     chosen = models.Options(options.diffuse, options.dominant, options.directions, free)
     points = models.Points.of({name: x for name, x in values.items() if name != "free"})
-    terms = models.MODELS[options.reflectance](points, light, chosen, [])
-    return np.stack(terms, axis=1)
+    return np.stack(models.MODELS[options.reflectance](points, light, chosen, []), axis=1)

@@ -93,8 +93,7 @@ def true_fraction(place: np.ndarray, points: ShadingPoints, roughness: float, f0
 def test_many_rays_converge_to_the_traced_fraction(roughness: float) -> None:
     """Analytic floor and wall: the error falls as rays are added, and the mirror ray is far off."""
     place, points = floor_points(roughness)
-    f0 = float(np.mean([0.8, 0.7, 0.6]))
-    truth = true_fraction(place, points, roughness, f0)
+    truth = true_fraction(place, points, roughness, float(np.mean([0.8, 0.7, 0.6])))
     assert 0.05 < truth.mean() < 0.95
     error = {}
     for rays in (1, 4, 16, 64, 1024):

@@ -102,8 +102,7 @@ def test_frame_contains_requested_aovs_only(at: Any, name: str, monkeypatch: pyt
     light = EnvironmentLight.from_radiance(sky())
     shading = Shading(at, "split_sum", "sh", occlusion=at == "pixel")
     scene = SurfelScene(things(), shading, shading.light_of(light), Occluder(two_balls()))
-    asked = {name} - {""}
-    found = values(render(scene, camera_at(30.0), Request(asked, forward_only=True)))
+    found = values(render(scene, camera_at(30.0), Request({name} - {""}, forward_only=True)))
     has = {*TERMS} if name in TERMS else {name} - {""}
     nothing = {"visibility"} if at == "surfel" else set()  # is traced
     assert {*found} == {"radiance", "alpha"} | (has - nothing)

@@ -20,6 +20,7 @@ from mi_refgs.data.view import View
 from mi_refgs.fitting import image_error, per_view
 from mi_refgs.fitting.events.per_view import DEAD_ZONE, Cameras, Exposure
 from mi_refgs.fitting.objective import LossInputs, objective
+from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import srgb_from_linear
@@ -47,7 +48,7 @@ Picture = tuple[np.ndarray, np.ndarray]
 def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
     """Without coarse images and other events; gains and cameras, which seem wrong, learn from AFTER on."""
     monkeypatch.setattr("mi_refgs.fitting.events.per_view._moved", lambda trainer, view: 1.0)
-    events: dict[str, Any] = {"exposure": Exposure(), "cameras": Cameras(AFTER)}
+    events: dict[str, Any] = {"exposure": Exposure(), "cameras": Cameras()}
     return replace(small_method(tmp_path), iterations=5 * AFTER, event=events, data=DataOptions())
 
 
@@ -180,12 +181,15 @@ def test_gains_of_images(method: Method, rng: np.random.Generator, monkeypatch: 
     np.testing.assert_allclose([float(value[0]) for value in used], np.log(gains[3]), atol=1e-6)
 
 
-def test_told_gains_learn_from_the_first_step(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_told_gains_learn_from_the_first_step(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The decision comes before the run folder exists, which has it nevertheless."""
     log = np.linspace(-0.5, 0.5, 18).reshape(6, 3).astype(np.float32)
     monkeypatch.setattr("mi_refgs.fitting.events.per_view.told_gains", lambda views: log)
-    trainer = Trainer(method, ball())
+    trainer = begin(method, ball(), run := Run(tmp_path / "run"))
     np.testing.assert_array_equal(trainer.fit.params[GAIN].numpy(), log)
-    assert POSE not in trainer.fit.params
+    assert POSE not in trainer.fit.params and [x["component"] for x in run.decisions()] == ["exposure"]
     trainer.step()
     moved = np.flatnonzero((trainer.fit.params[GAIN].numpy() != log).any(axis=1))
     assert moved.tolist() == [trainer.setup.view(1)]
