@@ -71,10 +71,10 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def abbreviated(value: object, limit: int = 80) -> str:
-    """Format a value for a message: at most `limit` characters, whatever a file contains."""
+def abbreviated(value: object) -> str:
+    """Format a value for a message: at most 80 characters, whatever a file contains."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of more than 4,300 digits; lists in lists
         text = f"a {type(value).__name__} without end"
-    return text if len(text) <= limit else f"{text[:limit]}…"
+    return text if len(text) <= 80 else f"{text[:80]}…"

@@ -59,8 +59,8 @@ PIXEL_CLASSES = {
 def caption(size: Sequence[int], relit: bool = False) -> dict[str, str]:
     """Return `scale`, `mask` and `frame` of a table of images with this width and height."""
     scale = "images unscaled; albedo and environment map by least squares per channel, one for all views"
-    mask = "whole images; normals and materials where ground-truth alpha > ½; aligned: of a checkerboard of"
-    mask += " 16 fields along the longer side one half, to the other of which pose and gains are fitted"
+    mask = "whole images; normals and materials where ground-truth alpha > ½; aligned: pose and gains are"
+    mask += " fitted to half of a checkerboard (16 fields along the longer side), the other half is scored"
     if relit:
         scale = "unscaled, and by least squares of displayed colours per channel, one for all images"
         mask = "whole images"

@@ -158,8 +158,8 @@ def differences(run: Run, now: Method) -> dict[str, tuple[Any, Any]]:
 
 
 def fork(trainer: Trainer, method: Method) -> Trainer:
-    """Copy a fit to a trainer of another method, at the same iteration, without a run folder; what it lacks
-    is dropped, SH are cut or filled with zeros, new attributes start as it says."""
+    """Copy a fit to a trainer of another method, at the same iteration, without a run folder. Attributes
+    that the method lacks are dropped, SH are cut or filled with zeros, new attributes start as it says."""
     state = trainer.fit.arrays()
     old, rng = part(state, PARAMS), trainer.setup.rng(trainer.iteration, "branch")
     widths = {name: method.surfels.columns(name) for name in method.surfels.names}

@@ -57,8 +57,8 @@ def exchanged(
 
 
 def depth_outside(position: np.ndarray, region: Region, reach: np.ndarray | float = 0.0) -> np.ndarray:
-    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside; that of
-    the lower ends of what extends by `reach` (N, P) along the normals of planes."""
+    """Signed distance (N,) of points (N, 3) from the region's border in its radii, negative inside. Below a
+    plane that of the lower end counts, `reach` (N, P) below the point along the plane's normal."""
     sphere = np.linalg.norm(position - np.array(region.centre), axis=1) / region.radius - 1
     below = (reach - region.heights(position)) / region.radius
     return np.asarray(np.maximum(sphere, below.max(axis=1, initial=-np.inf)))

@@ -64,15 +64,15 @@ def alpha_loss(alpha: Float, target: Float) -> Float:
 
 
 def normal_consistency(
-    normal: Vector3f, depth_normal: Vector3f, valid: Bool, alpha: Float, share: Float | None = None
+    normal: Vector3f, depth_normal: Vector3f, valid: Bool, alpha: Float, covered: Float | None = None
 ) -> Float:
     """Mean over all pixels of A (a - N · n_d), with A detached and only where n_d is valid.
 
     This is Σ wᵢ (1 - nᵢ · n_d) of 2DGS (eq. 13), weighted by A. normal: N, premultiplied; depth_normal: n_d,
-    unit; gradients flow to both. `share` is a, the opacity of the surfels that have normals, with gradients;
-    by default it is A detached, as in the code of 2DGS."""
+    unit; gradients flow to both. `covered` is a, the opacity of surfels that have normals, with gradients; by
+    default it is A detached, as in the code of 2DGS."""
     weight = dr.select(valid, dr.detach(alpha), 0.0)
-    covered = weight if share is None else share
+    covered = weight if covered is None else covered
     return _mean(weight * (covered - dr.dot(mi.Vector3f(normal), mi.Vector3f(depth_normal))))
 
 

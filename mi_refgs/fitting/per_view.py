@@ -5,8 +5,8 @@ View v shows encode(g_v L) of linear radiance L, with a gain g_v per channel; th
 The camera of view v is rotated about the point that the cameras look at, then moved. A row of the parameter
 (V, 6) is the axis times 2 tan(θ/2) of the rotation by θ, and the translation over half of the width that the
 median view shows there, both along the axes of the camera: so each number moves the image about equally.
-A step subtracts the mean over the views, that of corrections along the world's axes: the scene keeps its
-brightness and its place."""
+The mean over the views is subtracted when a row is read, that of corrections along the world's axes: the
+scene keeps its brightness and its place."""
 
 from collections.abc import Mapping
 

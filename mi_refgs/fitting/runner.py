@@ -272,8 +272,8 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     if (gains := gains_of(trainer.fit.params)) is not None:
         run.write_json(EXPOSURE, {"gain": dict(zip(names, gains.round(5).tolist(), strict=True))})
     if POSE in trainer.fit.params:
-        poses = [trainer.camera(i).pose().tolist() for i in range(len(names))]
-        run.write_json(CAMERAS, {"to_world": dict(zip(names, poses, strict=True))})
+        poses = {view.name: view.to_world.tolist() for view in map(trainer.posed, range(len(names)))}
+        run.write_json(CAMERAS, {"to_world": poses})
     if isinstance(light := trainer.fit.light, PlacedLight):
         scale = [1] * 3 if light.scale is None else np.exp(light.scale.numpy()[0]).tolist()
         turn = np.array(light.world_from_map()).reshape(3, 3).tolist()

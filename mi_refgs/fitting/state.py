@@ -29,13 +29,14 @@ from mi_refgs.methods.method import AROUND, TURNTABLE, Stage
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.occlusion.surface_materials import VertexColours, VertexSurfels
 from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.render.pipeline import SurfelScene
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs import checkpoint
 from mi_refgs.runs.checkpoint import MESH, OPTIMISER, PARAMS, PHOTOGRAPHED
 from mi_refgs.shade.ambient import update_occluder_caches
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.kind import FittedLight, LightKind
-from mi_refgs.shade.light.near_field import NearField
+from mi_refgs.shade.light.light import Light
 from mi_refgs.shade.shading import Shading
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.init import morton_order
@@ -184,10 +185,6 @@ class FitState:
         return checkpoint.light_of(self.light_kind, self.params)
 
     @property
-    def near(self) -> NearField | None:
-        return None if self.photographed is None else self.photographed.near
-
-    @property
     def turntable(self) -> TensorXf | None:
         """Axes of the camera with which the light turns."""
         return self.params.get(TURNTABLE)
@@ -195,6 +192,12 @@ class FitState:
     def shading(self, stage: Stage) -> Shading:
         """Shading options of a stage with the present occluder."""
         return Shading.resolve(stage.shading, not self.occluder.empty)
+
+    def scene(self, shading: Shading, light: Light | None, surfels: Surfels | None = None) -> SurfelScene:
+        """The object, or other `surfels` in its place, with what lights, occludes and surrounds it."""
+        near = None if self.photographed is None else self.photographed.near
+        given = (light, self.occluder, self.surroundings, near, self.turntable)
+        return SurfelScene(surfels or self.surfels, shading, *given)
 
     def update_missing_caches(self, shading: Shading) -> None:
         """Compute the caches that the shading requires and the occluder lacks."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from mi_refgs.data.dataset import Dataset
 from mi_refgs.data.region import Region
+from mi_refgs.data.view import View
 from mi_refgs.fitting import per_view
 from mi_refgs.fitting.health import Health
 from mi_refgs.fitting.objective import LossInputs, losses_in_use, objective
@@ -23,8 +24,8 @@ from mi_refgs.fitting.state import FitState
 from mi_refgs.fitting.targets import Targets, require_memory
 from mi_refgs.io.images import psnr_of
 from mi_refgs.kernels.timing import phase
-from mi_refgs.methods.method import Method
-from mi_refgs.render.pipeline import Frame, Request, SurfelScene, render
+from mi_refgs.methods.method import POSE, Method
+from mi_refgs.render.pipeline import Frame, Request, render
 from mi_refgs.runs.interrupt import held_interrupts
 from mi_refgs.runs.run import Run
 from mi_refgs.shade.light.maps import Map
@@ -87,7 +88,7 @@ class Trainer:
         self.fit.optimiser.groups.update(self.setup.groups(self.fit.params))
 
     def take(self, other: "Trainer", method: Method) -> None:
-        """Continue with the state of another fit of the same views, which may not go on, by this method."""
+        """Continue by this method from the state of another fit of the same views, which ends there."""
         self.setup, self.fit, self.targets = FitSetup(method, self.data), other.fit, other.targets
         self.health.checked = self.iteration
 
@@ -125,14 +126,17 @@ class Trainer:
         with dr.suspend_grad():
             return per_view.corrected(self.setup, self.fit.params, index, self.data.views[index].camera())
 
+    def posed(self, index: int) -> View:
+        """A training view, with the correction of its pose that was fitted."""
+        view = self.data.views[index]
+        return replace(view, to_world=self.camera(index).pose()) if POSE in self.fit.params else view
+
     def view(self, camera: Camera, aovs: bool = True, surfels: Surfels | None = None) -> Frame:
         """Render the present state, or other `surfels` in it, as its export does, without derivatives."""
         with dr.suspend_grad():
             shading = self.shading().antialiased()
             self.fit.update_missing_caches(shading)
-            light, around = shading.light_of(self.fit.light), self.fit.surroundings
-            given = (light, self.fit.occluder, around, self.fit.near, self.fit.turntable)
-            scene = SurfelScene(surfels or self.surfels, shading, *given)
+            scene = self.fit.scene(shading, shading.light_of(self.fit.light), surfels)
             degree = self.setup.sh_degree(self.iteration)
             return render(scene, camera, Request(scene.all_aovs if aovs else (), not aovs, sh_degree=degree))
 
@@ -228,8 +232,7 @@ class Trainer:
         shading = fit.shading(stage)
         fit.update_missing_caches(shading)
         light = fit.prefilter.light(fit.light, shading)
-        given = (light, fit.occluder, fit.surroundings, fit.near, fit.turntable)
-        scene = SurfelScene(fit.surfels, shading, *given)
+        scene = fit.scene(shading, light)
         used = losses_in_use(weights)
         aovs = ["normal"] if any(loss.normals for loss in used) else []
         if shading.shaded_at == "pixel":

@@ -1,5 +1,6 @@
 """Fit a `Reconstruction` to a data set, with previews in the run folder and a bar in the terminal."""
 
+import math
 import shutil
 import tempfile
 import warnings
@@ -113,7 +114,7 @@ class ProgressBar(Progress):
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet, self.bar = quiet, progress_bar(0, "", disable=True)
-        self.psnr: float | None = None
+        self.psnr = math.nan
 
     def say(self, message: str) -> None:
         if not self.quiet:
@@ -135,7 +136,7 @@ class ProgressBar(Progress):
         if not self.quiet and iteration % method.log_every == 0:
             numbers = trainer.statistics()
             new = float(numbers["psnr"])
-            self.psnr = new if self.psnr is None else 0.9 * self.psnr + 0.1 * new  # a running mean
+            self.psnr = new if math.isnan(self.psnr) else 0.9 * self.psnr + 0.1 * new  # a running mean
             text = f"loss {numbers['loss']:.4f}, PSNR {self.psnr:.1f} dB, {numbers['surfels']} surfels"
             self.bar.set_postfix_str(text, refresh=False)
         is_due = iteration % method.preview_every == 0 or iteration == method.iterations

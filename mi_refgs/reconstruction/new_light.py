@@ -39,7 +39,7 @@ class NewLight:
         return f"{digest} world={self.world} rotate={self.rotate % 360!r} exposure={self.exposure!r}"
 
     def read(self) -> EnvironmentLight:
-        """Read the light, of at most HEIGHT rows."""
+        """Read the light, of at most FIXED_HEIGHT rows."""
         return world_light(read_radiance(self.path, READ_ROWS), self.world, self.rotate, self.exposure)
 
 

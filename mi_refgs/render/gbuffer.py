@@ -20,7 +20,7 @@ class GBuffer:
     """Blended slots of a view, in raster order or in that of `pixels`. A slot that nobody needs is absent."""
 
     def __init__(self, blended: Composited, kinds: Slots, attribution: int | None = None) -> None:
-        """The maps of the `features` of slots, among which that of the attribution is, if it has a place."""
+        """`blended` has the `features` of slots like `kinds`, and at `attribution` that of errors."""
         self.alpha, self.pixels, maps = blended.alpha, blended.pixels, [*blended.features]
         self.attribution = None if attribution is None else maps.pop(attribution)
         self.slots = _grouped(kinds, maps)  # premultiplied by alpha

@@ -109,7 +109,7 @@ def warn_of_changes(views: Dataset, method: Method, known: Mapping[str, str]) ->
 
 
 def with_poses(views: Dataset, cameras: Mapping[str, Any]) -> Dataset:
-    """Replace the poses by those that a fit corrected (`Run.cameras`), if these are its training views."""
+    """Replace the poses by those that a fit corrected (cameras.json), if these are its training views."""
     poses = cameras.get("to_world", {})
     if views.split != "train" or [*poses] != [view.name for view in views.views]:
         return views

@@ -83,7 +83,7 @@ def ambient_direction(frame: Any, turn: UInt32, ray: UInt32, count: UInt32) -> V
 
 
 def ambient_of_pixels(context: TraceContext) -> Color3f:
-    """Ratio where the pixels' rays meet the mesh, 1 where they miss it; detached. InputError without any."""
+    """Ratio where pixels' rays meet the mesh, else 1; detached. Raises InputError if the mesh has none."""
     occluder = context.occluder
     if occluder.empty:
         return mi.Color3f(1)

@@ -64,7 +64,7 @@ class Shading(ShadingOptions):
         return Shading(**asdict(options) | {"occlusion": True}) if traced else untraced
 
     def relit(self, mesh: bool) -> "Shading | None":
-        """The shading under another light, occluded by a `mesh` if there is one; None: the model has none."""
+        """The shading under another light, occluded if there is a `mesh`; None: the model cannot be relit."""
         at = "pixel" if "pixel" in self.model.shaded_at else self.at
         options = self.model.relit(replace(self, at=at, **UNTRACED))
         if options is None:

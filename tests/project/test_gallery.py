@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 maker: Any = importlib.import_module("gallery_maker")
 
 SIZE, SCENE = 24, "plastic_hollows"
-SET = "iterations=6 surfels.count=80 surfels.max_count=100 light.height=8 event.mesh.resolution=16"
+SET = "iterations=6 surfels.count=80 surfels.max_count=100 event.mesh.resolution=16"
 SETTINGS: dict[str, Any] = {"views": 4, "size": SIZE, "set": tuple(SET.split())}
 SETTINGS["lights"] = (ROOT / "scenes" / "lights" / "studio.exr",)
 TURN, TEST_VIEWS = 4, 4  # frames of a turntable, and test views, of the small gallery

@@ -75,20 +75,20 @@ class Densify(Event[Trainer]):
             table.clear()
 
     def _weighed(self, trainer: Trainer) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The rows of each table with the least blending weight for the tiles they cost, these first, and of
-        the background those that float before what the views show."""
+        """Rows of each table to remove: those with the least blending weight for the tiles they cost, and of
+        the background also those that float before what the views show."""
         every = [table.surfels.detach() for table in trainer.fit.tables]
         position = np.concatenate([table.raw["position"].numpy() for table in every])
-        own, views = trainer.surfels.count, trainer.data.views
+        own = trainer.surfels.count
         weight, cost, before = np.zeros((3, len(position)))
-        for index in evenly_spread(len(views), WEIGHED_VIEWS):
-            camera = views[index].camera()
-            small = camera.resized(min(WEIGHED_SIZE, max(camera.width, camera.height)))
+        for index in evenly_spread(len(trainer.data.views), WEIGHED_VIEWS):
+            seen = trainer.posed(index)
+            small = seen.camera().resized(min(WEIGHED_SIZE, max(seen.width, seen.height)))
             view = BlendedView.of(every, small, [0] * len(every))
             pixels, *depths = view.sums([1, view.maps.expected_depth][: len(every)])  # beside a background
             weight += pixels
             for deep in depths:
-                before += pixels * (pixels * views[index].depth_of(position) < NEARER * deep)
+                before += pixels * (pixels * seen.depth_of(position) < NEARER * deep)
             cost += listed_tiles(every, small)
         floating = np.flatnonzero(before[own:] > FLOATING * weight[own:])
         tables = zip(np.split(weight, [own]), np.split(cost, [own]), (NO_ROWS, floating), strict=True)

@@ -60,8 +60,8 @@ class Metal(Event[Trainer]):
         # Each surfel starts as what has the smaller error around it.
         excess = [one - 10 ** (gain / 10) * other for one, other in zip(*errors, strict=True)]
         raw = trainer.surfels.to_numpy()
-        views = [trainer.data.views[i] for i in judged]
-        metals = _sum_around(raw["position"], _attributed(trainer.surfels, views, excess)) > 0
+        attributed = _attributed(trainer.surfels, [*map(trainer.posed, judged)], excess)
+        metals = _sum_around(raw["position"], attributed) > 0
         raw["metallic"] = np.where(metals[:, None], logit(METAL), logit(DIELECTRIC)).astype(np.float32)
         trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("metallic",))
         reason = (

@@ -1,6 +1,6 @@
 """Events of open scenes: the region follows the object, the background becomes the light of photographs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -42,9 +42,9 @@ class FollowObject(Event[Trainer]):
         assert region is not None and around is not None
         tables = trainer.surfels.detach(), around.surfels.detach()
         points = []
-        for i in evenly_spread(len(views), FEW_VIEWS):
-            depth, alpha = render_depth(tables[0], views[i].camera(), tables[1])
-            points.append(surface_points(views[i], depth, alpha, region.radius))
+        for view in map(trainer.posed, evenly_spread(len(views), FEW_VIEWS)):
+            depth, alpha = render_depth(tables[0], view.camera(), tables[1])
+            points.append(surface_points(view, depth, alpha, region.radius))
         seen, cameras = partial(seen_share, views), camera_positions(views)
         found = fitted_region(region, cameras, np.concatenate(points), seen)
         trainer.fit.region = found or region
@@ -72,13 +72,9 @@ class PhotographLight(Event[Trainer]):
         trainer.check()
         light, around, region = trainer.fit.light, trainer.fit.surroundings, trainer.region
         assert light is not None and around is not None and region is not None
-        views = trainer.data.views
-        posed = [
-            replace(views[i], to_world=trainer.camera(i).pose()) for i in evenly_spread(len(views), FEW_VIEWS)
-        ]
-        trainer.fit.photographed = PhotographedLight.of(
-            trainer.surfels.detach(), around, region, posed, light.environment().height
-        )
+        posed = [*map(trainer.posed, evenly_spread(len(trainer.data.views), FEW_VIEWS))]
+        given = (around, region, posed, light.environment().height)
+        trainer.fit.photographed = PhotographedLight.of(trainer.surfels.detach(), *given)
 
 
 def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.ndarray:

@@ -7,6 +7,7 @@ true cameras hardly move (`schedule.LEARNT_BESIDE`). Those of exact cameras woul
 
 import itertools
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -20,8 +21,6 @@ from mi_refgs.kernels.device import upload_tensor
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import ITERATIONS, at_least
 from mi_refgs.methods.method import GAIN, POSE
-from mi_refgs.render.pipeline import Frame
-from mi_refgs.splat import Camera
 
 DEAD_ZONE = 0.05  # log gain that counts as none: that of a render in the first fifth of a fit
 ALIGNED = 8  # training views whose cameras are compared with their images
@@ -104,10 +103,7 @@ class Exposure(PerView):
 
 def _moved(trainer: Trainer, view: View) -> float:
     """Pixels that what a loaded view looks at moves by, if its pose is fitted to its image; the mean."""
-
-    def render(camera: Camera) -> Frame:
-        return trainer.view(camera, aovs=False)
-
+    render = partial(trainer.view, aovs=False)
     everywhere = np.ones((view.height, view.width), bool)
     fitted = aligned(view, render(view.camera()), render, trainer.data, everywhere)
     corners = np.array([*itertools.product((-0.5, 0.5), repeat=3)])

@@ -203,7 +203,7 @@ def with_rows(trainer: Trainer, rows: np.ndarray) -> Trainer:
 
 def world_motion(trainer: Trainer, index: int) -> np.ndarray:
     """(4, 4): how the world would move to get from a view's camera to the corrected one."""
-    return np.asarray(trainer.camera(index).pose() @ np.linalg.inv(trainer.data.views[index].to_world))
+    return np.asarray(trainer.posed(index).to_world @ np.linalg.inv(trainer.data.views[index].to_world))
 
 
 def test_corrections_are_motions_about_focus_without_their_mean(method: Method) -> None:
