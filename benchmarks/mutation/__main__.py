@@ -26,7 +26,7 @@ from typing import NamedTuple
 from benchmarks.common.report import plain_parser
 
 ROOT = Path(__file__).parents[2]
-PARTS = ("mi_refgs", "variants", "scenes", "tests", "benchmarks", "pyproject.toml", "README.md", "setup.sh")
+PARTS = "mi_refgs variants scenes tests benchmarks docs pyproject.toml README.md setup.sh".split()
 """Files and folders that the tests read."""
 WORKERS = 2
 TIME_LIMIT = 300  # seconds for a test, compiling its kernels included; a mutant that hangs is caught
