@@ -55,7 +55,7 @@ def test_points_are_on_the_surfaces(data: Dataset, found: Stereo) -> None:
     assert len(points.position) > 2000 and len(np.unique(voxel, axis=0)) == len(found.spaced) > 1000
     for position in (points.position, found.spaced):
         off = off_surface(position)
-        assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.08
+        assert np.median(off) < 0.013 and np.quantile(off, 0.9) < 0.038  # observed .011 and .036
     # On the block as on the ground, with the linear colours of the images there.
     assert np.count_nonzero(points.position[:, 2] > scene.BLOCK[2] - 0.05) > 100
     view = data.views[COUNT // 2]
