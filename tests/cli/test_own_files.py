@@ -140,8 +140,10 @@ def test_export_replaces_only_exports_of_the_same_run(place: Path, tmp_path: Pat
     assert not (out / "background.exr").exists()
     before = contents(out)
     refused(["export", second, "-o", out], "output: has other files")
-    with pytest.raises(InputError, match="has other files"):
-        mi_refgs.load(second).export("3dgs-ply", out)
+    mi_refgs.load(first).export("3dgs-ply", tmp_path / "formats")
+    for folder in (out, tmp_path / "formats"):
+        with pytest.raises(InputError, match="has other files"):
+            mi_refgs.load(second).export("3dgs-ply", folder)
     assert contents(out) == before
 
 

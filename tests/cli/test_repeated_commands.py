@@ -163,8 +163,7 @@ def test_fit_locks_its_run(data: Path, method: Path, tmp_path: Path) -> None:
             thread.start()
             thread.join()
 
-    tiny = methods.load(str(method), "quick", SETTINGS)
-    reconstruct.fit(data, tiny, output=run.path, progress=Watch())
+    reconstruct.fit(data, methods.load(str(method), "quick", SETTINGS), output=run.path, progress=Watch())
     assert seen == ["busy"] * 6 and not (run.path / LOCK).exists()
     attempt()
     assert seen[-1] == "free"

@@ -423,8 +423,7 @@ def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None
     far = Surroundings(wall(3.0), EnvironmentLight.constant(0.5, 8))
     behind = map_directions(8) @ towards > 0.95
     for nearer, share in ((wall(30.0), 1.0), (wall(0.5), 0.0)):
-        found = PhotographedLight.of(nearer, far, data.region, data.views, 8)
-        assert np.all(found.weight[behind] == share)
+        assert np.all(PhotographedLight.of(nearer, far, data.region, data.views, 8).weight[behind] == share)
 
 
 def test_table_that_is_not_finite_is_cleaned(data: Dataset, method: Method) -> None:

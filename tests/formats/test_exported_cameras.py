@@ -117,6 +117,7 @@ def test_exported_cameras_match_the_image_files(kind: str, tmp_path: Path) -> No
                 np.testing.assert_allclose(other.to_world, view.to_world, atol=1e-6)
                 for name in ("width", "height", "fx", "fy", "cx", "cy"):
                     assert getattr(other, name) == pytest.approx(getattr(view, name), rel=1e-6)
+                assert source == "sparse" or kind == "depths" or (view.alpha is None) == (other.alpha is None)
                 if view.alpha is None or other.alpha is not None:
                     np.testing.assert_allclose(other.image, view.image, atol=1e-5)
                 # Depth as a mask has no name in other layouts, and COLMAP's masks lie in a folder of theirs.

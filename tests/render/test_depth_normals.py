@@ -96,8 +96,7 @@ def test_normal_consistency_through_the_depth(rng: np.random.Generator, has_back
     weight = alpha[..., 0].astype(np.float32).astype(np.float64)
 
     def loss(x: list[Any]) -> Any:
-        z = expected_depth(x[3], x[4])
-        depth_normal, valid = normals_from_depth(z, x[4], camera())
+        depth_normal, valid = normals_from_depth(expected_depth(x[3], x[4]), x[4], camera())
         share = x[5] if has_background else None
         return losses.normal_consistency(mi.Vector3f(*x[:3]), depth_normal, valid, x[4], share)
 
@@ -121,8 +120,7 @@ def test_empty_image_gives_finite_gradients() -> None:
     """Nothing seen anywhere: every loss stays finite, forwards and backwards."""
     size = WIDTH * HEIGHT
     leaves = with_grad([dr.zeros(mi.Float, size) for _ in range(5)])
-    z = expected_depth(leaves[3], leaves[4])
-    depth_normal, valid = normals_from_depth(z, leaves[4], camera())
+    depth_normal, valid = normals_from_depth(expected_depth(leaves[3], leaves[4]), leaves[4], camera())
     image = display.display_image(leaves[:3], leaves[4], (1.0, 1.0, 1.0))
     target = [dr.ones(mi.Float, size)] * 3
     total = (
