@@ -85,5 +85,4 @@ class Compare:
                     raise InputError("none given", f"--{name}", "DATA", remedy)
         table = write(self.output)
         files = ", ".join(str(self.output / name) for name in (TABLE_TEXT, TABLE))
-        text = f"{markdown(table)}\n{files}"
-        return Result(dataclasses.asdict(table), text, 0 if table.complete else 3)
+        return Result(dataclasses.asdict(table), f"{markdown(table)}\n{files}", 0 if table.complete else 3)

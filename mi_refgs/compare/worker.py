@@ -60,8 +60,7 @@ def fit_and_measure(job: Job) -> None:
 
     run, data = job.run, Path(job.data)
     method = run.method() if run.exists() else job.method()
-    views = read_views(method, data, "train", truth=False)
-    trainer = begin(method, views, run, warn=warn)
+    trainer = begin(method, read_views(method, data, "train", truth=False), run, warn=warn)
     if trainer.iteration:
         say(f"resumed at iteration {trainer.iteration} of {method.iterations}")
     trainer.train()

@@ -97,5 +97,4 @@ def fitted_gain(
     above = np.sum(square * rendered * colour, axis=(0, 1))
     below = np.sum(square * rendered * rendered, axis=(0, 1))
     lit = (above > 0) & (below > 0)
-    gain = np.where(lit, above, 1) / np.where(lit, below, 1)
-    return np.clip(gain, 1 / MAX_GAIN, MAX_GAIN)
+    return np.clip(np.where(lit, above, 1) / np.where(lit, below, 1), 1 / MAX_GAIN, MAX_GAIN)

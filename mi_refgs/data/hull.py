@@ -32,8 +32,7 @@ def view_focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
         what, remedy = "they do not look at one point from several sides", "give the bounds of the scene"
         raise InputError(what, "views", "cameras", remedy)
     # Σ (I - d dᵀ)(p - o) = 0.
-    right = np.einsum("nij,nj->i", projectors, origins) / len(views)
-    focus = np.linalg.solve(projectors.mean(axis=0), right)
+    focus = np.linalg.solve(projectors.mean(axis=0), np.einsum("nij,nj->i", projectors, origins) / len(views))
     return focus, np.linalg.norm(origins - focus, axis=1)
 
 

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Unpack
 
@@ -38,7 +38,7 @@ class Assignment:
         try:
             name, sign, values = ASSIGNMENT.fullmatch(text).groups()  # type: ignore[union-attr]
             numbers = tuple(map(float, values.split(",")))
-        except (AttributeError, ValueError):
+        except (AttributeError, TypeError, ValueError):
             remedy = "write it like roughness=0.3 or albedo*=1,0.5,0.5"
             raise InputError("no assignment of numbers", "--set", abbreviated(text), remedy) from None
         if not np.isfinite(numbers).all():
@@ -51,7 +51,8 @@ def assignments(given: Assignments) -> tuple[Assignment, ...]:
     if isinstance(given, Mapping):
         lists = {name: ",".join(map(str, np.atleast_1d(value).tolist())) for name, value in given.items()}
         given = [f"{name}={values}" for name, values in lists.items()]
-    return tuple(Assignment.parse(text) for text in ([given] if isinstance(given, str) else given))
+    texts = given if isinstance(given, Iterable) and not isinstance(given, str) else [given]
+    return tuple(map(Assignment.parse, texts))
 
 
 def edit(scene: TrainedScene, **options: Unpack[EditOptions]) -> tuple[TrainedScene, dict[str, Any]]:

@@ -32,7 +32,7 @@ class Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """What is done to the selected surfels, in this order."""
+    """What is done to the selected surfels: `materials` first, then `set` or `cut`."""
 
     materials: Flag = False
     """first replace colours that were fitted to the environment map, of the whole scene, by materials"""

@@ -25,7 +25,7 @@ Condition = list[list[tuple[str, str, float]]]  # groups of comparisons: all tho
 
 def parse_condition(text: str) -> Condition:
     """Parse comparisons of names with numbers between `and` and `or`; raises InputError for anything else."""
-    groups = re.split(r"\bor\b", text)
+    groups = re.split(r"\bor\b", f"{text}")
     return [[_comparison(part) for part in re.split(r"\band\b", group)] for group in groups]
 
 
@@ -79,8 +79,7 @@ class SurfelValues:
         if name == "size":
             return self.scene.surfels.primitive.extent(self.raw)[1].max(axis=1).astype(float)
         if name in NORMALS:
-            normal = outward(self.scene.surfels, self.scene.mesh)[0]
-            return normal[:, NORMALS.index(name)].astype(np.float64)
+            return outward(self.scene.surfels, self.scene.mesh)[0][:, NORMALS.index(name)].astype(np.float64)
         if name not in self.names:
             what = f"{abbreviated(name)} is no value of these surfels"
             raise InputError(what, "--where", remedy=f"use one of {', '.join(self.names)}")

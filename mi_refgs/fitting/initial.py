@@ -81,8 +81,7 @@ def seen_around(data: Dataset, height: int) -> EnvironmentLight:
         outside = data.points.position[~data.region.contains(data.points.position)]
         if len(outside):
             distance = float(np.median(np.linalg.norm(outside - centre, axis=1)))
-    points = centre + distance * directions.reshape(-1, 3)
-    seen = hull.median_colours(points, data.views, data.background)
+    seen = hull.median_colours(centre + distance * directions.reshape(-1, 3), data.views, data.background)
     return EnvironmentLight.from_radiance(seen.reshape(directions.shape))
 
 

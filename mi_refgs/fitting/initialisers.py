@@ -120,8 +120,7 @@ def _around(count: int, region: Region, data: Dataset, rng: np.random.Generator)
             break
         points = draw(4 * (count - len(found)))
         points = points[seen_share(data.views, points) >= SEEN_SHARE]
-        points = points[~in_free_space(data.views, region, points)]
-        found = np.concatenate([found, points])[:count]
+        found = np.concatenate([found, points[~in_free_space(data.views, region, points)]])[:count]
     while len(found) < count:
         found = np.concatenate([found, draw(count - len(found))])
     return found

@@ -34,6 +34,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.splat.weights import BlendedView
 from mi_refgs.surfels.attributes import MAX_SH_DEGREE
 from mi_refgs.surfels.ply import write_ply as write_surfels
+from mi_refgs.surfels.primitives.primitive import PRIMITIVES
 from mi_refgs.surfels.table import Surfels
 
 THIN = 0.01  # third standard deviation of a surfel relative to its shorter one: thicker ones widen outlines
@@ -77,7 +78,9 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     # Geometry: surfels get a thin third axis, and move inwards.
     parts = [_geometry(table) for table in tables]
     raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    flat = np.concatenate([np.full(table.count, table.primitive.widths["scale"] == 2) for table in tables])
+    flat = np.concatenate(
+        [np.full(table.count, table.primitive.widths.get("scale") == 2) for table in tables]
+    )
     if flat.any():
         raw["position"] = np.where(flat[:, None], _inset(tables, cameras), raw["position"])
     # Colours: those of an imported file are encoded already.
@@ -92,7 +95,10 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
 
 def _geometry(table: Surfels) -> dict[str, np.ndarray]:
     """Return raw geometry with three standard deviations."""
-    raw = {name: table.to_numpy()[name] for name in table.primitive.widths}
+    raw, gaussian = table.to_numpy(), PRIMITIVES["gaussian"]
+    if "scale" not in raw:
+        raw |= gaussian.like(*table.primitive.extent(raw))
+    raw = {name: raw[name] for name in gaussian.widths}
     if raw["scale"].shape[1] == 2:
         thin = raw["scale"].min(axis=1, keepdims=True) + np.float32(np.log(THIN))
         raw["scale"] = np.concatenate([raw["scale"], thin], axis=1)

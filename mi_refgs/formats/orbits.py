@@ -25,7 +25,7 @@ def sphere_around(surfels: Surfels) -> tuple[np.ndarray, float]:
     """Return centre (3,) and radius of a sphere around the surfels without strays (INSIDE)."""
     position, weight = _weighted(surfels)
     middle = _middle(position, weight)
-    deviation = np.exp(surfels.to_numpy()["scale"].astype(np.float64)).max(axis=1)
+    deviation = surfels.primitive.extent(surfels.to_numpy())[1].max(axis=1)
     far = np.linalg.norm(position - middle, axis=1) + SIGMAS * deviation
     return middle, max(weighted_quantile(far, weight, INSIDE), 1e-6)
 

@@ -39,8 +39,7 @@ def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
 def straight_srgb(rgba: np.ndarray) -> np.ndarray:
     """Convert premultiplied linear RGBA (H, W, 4) to that of PNG: sRGB(radiance / alpha), and alpha."""
     alpha = rgba[..., 3:]
-    colour = srgb_from_linear(rgba[..., :3] / np.maximum(alpha, ALPHA_FLOOR))
-    return np.concatenate([colour, alpha], axis=-1)
+    return np.concatenate([srgb_from_linear(rgba[..., :3] / np.maximum(alpha, ALPHA_FLOOR)), alpha], axis=-1)
 
 
 def whole_blocks(length: int, factor: float) -> int:

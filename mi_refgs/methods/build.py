@@ -36,8 +36,7 @@ def build(
     if "by_kind" in metadata:
         registry, default = metadata["by_kind"]
         table = _converted(dict[str, Any], value, key)
-        chosen = registry.find(table.pop("kind", default), f"{key}.kind")
-        return build(chosen, table, key)
+        return build(registry.find(table.pop("kind", default), f"{key}.kind"), table, key)
     built = _converted(kind, value, key)
     if built is not None and (allowed := metadata.get("allowed")):
         allows, wanted = allowed

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from skimage import measure
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, within
 from mi_refgs.io.files import is_file, write_bytes
 from mi_refgs.io.ply import Header, read_header
 from mi_refgs.occlusion.tsdf import TSDF
@@ -30,8 +30,15 @@ class Mesh:
     voxel: float  # resolution of the surface, scene units; offsets of visibility rays scale with it
 
     def __post_init__(self) -> None:
-        for name, kind in (("vertices", np.float32), ("faces", np.uint32)):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), kind))
+        """Raise InputError for values that are not finite, and faces without a vertex."""
+        with np.errstate(over="ignore"):
+            for name, kind in (("vertices", np.float32), ("faces", np.uint32)):
+                object.__setattr__(self, name, np.asarray(getattr(self, name), kind))
+        if not (0 < self.voxel < np.inf and np.isfinite(self.vertices).all()):
+            wrong = f"vertices not finite, or {VOXEL_COMMENT} not above 0"
+            raise InputError(wrong, "mesh", remedy="extract the mesh again")
+        if self.faces.max(initial=0) >= max(len(self.vertices), 1):
+            raise InputError("a face names a vertex that is not there", "mesh", remedy="write it again")
 
     @staticmethod
     def empty(voxel: float = 1.0) -> "Mesh":
@@ -64,8 +71,7 @@ def extract_mesh(tsdf: TSDF) -> Mesh:
         return Mesh.empty(tsdf.voxel)
     # "descent": the field falls towards the object, and faces then wind outward.
     grid, faces, _, _ = measure.marching_cubes(volume, 0.0, gradient_direction="descent")
-    vertices = np.asarray(tsdf.origin) + (grid.astype(np.float64) - 1) * tsdf.voxel
-    return clean(vertices, faces, tsdf.voxel)
+    return clean(np.asarray(tsdf.origin) + (grid.astype(np.float64) - 1) * tsdf.voxel, faces, tsdf.voxel)
 
 
 def clean(vertices: np.ndarray, faces: np.ndarray, voxel: float, open_: bool = False) -> Mesh:
@@ -112,18 +118,11 @@ def read_mesh(path: Path | str) -> Mesh:
             return Mesh.empty(1.0 if voxel is None else voxel)
         options: Any = {"skip_materials": True} if kind in ("ply", "obj") else {}
         mesh: Any = trimesh.load(data, kind, force="mesh", process=False, **options)
-        faces = np.asarray(mesh.faces)
-        if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
-            raise InputError("a face names a vertex that is not there", path, "mesh", "write the file again")
         if voxel is None:
-            voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(faces) else 1.0
+            voxel = float(np.linalg.norm(mesh.extents)) / FOREIGN_RESOLUTION if len(mesh.faces) else 1.0
     except InputError:
         raise
     except Exception as error:  # trimesh raises whatever its parsers meet
         raise InputError("not a readable triangle mesh", path, "mesh", "write it as PLY or OBJ") from error
-    with np.errstate(over="ignore"):
-        vertices = np.asarray(mesh.vertices, np.float32)
-    if not (voxel > 0 and np.isfinite(voxel) and np.isfinite(vertices).all()):
-        wrong = f"vertices not finite, or {VOXEL_COMMENT} not above 0"
-        raise InputError(wrong, path, "mesh", "extract the mesh again")
-    return Mesh(vertices, faces, voxel)
+    with within(path):
+        return Mesh(mesh.vertices, mesh.faces, voxel)

@@ -160,5 +160,4 @@ def _normals(mesh: Mesh, neighbours: np.ndarray, weight: np.ndarray) -> np.ndarr
     outward = np.where((neighbours * own[:, None]).sum(-1) < 0, -1.0, 1.0)
     mean = (neighbours * (weight * outward)[..., None]).sum(1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    agrees = (mean * own).sum(1, keepdims=True) > NORMAL_AGREEMENT
-    return np.where(agrees, mean, own)
+    return np.where((mean * own).sum(1, keepdims=True) > NORMAL_AGREEMENT, mean, own)

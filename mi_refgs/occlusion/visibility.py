@@ -130,8 +130,7 @@ class Occluder:
 def _unit(v: Vector3f) -> tuple[Vector3f, Bool]:  # and whether there is one, else (0, 0, 0)
     squared = dr.squared_norm(v)
     valid = dr.isfinite(squared) & (squared > 0)
-    scale = dr.select(valid, dr.rsqrt(dr.select(valid, squared, 1)), 0)
-    return dr.select(valid, v * scale, 0), valid
+    return dr.select(valid, v * dr.select(valid, dr.rsqrt(dr.select(valid, squared, 1)), 0), 0), valid
 
 
 def _values(mesh: Mesh) -> dict[str, Array]:

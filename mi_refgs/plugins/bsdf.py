@@ -195,8 +195,7 @@ def _specular_probability(ctx: Any, material: Material, cosine: Any) -> Any:
     if not (specular and diffuse):
         return mi.Float(specular)
     reflected = dr.maximum(dr.mean(material.specular(cosine)), 0)
-    scattered = dr.maximum(dr.mean(material.diffuse(cosine)), 0)
-    total = reflected + scattered
+    total = reflected + dr.maximum(dr.mean(material.diffuse(cosine)), 0)
     return dr.select(total > 0, reflected / dr.select(total > 0, total, 1), 1)
 
 

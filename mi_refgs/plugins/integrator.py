@@ -13,6 +13,7 @@ import mitsuba as mi
 from mi_refgs.constants import RAW_LIMIT
 from mi_refgs.errors import InputError
 from mi_refgs.kernels.device import require_supported_variant
+from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.plugins import properties
 from mi_refgs.plugins.aovs import parse_aovs, suffixes
 from mi_refgs.plugins.derivatives import require_derivatives
@@ -86,8 +87,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     lights, ``x_fov`` and principal point of the sensor, and ``to_world`` of both as a rigid motion; any other
     parameter with gradients raises InputError.
 
-    A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 covers no
-    pixel and gets zero gradient; such a value of the light is black. One warning names the attribute."""
+    A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 is not drawn,
+    with zero gradient; such a value of a light is black. One warning names the attribute, of no emitter."""
 
     def __init__(self, props: Any) -> None:
         require_supported_variant("refgs")
@@ -99,7 +100,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.light, self.light_to_world, self.near = properties.read_light(props)
         self.seen = 0  # id of the scene whose ignored emitters and shapes were named
         self.filtered_light: Light | None = None  # of images without derivatives, until it changes
-        self.shading, self.occluder = properties.read_shading(props, self.surfels)
+        self.shading, self.mesh = properties.read_shading(props, self.surfels)
+        self.occluder = Occluder(self.mesh) if self.shading.occlusion and self.mesh else None
         self.caches_valid = False  # occluder materials and ambient ratios are up to date
         self.around, self.behind = properties.read_background(props)
         self.aovs = parse_aovs(str(properties.get(props, "aovs", "")))

@@ -46,7 +46,8 @@ def emitter_light(emitter: Any, filtered: bool = True, other: Light | None = Non
     if "irradiance.value" in params:
         towards = -mi.Vector3f(params["to_world"] @ mi.Vector3f(0, 0, 1))
         other = other or ConstantLight(mi.Color3f(0))
-        return DirectionalLight(other, dr.normalize(towards), mi.Color3f(params["irradiance.value"]))
+        arriving = mi.Color3f(params["irradiance.value"])
+        return DirectionalLight(other, dr.normalize(towards), bounded(arriving, arriving))
     if "data" not in params:
         return ConstantLight(_constant_radiance(params, emitter))
     radiance, resampled = _map_radiance(params, emitter)

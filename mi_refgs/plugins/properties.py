@@ -3,11 +3,11 @@
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.errors import InputError, abbreviated
-from mi_refgs.occlusion.mesh import read_mesh
-from mi_refgs.occlusion.visibility import Occluder
+from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.plugins.light import own_light
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.near_field import NearField
@@ -85,7 +85,10 @@ def read_background(props: Any) -> tuple[Surfels | None, Any]:
     if getattr(value, "ndim", 0) == 3:
         return around, EnvironmentLight(mi.TensorXf(value))
     try:
-        return around, None if value is None else mi.Color3f(value)
+        colour = None if value is None else mi.Color3f(value)
+        if colour is None or dr.all(dr.isfinite(colour), axis=None):
+            return around, colour
+        raise ValueError
     except Exception as error:
         found = f"{abbreviated(value)} is no colour"
         raise InputError(found, "refgs", "background", "give an rgb value or a map") from error
@@ -110,8 +113,8 @@ def read_light(props: Any) -> tuple[Any, Any, NearField | None]:
     return None if raw is None else EnvironmentLight(raw), mi.Transform4f(), near
 
 
-def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None]:
-    """Read the shading, whose defaults fit the attributes, and the occluder if it traces visibility."""
+def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Mesh | None]:
+    """Read the shading, whose defaults fit the attributes, and the mesh."""
     reflectance = str(get(props, "reflectance", Shading.default(surfels.raw)[0]))
     MODELS.find(reflectance, "refgs: reflectance")
     diffuse = _choice(props, "diffuse", Shading.default(surfels.raw, [reflectance])[1], DIFFUSE)
@@ -121,4 +124,4 @@ def read_shading(props: Any, surfels: Surfels) -> tuple[Shading, Occluder | None
     occlusion = get(props, "occlusion", mesh is not None)
     quality = {name: get(props, name, getattr(ShadingOptions, name)) for name in QUALITY}
     shading = replace(shading, occlusion=occlusion, **quality)
-    return shading, Occluder(read_mesh(mesh)) if occlusion and mesh else None
+    return shading, None if mesh is None else read_mesh(mesh)

@@ -52,10 +52,11 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         warnings.warn(what, RuntimeWarning, stacklevel=3)
     if (around := integrator.surroundings) is not None:
         around = Surroundings(Surfels(around.surfels.raw).detach(), around.background)
+        around.surfels.validate()
     return TrainedScene(
         integrator.surfels.detach(),
         None if light is None else EnvironmentLight(dr.detach(light.raw)),
-        mesh or (None if integrator.occluder is None else integrator.occluder.mesh),
+        mesh or integrator.mesh,
         integrator.shading,
         iteration=0,
         seconds=0.0,

@@ -75,6 +75,8 @@ class Reconstruction:
         name: of its method. Raises InputError for another object, unknown names, wrong shapes, NaN, or a
         missing light."""
         trained = scene_of(params, mesh, shading)
+        if trained.light is not None and (count := trained.light.unusable()):
+            raise InputError(f"{count} values are NaN or infinite", "light", remedy="give finite values")
         provenance = Provenance(method_of(trained, name)).with_data(None if data is None else Path(data))
         return Reconstruction(trained, provenance)
 
@@ -206,7 +208,7 @@ class Reconstruction:
         raw environment map, "refgs.light": `mi.render(scene, params)` differentiates all of them. aovs:
         types, or name:type, appended to the image. Raises InputError for a camera that no Mitsuba sensor
         represents, and unknown AOVs."""
-        several = cameras if isinstance(cameras, list | tuple) else [cameras]
+        several = cameras if isinstance(cameras, list | tuple) and cameras else [cameras]
         first, *more = map(self.camera, several)
         with tempfile.TemporaryDirectory(prefix="refgs_") as folder:
             export(self.trained, Path(folder), first, more)

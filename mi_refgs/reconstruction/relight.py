@@ -83,8 +83,7 @@ def relight(
     name += f"_e{light.exposure:+g}" if light.exposure else ""
     folder = run.path / "relight" / name if out is None else out
     inside = folder.resolve().is_relative_to(run.path.resolve())  # both may then move together
-    owner = f"relight {requested.identity}" + ("" if inside else f" of {run.path.resolve()}")
-    own_folder(folder, owner)
+    own_folder(folder, f"relight {requested.identity}" + ("" if inside else f" of {run.path.resolve()}"))
     kind, place = ("turntable/t", "turntable/") if turntable else ("test/r", "")
     images = [f"{kind}_{i:03d}.png" for i in range(len(cameras))]
     for stale in folder.glob(f"{kind}_*.*"):  # of more views, or another data set

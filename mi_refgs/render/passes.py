@@ -40,7 +40,7 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
     most = PASS_SAMPLES if most is None else most
     width, height = camera.width, camera.height
     film, offset = camera.film or (width, height), camera.offset if camera.film else (0, 0)
-    left, right = min(margin, offset[0]), min(margin, film[0] - offset[0] - width)
+    left, right = (min(margin, max(beside, 0)) for beside in (offset[0], film[0] - offset[0] - width))
     high = height
     if width * height * factor**2 > most:
         step = PATCH_EDGE // math.gcd(PATCH_EDGE, factor)  # tiles of all bands begin at their first row
@@ -49,9 +49,9 @@ def bands(camera: Camera, factor: int = 1, margin: int = 0, most: int | None = N
         high = -(-height // (count * step)) * step
     found = []
     for top in range(0, height, high):
-        first, last = top - margin, top + high + margin
-        if margin:
-            first, last = max(first, -offset[1]), min(last, film[1] - offset[1])
+        below = top + high
+        first = min(top, max(top - margin, -offset[1]))  # beside its own rows, only those of the film
+        last = max(min(below, height), min(below + margin, film[1] - offset[1])) if margin else below
         whole = (left, first, right, last) == (0, 0, 0, height)
         part = camera if whole else camera.window(-left, first, left + width + right, last - first)
         found.append(Band(part, (left, top - first), (width, min(high, height - top))))

@@ -219,6 +219,8 @@ def _shade_at_surfels(view: _View) -> Frame:
     asked_terms = {name: term for name, term in terms.known().items() if name in asked}
     slots = {"radiance": terms.total()} | ({"normal": points.normal} if "normal" in asked else {})
     materials = scene.surfels.values(asked)
+    if "visibility" in asked and (seen := points.get("visibility")) is not None:
+        materials["visibility"] = seen
     slots |= asked_terms | materials
     if asked - {"depth"}:  # normals, terms and maps are those of the object: they need its opacity
         slots |= view.presence

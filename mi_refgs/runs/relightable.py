@@ -90,8 +90,7 @@ def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> S
         occluder = Occluder(mesh)
         occluder.set_materials(found)
         options = ShadingOptions(ambient_rays=RELIT_RAYS["ambient_rays"])
-        ratios = ambient(occluder, found, light, options).numpy()
-        return with_shadows(ratios[vertex])
+        return with_shadows(ambient(occluder, found, light, options).numpy()[vertex])
 
 
 def outward(surfels: Surfels, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray | None]:

@@ -79,8 +79,7 @@ class Camera:
         centre in pixels, and near in scene units."""
         matrix = np.asarray(to_world, dtype=np.float64)
         rotation = matrix[:3, :3]
-        finite = np.isfinite(matrix).all()
-        if not finite or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
+        if not np.isfinite(matrix).all() or np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE:
             what, remedy = "must be a rotation and a translation", "remove scale and shear"
             raise InputError(what, "camera", "to_world", remedy)
 

@@ -121,8 +121,7 @@ def write_views(out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str
     views = {s: [(f"{s}/r_{i:03d}", *job) for i, job in enumerate(cameras.of(s))] for s in splits}
     light, height = out / "environment.exr", cameras.options.environment_height
     if height and cameras.objects and not light.exists():
-        room = without(tracer.scene, cameras.objects)
-        write_exr(light, incident(room, cameras.centre, cameras.options))
+        write_exr(light, incident(without(tracer.scene, cameras.objects), cameras.centre, cameras.options))
     elif height and tracer.scene.environment() is not None and not light.exists():
         write_exr(light, environment_image(tracer.scene, height))
     jobs = [job for split in splits for job in views[split]]

@@ -27,7 +27,7 @@ class Pose:
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat(np.roll(np.asarray(camera.wxyz, np.float64), -1)).as_matrix()
         matrix[:3, 3] = camera.position
-        aspect = camera.image_width / max(camera.image_height, 1)
+        aspect = max(camera.image_width, 1) / max(camera.image_height, 1)
         return Pose(matrix @ MITSUBA_FROM_OPENCV, float(camera.fov), aspect, near)
 
     @staticmethod

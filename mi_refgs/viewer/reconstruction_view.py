@@ -124,8 +124,7 @@ class ReconstructionView:
         own = self.environment is self.original.light and not self.turn
         given = (light, occluder, background, scene.near if own else None)
         rendered = SurfelScene(scene.surfels, shading, *given)
-        aovs = frozenset({look.what} - {IMAGE, "alpha"})
-        return render(rendered, camera, Request(aovs, forward_only=True))
+        return render(rendered, camera, Request(frozenset({look.what} - {IMAGE, "alpha"}), forward_only=True))
 
     def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Float]:
         """Render planes of `planes_of`."""

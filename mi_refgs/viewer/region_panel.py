@@ -74,8 +74,7 @@ def save_region(region: Region, data: Dataset, again: bool = False) -> str:
     if there is not None and not (there.estimated or again):
         remedy = "move it away, or correct it by hand"
         raise InputError("exists, and is no estimate", data.path / REGION_FILE, "output", remedy)
-    moved = replace(region, estimated=False).moved(np.array(data.offset))
-    write_region(data.path, moved)
+    write_region(data.path, replace(region, estimated=False).moved(np.array(data.offset)))
     return f"saved `{data.path / REGION_FILE}`; next: `{command_line('train', data.path, '-o', 'RUN')}`"
 
 

@@ -78,8 +78,7 @@ def test_cameras_are_found_up_to_a_similarity(captured: Path) -> None:
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.5
     # The world is upright, and its unit ball contains the block.
     assert rotation[2] @ [0, 0, 1] > np.cos(np.radians(1)) and 0.5 < scale < 2
-    block = np.array([0, 0, scene.BLOCK[2] / 2])
-    assert np.linalg.norm(shift - block) < 0.5 * scale
+    assert np.linalg.norm(shift - np.array([0, 0, scene.BLOCK[2] / 2])) < 0.5 * scale
 
 
 @needs_colmap

@@ -150,8 +150,7 @@ def test_export_replaces_only_exports_of_the_same_run(place: Path, tmp_path: Pat
 def test_run_is_never_overwritten(place: Path, tmp_path: Path) -> None:
     """Also without its config.toml, as one that was killed while it was saved."""
     other = shutil.copytree(place / "run", tmp_path / "other")
-    with pytest.raises(InputError, match="contains a run already"):
-        mi_refgs.load(place / "run").save(other)
+    refused(lambda: mi_refgs.load(place / "run").save(other), "contains a run already")
     (other / "config.toml").unlink()
     before = contents(other)
     refused(["export", place / "run", "-o", other], "belongs to a run, which is never overwritten")

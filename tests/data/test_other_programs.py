@@ -43,8 +43,7 @@ def points_beside_colmap(folder: Path) -> None:
 
 def points_of_nerfstudio(folder: Path) -> None:
     """Poses and points share a frame: `applied_transform` was applied to both."""
-    moved = np.eye(4)[[0, 2, 1, 3]][:3].tolist()
-    write_nerfstudio(folder, ply_file_path="a.ply", applied_transform=moved)
+    write_nerfstudio(folder, ply_file_path="a.ply", applied_transform=np.eye(4)[[0, 2, 1, 3]][:3].tolist())
     (folder / "a.ply").write_bytes(point_bytes("ascii"))
 
 

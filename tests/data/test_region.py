@@ -28,8 +28,7 @@ def test_region_pixels_are_those_whose_rays_hit_it(planes: tuple[Plane, ...]) ->
     region = Region((0.3, -0.2, 0.1), 0.4, planes)
     for origin in ([2.0, 1.0, 0.5], [-0.5, 0.6, -1.5], [0.35, 0.05, 0.3], [2.0, 0.0, 0.25]):
         view = replace(view_from(np.array(origin)), width=30, height=20, fx=25.0, fy=28.0, cx=12.0, cy=11.0)
-        rays = unit(np.array(view.camera().rays()).T)
-        steps = origin + np.linspace(0, 6, 3000)[:, None, None] * rays
+        steps = origin + np.linspace(0, 6, 3000)[:, None, None] * unit(np.array(view.camera().rays()).T)
         moved = {e: tuple((a, b, c, d - e) for a, b, c, d in region.planes) for e in (-4e-3, 4e-3)}
         sure, never = (replace(region, radius=0.4 + e, planes=planes) for e, planes in moved.items())
         found = region_pixels(view, region).ravel()

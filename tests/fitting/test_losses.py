@@ -156,8 +156,7 @@ def test_colour_of_light(rng: np.random.Generator) -> None:
     step = rng.normal(size=texels.shape)
     difference = (define(texels + 0.01 * step, scale) - define(texels - 0.01 * step, scale)) / 0.02
     assert np.sum(slope * step) == pytest.approx(difference, rel=2e-2)
-    grey = EnvironmentLight.from_radiance(np.repeat(texels[..., :1], 3, axis=-1))
-    assert float(loss(grey)[0]) < 1e-6
+    assert float(loss(EnvironmentLight.from_radiance(np.repeat(texels[..., :1], 3, axis=-1)))[0]) < 1e-6
 
 
 def test_difference_of_lights(rng: np.random.Generator) -> None:

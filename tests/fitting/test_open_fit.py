@@ -194,7 +194,7 @@ def test_surfels_below_planes_change_tables(method: Method) -> None:
     np.testing.assert_allclose(own, inside, atol=1e-6)
     np.testing.assert_allclose(other, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]], atol=1e-6)
     # Tangents along x and y, deviations of 0.1: some extend through the second plane, none through the first.
-    through = [[0, 0, 0.2], [-0.45, 0, 0.2], [0, 0, -1]]
+    through = [[0.0, 0.0, 0.2], [-0.45, 0.0, 0.2], [0.0, 0.0, -1.0]]
     wide, others = table(method.surfels.names, through[:2], 0.1), table((*outer.raw,), through, 0.1)
     own, other = (x.surfels.to_numpy()["position"] for x in exchanged(wide, others, method, region, rng))
     np.testing.assert_allclose(own, [*through[:2], through[0]], atol=1e-6)

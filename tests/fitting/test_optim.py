@@ -283,8 +283,7 @@ def test_a_loop_over_the_parameters_of_a_scene(rng: np.random.Generator) -> None
     losses = []
     for step in range(16):
         params.update()
-        image = mi.render(scene, params, spp=1)
-        planes, true_planes = (mi_refgs.image_planes(x) for x in (image, goal))
+        planes, true_planes = (mi_refgs.image_planes(x) for x in (mi.render(scene, params, spp=1), goal))
         loss = mi_refgs.l1(planes, true_planes) + mi_refgs.d_ssim(planes, true_planes, 24, 24)
         dr.backward(loss)
         table.observe(mi.Float(np.linalg.norm(dr.grad(params["refgs.position"]).numpy(), axis=1)))

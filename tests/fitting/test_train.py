@@ -29,8 +29,7 @@ def method(tmp_path: Path) -> Method:
 
 def test_loss_falls_and_everything_trains(method: Method) -> None:
     data = ball()
-    method = replace(without(method), data=DataOptions(), iterations=60)
-    trainer = Trainer(method, data)
+    trainer = Trainer(replace(without(method), data=DataOptions(), iterations=60), data)
     before = {name: tensor.numpy().copy() for name, tensor in trainer.fit.params.items()}
     losses = []
     while trainer.iteration < 60:

@@ -95,8 +95,7 @@ def test_splats_need_no_test_images(
     other = shutil.copytree(data, tmp_path / "data")
     for path in other.glob("test/r_*"):
         path.unlink()
-    given = Provenance.of(Run(run)).with_data(other)
-    refused(lambda: given.shots(TrainedScene.read(run), "test"), "missing")
+    refused(lambda: Provenance.of(Run(run)).with_data(other).shots(TrainedScene.read(run), "test"), "missing")
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         target = tmp_path / "splats.ply"

@@ -20,8 +20,7 @@ def test_columns_and_their_derivatives(width: int) -> None:
     columns = columns_of(array, width)
     np.testing.assert_array_equal(np.stack([c.numpy() for c in columns], axis=1), table)
 
-    weighted = sum(dr.sum(c * mi.Float(np.ascontiguousarray(adjoint[:, i]))) for i, c in enumerate(columns))
-    dr.backward(weighted)
+    dr.backward(sum(dr.sum(c * mi.Float(np.ascontiguousarray(adjoint[:, i]))) for i, c in enumerate(columns)))
     np.testing.assert_allclose(dr.grad(array).numpy().reshape(ROWS, width), adjoint, rtol=1e-6)
 
     moved = dr.forward_to(columns_of(with_grad(mi.Float(table.ravel()), mi.Float(tangent.ravel())), width))

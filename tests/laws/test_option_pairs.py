@@ -85,8 +85,7 @@ def check(case: Case, folder: Path, set_threads: Any) -> None:
     elif case["derivative"] == "forward":
         for name, leaf in leaves.items():
             dr.set_grad(leaf, type(leaf)(like(leaf, tangent[name])))
-        moved = moved_by(oracle, first, tangent)
-        compare(dr.forward_to(image).numpy(), moved, kept, DERIVATIVE, 0.05)
+        compare(dr.forward_to(image).numpy(), moved_by(oracle, first, tangent), kept, DERIVATIVE, 0.05)
     else:
         weight = rng.normal(size=expected.shape) * kept[..., None] / np.maximum(1, abs(expected).max((0, 1)))
         dr.backward(dr.sum(image * mi.TensorXf(weight.astype(np.float32)), axis=None).array + prior)

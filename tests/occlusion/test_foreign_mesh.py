@@ -1,5 +1,6 @@
 """Meshes made elsewhere, of few triangles and of any size, as occluders."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,11 @@ import pytest
 import trimesh
 
 from mi_refgs.errors import InputError
-from mi_refgs.occlusion.mesh import read_mesh
+from mi_refgs.occlusion.mesh import Mesh, read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.shade.reflectance.split_sum import MATERIALS
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import unit, vector
+from tests.helpers import refused, unit, vector
 from tests.scenes.splats import discs
 
 SCALES = [1.0, 1e-6, 1e6]
@@ -96,3 +97,8 @@ def test_a_mesh_without_faces_hides_nothing(tmp_path: Path, noted: bool) -> None
     mesh = read_mesh(path)
     assert mesh.voxel == (0.25 if noted else 1)
     assert np.all(Occluder(mesh).visible(mi.Point3f(0), mi.Vector3f(0, 0, 1)))
+    for corners, voxel, what in (
+        (np.eye(3), 0, "not above 0"),
+        (np.eye(2, 3), 1, "vertex that is not there"),
+    ):
+        refused(partial(Mesh, corners, np.array([[0, 1, 2]]), voxel), what)

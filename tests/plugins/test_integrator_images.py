@@ -30,8 +30,7 @@ def test_aovs_follow_mitsubas_names(tmp_path: Path) -> None:
         np.testing.assert_allclose(aov[f"di.{c}"] + aov[f"sp.{c}"] + aov[f"ind.{c}"], rgb[..., i], atol=1e-6)
     seen = alpha > 0.01
     assert seen.any() and not seen.all()
-    length = sum(aov[f"n.{c}"] ** 2 for c in "XYZ")
-    np.testing.assert_allclose(length[seen], 1, atol=1e-5)
+    np.testing.assert_allclose(sum(aov[f"n.{c}"] ** 2 for c in "XYZ")[seen], 1, atol=1e-5)
     assert 0 < aov["v.Y"][seen].mean() < 1 and aov["ind.R"].max() > 0
     assert np.all((aov["r.Y"][seen] > 0) & (aov["r.Y"][seen] < 1))
     assert all(np.all(values[alpha == 0] == 0) for values in aov.values())

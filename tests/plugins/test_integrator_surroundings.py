@@ -34,6 +34,12 @@ def test_values_that_cannot_be_used_are_told_of_and_left_out() -> None:
     np.testing.assert_array_equal(scenes.image(of), scenes.image(scenes.open_scene(**left)))
 
 
+def test_visibility_is_that_of_the_object() -> None:
+    seen = scenes.image(scenes.open_scene(aovs="a:albedo,v:visibility"))
+    assert 0 < np.count_nonzero(seen[..., -1]) < seen[..., -1].size
+    np.testing.assert_array_equal(seen[..., -1] > 0, seen[..., -2] > 0)
+
+
 def test_refusals(tmp_path: Path) -> None:
     raw = scenes.far_channels()
     write_ply(tmp_path / "bare.ply", Surfels.from_numpy({n: x for n, x in raw.items() if n != "radiance_sh"}))

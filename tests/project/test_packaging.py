@@ -17,9 +17,8 @@ import pytest
 
 import mi_refgs
 from mi_refgs.cli.doctor import EXTRAS
-from mi_refgs.errors import InputError
 from mi_refgs.io.files import resource_dir
-from tests.helpers import ROOT, imported_packages, run_process
+from tests.helpers import ROOT, imported_packages, refused, run_process
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 LEFT_OUT = {".git", ".venv", "runs", "data", "site", "build", "dist"}
@@ -156,5 +155,4 @@ def test_doctor_checks_modules_of_the_extras() -> None:
 
 def test_checkout_finds_its_data() -> None:
     assert [resource_dir(name) for name in ("variants", "scenes")] == [ROOT / "variants", ROOT / "scenes"]
-    with pytest.raises(InputError, match="absent: the folder is missing from this installation"):
-        resource_dir("absent")
+    refused(lambda: resource_dir("absent"), "absent: the folder is missing from this installation")

@@ -10,6 +10,8 @@ import pytest
 
 import mi_refgs
 from mi_refgs import Reconstruction
+from mi_refgs.shade.options import ShadingOptions
+from mi_refgs.shade.reflectance import MODELS
 from tests.helpers import refused
 from tests.scenes.integrator import sky
 
@@ -59,6 +61,21 @@ def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) 
         Reconstruction.from_params(mi.load_dict(surfels))
 
 
+def test_models_without_mirror_rays_keep_the_mesh(balls: Reconstruction) -> None:
+    """Also one that is not used, for relighting; visibility is the share of free directions."""
+    trained = balls.trained
+    assert trained.light is not None
+    quality: dict[str, Any] = {"split_sum": {}, "monte_carlo": {"directions": 8}}
+    for model, options in quality.items():
+        shading = ShadingOptions("surfel", model, "irradiance" if model == "split_sum" else "sh", **options)
+        names = {*trained.surfels.primitive.widths, *MODELS[model].required_attributes(shading)}
+        arrays = {name: trained.surfels.raw[name] for name in names} | {"light": trained.light.raw}
+        made = Reconstruction.from_params(arrays, mesh=trained.mesh, shading=shading)
+        assert Reconstruction.from_params(made.scene()).trained.mesh is not None
+    seen = made.aovs(0, ["visibility", "alpha"])
+    assert 0.1 < seen["visibility"][seen["alpha"] > 0.5].min() < 0.8
+
+
 def test_other_states_are_refused(balls: Reconstruction) -> None:
     arrays, make = balls.trained.surfels.to_numpy(), Reconstruction.from_params
     refused(lambda: make(mi.load_dict({"type": "sphere"})), "no `refgs` integrator")
@@ -66,6 +83,9 @@ def test_other_states_are_refused(balls: Reconstruction) -> None:
     refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
     refused(lambda: make(arrays), "shading: light: reflectance = split_sum needs one")
     refused(lambda: make(arrays | {"opacity": np.full_like(arrays["opacity"], np.nan)}), "NaN")
+    refused(lambda: make(arrays | {"light": np.full((8, 16, 3), np.nan)}), "NaN")
+    white = {"type": "refgs", **balls.trained.surfels.raw, "background": mi.Color3f(np.nan)}
+    refused(lambda: mi.load_dict(white), "is no colour")
     params = mi.traverse(balls.scene())
     params.update({"refgs.opacity": params["refgs.opacity"] * np.nan})
     refused(lambda: make(params), "NaN")

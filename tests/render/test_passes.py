@@ -182,3 +182,10 @@ def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
         heights = {band.camera.height for band in found}
         assert len(heights) == 1 if not margin else max(heights) <= 26
     assert scenes.HEIGHT < 103
+    for x, y, width, height in ((20, 5, 40, 16), (-4, 5, 20, 16), (5, -4, 20, 16), (5, 95, 20, 16)):
+        for margin in (0, 1):
+            [band] = passes.bands(eye.window(x, y, width, height), margin=margin)
+            seen, first = band.camera, band.first
+            assert seen.offset == (x - first[0], y - first[1]) and min(first) >= 0 and max(first) <= margin
+            assert seen.width >= first[0] + width == first[0] + band.size[0]
+            assert seen.height >= first[1] + height == first[1] + band.size[1]

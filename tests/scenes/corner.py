@@ -31,8 +31,7 @@ def corner(cells: int = 8) -> Mesh:
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]
     faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
     floor = np.stack([FLOOR * u, 0 * u, FLOOR * z], 1)
-    wall = np.stack([0 * u, WALL * u, FLOOR * z], 1)
-    vertices = np.concatenate([floor, wall]).astype(np.float32)
+    vertices = np.concatenate([floor, np.stack([0 * u, WALL * u, FLOOR * z], 1)]).astype(np.float32)
     return Mesh(vertices, np.concatenate([faces, faces[:, ::-1] + len(floor)]).astype(np.uint32), VOXEL)
 
 

@@ -76,8 +76,7 @@ def known_surfels() -> Surfels:
     surfels = from_points(points, normals, rng=rng, attributes=channels, scale_factor=0.8, opacity=0.999)
     raw = surfels.to_numpy()
     for name in ("albedo", "metallic", "roughness"):
-        values = np.array([np.atleast_1d(material[name]) for material in (METAL, CLAY)])
-        raw[name] = logit(values[ball])
+        raw[name] = logit(np.array([np.atleast_1d(material[name]) for material in (METAL, CLAY)])[ball])
     return Surfels.from_numpy(raw)
 
 

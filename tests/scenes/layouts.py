@@ -137,8 +137,7 @@ def write_llff(folder: Path, factor: int = 1) -> Path:
         same.write(folder / "images")
         right, down, forward, position = same.camera_to_world[:3].T
         size = np.array([72 * factor, 96 * factor, 107.0 * factor])
-        matrix = np.stack([down, right, -forward, position, size], axis=-1)
-        rows.append([*matrix.ravel(), 1.0, 9.0])
+        rows.append([*np.stack([down, right, -forward, position, size], axis=-1).ravel(), 1.0, 9.0])
     np.save(folder / "poses_bounds.npy", np.array(rows))
     return folder
 

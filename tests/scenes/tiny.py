@@ -103,5 +103,4 @@ def _ball(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     discriminant = along**2 - origin @ origin + RADIUS**2
     hit = discriminant > 0
     distance = -along - np.sqrt(np.maximum(discriminant, 0))
-    normal = np.where(hit[..., None], (origin + distance[..., None] * ray) / RADIUS, 0)
-    return hit.astype(np.float64), normal
+    return hit.astype(np.float64), np.where(hit[..., None], (origin + distance[..., None] * ray) / RADIUS, 0)

@@ -118,6 +118,8 @@ INCOMPLETE: dict[str, tuple[dict[str, Any], str]] = {
     "no such rays": ({"visibility": "many"}, "visibility: 'many' is not allowed; use none or mirror or own"),
     "no order": ({"shaded_at": ()}, "shaded_at: () is not allowed; use pixel or surfel"),
     "no such option": ({"honoured": ("speed",)}, "honoured: ('speed',) is not allowed; use dominant"),
+    "hits in the dark": ({"light": "none", "honoured": ("traced_bounces",)}, "honoured: hits are not lit"),
+    "no irradiance": ({"light": "radiance", "honoured": ("ambient_rays",)}, "honoured: hits are not lit"),
     "another's name": ({"name": "split_sum"}, "'split_sum': the name is empty or in use"),
 }
 

@@ -18,8 +18,7 @@ TERMS = ("diffuse", "specular", "indirect")
 
 def tilted(view: np.ndarray, cosine: float, rng: np.random.Generator) -> np.ndarray:
     """Unit normals at this cosine to unit views."""
-    across = np.cross(view, unit(rng.normal(size=view.shape)))
-    return cosine * view + np.sqrt(1 - cosine**2) * unit(across)
+    return cosine * view + np.sqrt(1 - cosine**2) * unit(np.cross(view, unit(rng.normal(size=view.shape))))
 
 
 def mirrored_to(view: np.ndarray, target: np.ndarray) -> np.ndarray:

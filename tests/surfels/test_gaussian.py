@@ -37,8 +37,7 @@ def test_reference_footprints_match_textbook_matrices() -> None:
 def test_the_normal_is_the_shortest_axis() -> None:
     scales = np.log([[1, 2, 3], [2, 1, 3], [3, 2, 1], [1, 1, 1], [1, 1, 2]])
     surfels = Surfels.from_numpy(discs(scale=scales, rotation=np.random.default_rng(0).normal(size=(5, 4))))
-    axes = np.stack([np.array(axis).T for axis in surfels.frame()], axis=1)
-    expected = axes[np.arange(5), [0, 1, 2, 2, 0]]
+    expected = np.stack([np.array(axis).T for axis in surfels.frame()], axis=1)[np.arange(5), [0, 1, 2, 2, 0]]
     normal = np.array(surfels.primitive.normal(surfels)).T
     assert np.abs(np.sum(normal * expected, axis=1)[:4] - 1).max() < 1e-6
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs import methods
+from mi_refgs import Reconstruction, methods
 from mi_refgs.cli import main
 from mi_refgs.constants import ALPHA_MAX, ALPHA_MIN
 from mi_refgs.errors import InputError
@@ -188,6 +188,8 @@ def test_balls_are_split_and_written(tmp_path: Path) -> None:
     write_ply(tmp_path / "balls.ply", edited.surfels)
     read = read_ply(tmp_path / "balls.ply")
     assert read.primitive.name == "ball"
+    made = Reconstruction.from_params(before | {"radiance_sh": np.zeros((len(before["radius"]), 3))})
+    assert made.export("3dgs-ply", tmp_path / "gaussians.ply") and made.render(0, size=16)[..., 3].max() > 0.5
     np.testing.assert_array_equal(read.to_numpy()["radius"], after["radius"])
 
 

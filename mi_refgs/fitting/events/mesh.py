@@ -36,8 +36,7 @@ class ExtractMesh(Event[Trainer]):
         exchange(trainer.setup, trainer.fit)
         views, method = len(trainer.data.views), trainer.method
         last = self.when.count(trainer.iteration) == self.when.count(method.iterations)
-        seen = range(views) if last else evenly_spread(views, FEW_VIEWS)
-        cameras = [trainer.camera(i) for i in seen]
+        cameras = [trainer.camera(i) for i in (range(views) if last else evenly_spread(views, FEW_VIEWS))]
         trainer.fit.occluder.update(surface_of(trainer.surfels.detach(), cameras, self.resolution))
 
 

@@ -33,8 +33,7 @@ class FollowObject(Event[Trainer]):
     def due(self, trainer: Trainer) -> bool:
         region = trainer.data.region
         open_ = trainer.setup.open_scene and region is not None and region.estimated
-        late = trainer.iteration >= AFTER * trainer.method.iterations
-        return open_ and late and trainer.fit.region is None
+        return open_ and trainer.iteration >= AFTER * trainer.method.iterations and trainer.fit.region is None
 
     def apply(self, trainer: Trainer) -> None:
         trainer.check()

@@ -106,7 +106,6 @@ def _moved(trainer: Trainer, view: View) -> float:
     render = partial(trainer.view, aovs=False)
     everywhere = np.ones((view.height, view.width), bool)
     fitted = aligned(view, render(view.camera()), render, trainer.data, everywhere)
-    corners = np.array([*itertools.product((-0.5, 0.5), repeat=3)])
-    points = trainer.setup.focus + trainer.setup.reach * corners
+    points = trainer.setup.focus + trainer.setup.reach * np.array([*itertools.product((-0.5, 0.5), repeat=3)])
     before, after = (np.stack(one.project(points)[:2]) for one in (view, fitted))
     return float(np.linalg.norm(after - before, axis=0).mean())

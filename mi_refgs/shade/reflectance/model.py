@@ -119,6 +119,11 @@ def require_complete(model: Reflectance) -> None:
         if not {*values} <= {*allowed}:
             what = f"{name}: {abbreviated(getattr(model, name))} is not allowed"
             raise InputError(what, "reflectance model", model.name, f"use {' or '.join(allowed)}")
+    both = {"visibility_rays", "traced_bounces"} <= {*model.honoured}
+    filtered = model.light == "filtered" or not (both or "ambient_rays" in model.honoured)
+    if not filtered or (model.light == "none" and "traced_bounces" in model.honoured):
+        what = f"honoured: hits are not lit, since light is {model.light!r}"
+        raise InputError(what, "reflectance model", model.name, "use filtered light, or honour less")
 
 
 MODELS: Registry[Reflectance] = Registry("reflectance model", require_complete, of=Reflectance)

@@ -54,7 +54,7 @@ class MonteCarlo(Reflectance):
         return {"albedo": base, "metallic": 0 * roughness, "roughness": roughness}
 
     def trace(self, points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
-        """The points with `free` (mi.UInt64): bit j says that light arrives from direction j."""
+        """The points with `free` (mi.UInt64), bit j of which says that light arrives from direction j."""
         count = dr.opaque(mi.UInt32, options.directions)
         normal, position = dr.detach(safe_normalize(points.normal)), dr.detach(points.position)
 
@@ -67,7 +67,7 @@ class MonteCarlo(Reflectance):
             start = (mi.UInt32(0), dr.zeros(mi.UInt64, dr.width(position)))
             _, free = dr.while_loop(start, lambda index, _: index < count, body, label="visibility")
             dr.eval(free)  # now, once: every kernel of the adjoint that reads it would trace the rays again
-        return points.replaced(free=free)
+        return points.replaced(free=free, visibility=mi.Float(dr.popcnt(free)) / mi.Float(count))
 
     def shade(self, points: ShadingPoints, light: Light, options: ShadingOptions) -> RadianceTerms:
         count = dr.opaque(mi.UInt32, options.directions)
