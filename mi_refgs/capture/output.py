@@ -97,8 +97,7 @@ def write_images(
         from PIL import Image
 
         camera, image = straight[photograph.copy], folder / IMAGES / photograph.name
-        turned = photograph.orientation != 1 or photograph.lying
-        if camera.undo is None and photograph.plain and not turned:
+        if camera.undo is None and photograph.plain and photograph.orientation == 1 and not photograph.lying:
             replace_file(image, partial(shutil.copyfile, photograph.path))
         else:
             jpeg = photograph.path.suffix.lower() in (".jpg", ".jpeg")

@@ -158,8 +158,7 @@ def markdown(table: Table) -> str:
         for row in scene.rows:
             marks = f" [{','.join(map(str, row.footnotes))}]" if row.footnotes else ""
             seeds = f" ({len(row.seeds)} seeds)" if len(row.seeds) > 1 else ""
-            cells = (cell(c, row.numbers.get(c.key)) for c in columns)
-            body.append([f"{row.variant}{marks}{seeds}", *cells])
+            body.append([f"{row.variant}{marks}{seeds}", *(cell(c, row.numbers.get(c.key)) for c in columns)])
         scale = f", downscaled for the fits by {scene.downscale}" if scene.downscale not in (None, 1) else ""
         size = " × ".join(map(str, scene.image_size))
         images = f" ({scene.test_views} test views of {size} pixels{scale})" if size else ""

@@ -72,11 +72,15 @@ def _ssim(inputs: LossInputs) -> Float:
     return losses.d_ssim(inputs.image, inputs.target.image, camera.width, camera.height)
 
 
-def _normal(inputs: LossInputs) -> Float:
-    frame = inputs.frame
+def _normal(inputs: LossInputs, mirrors: bool = False) -> Float | None:
+    frame, weight = inputs.frame, inputs.frame.alpha
+    if mirrors:
+        if not {*MATERIALS} <= {*frame.maps}:
+            return None
+        weight = weight * frame.maps["metallic"] * (1 - frame.maps["roughness"]) ** 8
     depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, inputs.target.camera)
-    share = None if frame.background is None else frame.object_alpha
-    return losses.normal_consistency(frame.normal, depth_normal, valid, frame.alpha, share)
+    covered = dr.detach(frame.alpha) if frame.background is None else frame.object_alpha
+    return losses.normal_consistency(frame.normal, depth_normal, valid, weight, covered)
 
 
 def _smooth(inputs: LossInputs) -> Float:
@@ -106,6 +110,7 @@ register_loss(Loss("l1", lambda of: losses.l1(of.image, of.target.image)))
 register_loss(Loss("gain", _gain))
 register_loss(Loss("ssim", _ssim))
 register_loss(Loss("normal", _normal, normals=True))
+register_loss(Loss("mirror_normal", lambda of: _normal(of, True), True, True, attributes=MATERIALS))
 register_loss(Loss("smooth", _smooth, normals=True))
 register_loss(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
 register_loss(Loss("materials", _materials, maps=True, attributes=MATERIALS))

@@ -78,9 +78,7 @@ def gaussians(trained: TrainedScene, shots: Sequence[Shot], degree: int, object_
     # Geometry: surfels get a thin third axis, and move inwards.
     parts = [_geometry(table) for table in tables]
     raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    flat = np.concatenate(
-        [np.full(table.count, table.primitive.widths.get("scale") == 2) for table in tables]
-    )
+    flat = np.concatenate([np.full(one.count, one.primitive.widths.get("scale") == 2) for one in tables])
     if flat.any():
         raw["position"] = np.where(flat[:, None], _inset(tables, cameras), raw["position"])
     # Colours: those of an imported file are encoded already.

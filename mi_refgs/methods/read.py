@@ -111,8 +111,7 @@ def for_purpose(purpose: str) -> str:
     files = resource_dir("variants").glob("*.toml")
     found = {_read(path).get("about", {}).get("purpose"): path.stem for path in files}
     if not purpose or purpose not in found:
-        known = ", ".join(sorted(filter(None, found)))
-        remedy = f"use one of {known}, or choose a --method"
+        remedy = f"use one of {', '.join(sorted(filter(None, found)))}, or choose a --method"
         raise InputError("no method is for that", "--for", purpose, remedy)
     return found[purpose]
 

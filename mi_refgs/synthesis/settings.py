@@ -72,8 +72,7 @@ def _parts_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
     """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
     shapes = all_but(scene.shapes(), objects)
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
-    lamps = [lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)]
-    return [*shapes, *lamps]
+    return [*shapes, *(lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface))]
 
 
 def scene_of(parts: Sequence[Any]) -> Any:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import LossWeight
 from mi_refgs.reference import losses as reference
+from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, planes, shown, view_of
@@ -72,7 +74,8 @@ def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     radiance, alpha = picture
     maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}
     uploaded = {name: upload(x.astype(np.float32)) for name, x in maps.items()}
-    frame = replace(frame_of(radiance, alpha), maps=uploaded)
+    depth = upload(rng.uniform(2, 2.1, alpha.size).astype(np.float32))
+    frame = replace(frame_of(radiance, alpha), maps=uploaded, depth=depth)
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
 
     def loss(iteration: int = 1, **weights: LossWeight) -> float:
@@ -89,11 +92,15 @@ def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     guide = np.stack([np.array(plane).reshape(alpha.shape) for plane in target.image], axis=-1)
     expected = 0.2 * reference.smoothness(smooth, guide, 10.0)
     assert loss(materials=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3)
+    normals = normals_from_depth(depth, frame.alpha, target.camera)
+    mirror = frame.alpha * uploaded["metallic"] * (1 - uploaded["roughness"]) ** 8
+    expected = 0.2 * float(losses.normal_consistency(frame.normal, *normals, mirror, frame.alpha)[0])
+    assert loss(mirror_normal=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3) and expected > 1e-5
     expected = 0.4 * float(losses.light_colour(light)[0])
     assert loss(light_colour=LossWeight(0.4)) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
 
 
-@pytest.mark.parametrize("prior", ["half_metal", "materials", "light_colour"])
+@pytest.mark.parametrize("prior", ["half_metal", "materials", "light_colour", "mirror_normal"])
 def test_prior_needs_what_it_is_about(prior: str) -> None:
     weight = [f"loss.{prior}=0.1"]
     with pytest.raises(InputError, match=rf"loss\.{prior}: needs .*, or drop the loss"):

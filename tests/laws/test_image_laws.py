@@ -125,8 +125,7 @@ def test_tiles_do_not_show(seed: int, tile: tuple[int, int]) -> None:
     tilt = rng.normal(size=(COUNT, 3)) * [0.04, 0.04, 1]  # σ sin θ is far below the layers' distance
     rotation = Rotation.from_rotvec(tilt).as_quat()
     layers = law_scenes.random_scene(seed, size=0.3, opacity=1.0)
-    layers = layers.changed(position=position, rotation=rotation)
-    scene = Scene(layers.raw, View(np.eye(4)))
+    scene = Scene(layers.changed(position=position, rotation=rotation).raw, View(np.eye(4)))
     shipped = draw(scene)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "TILE_SIZES", ((np.inf, tile),))

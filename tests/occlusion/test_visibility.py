@@ -76,8 +76,7 @@ def test_offset_is_what_prevents_self_occlusion(monkeypatch: pytest.MonkeyPatch)
     point, normal, mirror = mirror_rays(shape, 2000)
     args = mi.Point3f(vector(point - mesh.voxel * normal)), vector(mirror), vector(normal)
     assert dr.all(occluder.visible(*args) == 1)
-    steep = np.sum(mirror * normal, axis=1) > 0.6
-    assert np.array(occluder.visible(args[0], args[1]))[steep].all()
+    assert np.array(occluder.visible(args[0], args[1]))[np.sum(mirror * normal, axis=1) > 0.6].all()
     monkeypatch.setattr(visibility, "OFFSET_VOXELS", 0.0)
     assert dr.mean(occluder.visible(*args))[0] < 0.01
 

@@ -114,8 +114,7 @@ def test_pixels_read_what_the_mesh_holds() -> None:
     at = np.array([[0.2, 0.3], [0.6, 0.1], [0.1, 0.1], [2, 2]])
     ray, covered = vector(np.column_stack([at, -np.ones(4)])), mi.Bool([True, True, False, True])
     ratio = ambient.ambient_of_pixels(TraceContext(occluder, surfels, None, eye, ray, covered))
-    shares = np.column_stack([1 - at.sum(1), at])
-    expected = np.where([[True], [True], [False], [False]], shares @ colours, 1)
+    expected = np.where([[True], [True], [False], [False]], np.column_stack([1 - at.sum(1), at]) @ colours, 1)
     np.testing.assert_allclose(ratio.numpy().T, expected, atol=1e-5)
     occluder.update(mesh)
     assert occluder.ambient is None

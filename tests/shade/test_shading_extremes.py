@@ -108,5 +108,4 @@ def test_energy_under_a_constant_light_of_1(dominant: bool) -> None:
     options = ShadingOptions(diffuse="irradiance", dominant=dominant)
     total = SplitSum().shade(points_of(values), light, options).total().numpy()[0]
     assert total.min() >= 0 and total.max() <= 1 + 1e-3
-    white = (albedo == 1) & (metallic == 0)
-    assert total[white].min() >= 1 - 1e-3
+    assert total[(albedo == 1) & (metallic == 0)].min() >= 1 - 1e-3

@@ -132,8 +132,7 @@ def densify_and_prune(
     raw = surfels.to_numpy()
     primitive = primitive_of(raw)
     opacity = sigmoid(raw["opacity"][:, 0])
-    size = primitive.extent(raw)[1].max(axis=1)
-    keep = (size <= largest) & (opacity >= prune_opacity)
+    keep = (primitive.extent(raw)[1].max(axis=1) <= largest) & (opacity >= prune_opacity)
     keep[gone] = False
     if keep_one and not keep.any():
         keep[np.argmax(opacity)] = True

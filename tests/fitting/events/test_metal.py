@@ -81,8 +81,7 @@ def test_each_region_has_its_start(
     gains: tuple[float, float], views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All images gain enough as metal in their upper half, so the upper half of the ball starts as metal."""
-    gain = np.where((np.arange(SIZE) < SIZE // 2)[:, None], *gains)
-    judged(monkeypatch, 0.01, 0.01 * 10 ** (-gain / 10))
+    judged(monkeypatch, 0.01, 0.01 * 10 ** (-np.where((np.arange(SIZE) < SIZE // 2)[:, None], *gains) / 10))
     trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4")
     is_metal = metallic(trainer)[:, 0] > 0.5
     height = trainer.surfels.to_numpy()["position"][:, 2]
