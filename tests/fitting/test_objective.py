@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
