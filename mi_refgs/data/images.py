@@ -22,6 +22,7 @@ from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import is_file
 
 CACHE_BYTES = 2**30  # of decoded images that a data set keeps: 28 of 12 Mpx, a thousand of 600 × 600
+OVERSHOOT = 0.25  # of alpha beyond 0 … 1 in an EXR file: filters with negative lobes have an eighth
 BAND = 256  # rows of a file that are converted to floating point at a time, for less memory
 MASKS = "masks"
 FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "rgb", "image")
@@ -86,6 +87,8 @@ class ImageFile:
             pixels = read_exr_image(self.path)
             if pixels.shape[-1] < 3:
                 raise InputError("no R, G, B", self.path, "channels", "export a colour image")
+            if np.abs(pixels[..., 3:] - 0.5).max(initial=0) > 0.5 + OVERSHOOT:
+                raise InputError("beyond 0 … 1", self.path, "A", "export alpha from 0 to 1")
         else:
             pixels, factor = io.read_bytes(self.path, 1 if self.mask else int(self.downscale))
             if self.downscale == 1 and self.mask is None and self.undistortion is None:

@@ -46,6 +46,9 @@ def started(names: Sequence[str], wanted: Wanted) -> Start:
     """The start by the first initialiser of these that fits the data; raises InputError if none does."""
     for name in names:
         if (start := INITIALISERS.find(name, "surfels.start").start(wanted)) is not None:
+            if not isinstance(start, Start):
+                what, remedy = f"'{name}' returned a {type(start).__name__}", "return a Start, or None"
+                raise InputError(what, "surfels.start", remedy=remedy)
             return start
     raise InputError("no initialiser fits the data", field="surfels.start", remedy="add 'random'")
 

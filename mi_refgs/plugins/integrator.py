@@ -1,6 +1,5 @@
 """The `refgs` integrator: Gaussian surfels and deferred shading for `mi.render`."""
 
-import math
 import time
 import warnings
 from dataclasses import replace
@@ -107,6 +106,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.aovs = parse_aovs(str(properties.get(props, "aovs", "")))
         self.check()
         self.changed, self.next_check = False, 0.0  # since the last check; seconds of the monotonic clock
+        self.announced: set[tuple[str, str]] = set()  # what was warned of
         self._warn_of_unusable()
 
     def check(self) -> None:
@@ -247,17 +247,20 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         return f"RefGSIntegrator[\n  surfels = {self.surfels.count},\n  shading = {self.shading}\n]"
 
     def _warn_of_unusable(self) -> None:
-        """Warn of unusable values, and never check again if there are any."""
-        found = [
-            f"{len(rows)} {kind} in {name} (first: {rows[0]})"
+        """Warn of unusable values, once for each attribute and map."""
+        found = {
+            (kind, name): f"{len(rows)} {kind} in {name} (first: {rows[0]})"
             for kind, model in self._models.items()
             for name, rows in model.unusable().items()
-        ]
+        }
         maps = self._maps.items()
-        found += [f"{black} values of {name}" for name, light in maps if (black := light.unusable())]
-        if found:
-            self.next_check = math.inf
-            what = f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(found)}"
+        found |= {
+            ("", name): f"{black} values of {name}" for name, light in maps if (black := light.unusable())
+        }
+        new = [text for key, text in found.items() if key not in self.announced]
+        self.announced |= {*found}
+        if new:
+            what = f"refgs: values are NaN, infinite or beyond {RAW_LIMIT:g}: {', '.join(new)}"
             warnings.warn(f"{what}; they are left out, such light is black", RuntimeWarning, stacklevel=3)
 
 

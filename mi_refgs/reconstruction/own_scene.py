@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import drjit as dr
@@ -13,7 +14,7 @@ from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.plugins.light import light_of, own_light, used_emitters
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.runs.trained_scene import TrainedScene
-from mi_refgs.shade.light.envmap import EnvironmentLight
+from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.light.latlong import lat_long
 from mi_refgs.shade.light.light import RotatedLight
 from mi_refgs.shade.options import ShadingOptions
@@ -44,15 +45,24 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     with dr.suspend_grad():
         seen = light_of(integrator.shading, integrator.light, integrator.light_to_world, params)
     light = integrator.light
-    if isinstance(seen, RotatedLight) or (light is None and seen is not None):
-        own = own_light(lights[0])[0] if light is None else light
-        light = EnvironmentLight.from_radiance(lat_long(seen.radiance, own.height))
-    if not isinstance(integrator.behind, EnvironmentLight | None) and dr.any(integrator.behind != 0):
+    if light is None and seen is not None:
+        light = own_light(lights[0])[0]
+    if isinstance(seen, RotatedLight):
+        light = EnvironmentLight.from_radiance(lat_long(seen.radiance, light.height))
+    around, behind = integrator.surroundings, integrator.behind
+    if around is not None:
+        if behind is None:
+            what = "background: behind surroundings a reconstruction has one, so it becomes black"
+            warnings.warn(what, RuntimeWarning, stacklevel=3)
+        elif around.background is None:
+            every = np.tile(np.array(behind).ravel(), (MIN_HEIGHT, 2 * MIN_HEIGHT, 1))
+            behind = EnvironmentLight.from_radiance(every)
+        behind = behind and EnvironmentLight(dr.detach(behind.raw))
+        around = Surroundings(Surfels(around.surfels.raw).detach(), behind)
+        around.surfels.validate()
+    elif behind is not None and dr.any(behind != 0):
         what = "background: a reconstruction has none of one colour, so it becomes transparent"
         warnings.warn(what, RuntimeWarning, stacklevel=3)
-    if (around := integrator.surroundings) is not None:
-        around = Surroundings(Surfels(around.surfels.raw).detach(), around.background)
-        around.surfels.validate()
     return TrainedScene(
         integrator.surfels.detach(),
         None if light is None else EnvironmentLight(dr.detach(light.raw)),
@@ -80,6 +90,6 @@ def _of_arrays(params: Mapping[str, Any], mesh: Mesh | None, shading: ShadingOpt
         if lost := spare(surfels.raw, MODELS[reflectance].required_attributes(shading)):
             what = f"{', '.join(lost)}: `{reflectance}` does not use it; name a model by `shading`"
             warnings.warn(what, RuntimeWarning, stacklevel=4)
-    resolved = Shading.resolve(shading, mesh is not None)
-    resolved.require_inputs(surfels.raw, light is not None)
+    resolved = Shading(**asdict(shading)) if mesh is None else Shading.resolve(shading, True)
+    resolved.require_inputs(surfels.raw, light is not None, mesh is not None)
     return TrainedScene(surfels, light, mesh, resolved, iteration=0, seconds=0.0)

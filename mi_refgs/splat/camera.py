@@ -107,7 +107,7 @@ class Camera:
         """Camera at `origin` that looks at `target`, world, `up` upwards in the image; fov: degrees across
         the width; size: width and height, or both as one, pixels; near: scene units, by default 1/1000 of the
         distance. Raises InputError for values that define no view."""
-        width, height = (size, size) if isinstance(size, int) else size
+        width, height = (int(size), int(size)) if isinstance(size, int | np.integer) else size
         eye, forward, top = (np.asarray(x, dtype=np.float64) for x in (origin, target, up))
         forward = forward - eye
         distance, left = float(np.linalg.norm(forward)), np.cross(top, forward)
@@ -223,7 +223,7 @@ class Camera:
 
     def resized(self, size: int | tuple[int, int]) -> Camera:
         """The same view with another size, or longer side, pixels; raises InputError if there are none."""
-        if isinstance(size, int):
+        if isinstance(size, int | np.integer):
             ratio, least = size / max(self.width, self.height), min(size, 1)
             size = max(least, round(self.width * ratio)), max(least, round(self.height * ratio))
         if min(size) < 1:

@@ -1,7 +1,8 @@
 """Attributes of a surfel: the one place where they are declared. A new one is a `register`ed `Attribute`."""
 
+import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -15,8 +16,10 @@ JITTER_RANGE = (0.001, 0.999)  # of initial values with noise: beyond, the sigmo
 PROBABILITY_MARGIN = 1e-6  # least distance of initial values from 0 and 1, where the logit is infinite
 
 RESERVED = """normal depth alpha visibility radiance diffuse specular indirect object surroundings
-    light light_to_world near_field mesh background aovs filename occlusion shade_at reflectance""".split()
-"""Names of maps and of options of the integrator."""
+    light light_to_world near_field mesh background aovs filename occlusion shade_at reflectance
+    dominant antialias visibility_rays traced_bounces ambient_rays directions
+    gain pose light_rotation light_scale light_turntable""".split()
+"""Names of maps, of options of the integrator, and of what fits learn beside surfels."""
 
 Activation = Literal["identity", "quaternion", "exp", "sigmoid", "harmonics"]
 """Activation of a raw value. "quaternion": normalised (x, y, z, w); "sigmoid": logistic; `harmonics`: raw
@@ -90,16 +93,27 @@ class Attribute:
 
 
 def _check(attribute: Attribute) -> None:
-    if attribute.aov not in ("", "Y", "RGB", "XYZ") or len(attribute.aov) not in (0, *attribute.widths):
-        what = f"aov: {attribute.aov!r} does not fit {' or '.join(map(str, attribute.widths))} columns"
-        remedy = 'use Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""'
+    def refuse(what: str, remedy: str) -> None:
         raise InputError(f"attribute '{attribute.name}': {what}", remedy=remedy)
+
+    names, widths, aov = attribute.properties, attribute.widths, attribute.aov
+    if not (isinstance(names, tuple) and isinstance(widths, tuple) and widths):
+        refuse("widths, properties: not tuples", "write widths=(1,) and properties=('name',)")
+    known = [name for name in get_args(Activation) if attribute.geometry or name != "quaternion"]
+    if attribute.activation not in known:
+        refuse(f"activation: {attribute.activation!r} is unknown", f"use {' or '.join(known)}")
+    if not all(re.fullmatch("[!-~]+", name) for name in names):
+        refuse(f"properties: {names}: not all are names in a PLY file", "use ASCII without spaces")
+    if len(names) < (columns := 1 if attribute.harmonics else max(widths)):
+        refuse(f"properties: {len(names)} for {columns} columns", "name one for each")
+    if aov not in ("", "Y", "RGB", "XYZ") or len(aov) not in (0, *widths):
+        what = f"aov: {aov!r} does not fit {' or '.join(map(str, widths))} columns"
+        refuse(what, 'use Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""')
     if attribute.name in RESERVED:
-        raise InputError(f"attribute '{attribute.name}': the integrator has it", remedy="rename it")
+        refuse("the name is taken", "rename it")
     for other in ATTRIBUTES.values():
-        if {*other.properties} & {*attribute.properties}:
-            what = f"attribute '{attribute.name}': '{other.name}' has its PLY property"
-            raise InputError(what, remedy="rename it")
+        if {*other.properties} & {*names}:
+            refuse(f"'{other.name}' has its PLY property", "rename it")
 
 
 ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check, of=Attribute)

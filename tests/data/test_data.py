@@ -173,6 +173,10 @@ def nan(folder: Path) -> None:
     write_exr(folder / "train/r_4.exr", broken)
 
 
+def unbounded(folder: Path) -> None:
+    write_exr(folder / "train/r_4.exr", np.full((HEIGHT, WIDTH, 4), 1.5))
+
+
 @pytest.mark.parametrize(
     ("damage", "options", "words"),
     [
@@ -195,6 +199,7 @@ def nan(folder: Path) -> None:
         (lambda f: (f / "train/r_0.png").write_bytes(b"\x89PNG"), {}, ["r_0.png", "readable"]),
         (resize, {}, ["6 different sizes", "one size"]),
         (nan, {"images": "exr"}, ["r_4.exr", "NaN", "row 1, column 2"]),
+        (unbounded, {"images": "exr"}, ["r_4.exr", "A", "beyond 0 … 1", "export alpha"]),
         (lambda f: None, {"downscale": 5}, ["r_0.png", "downscale", "smaller"]),
         (lambda f: None, {"downscale": 0}, ["downscale"]),
         (lambda f: None, {"background": "green"}, ["background", "green"]),

@@ -1,5 +1,6 @@
 """`Reconstruction.from_params`: the state of a loop is what save, relight, export and view take."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +57,33 @@ def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) 
         assert found.trained.light is not None and found.trained.light.height == 16
         shown = found.render(camera)[..., :3]
         np.testing.assert_allclose(shown, expected[..., :3], atol=0.03 * expected.max())
+    scene = mi.load_dict({"type": "scene", **parts, "sky": turned | {"to_world": mi.ScalarTransform4f()}})
+    exact = Reconstruction.from_params(scene).render(camera)[..., :3]
+    np.testing.assert_allclose(exact, mi.render(scene, spp=1)[..., :3], atol=1e-5)
     surfels = {"type": "refgs", **balls.trained.surfels.raw, "light": turned, "background": mi.Color3f(1)}
     with pytest.warns(RuntimeWarning, match="background: "):
         Reconstruction.from_params(mi.load_dict(surfels))
+
+
+@pytest.mark.parametrize("behind", [None, [0.1, 0.2, 0.3], sky(16)])
+def test_what_is_behind_surroundings_is_taken(balls: Reconstruction, behind: Any) -> None:
+    """A colour, too; a copy, which the loop does not change."""
+    raw = balls.trained.surfels.raw
+    around = {
+        f"surroundings_{x}": raw[x] for x in ("position", "rotation", "scale", "opacity", "radiance_sh")
+    }
+    own = {"type": "refgs", **raw, **around, "reflectance": "radiance"}
+    if behind is not None:
+        own["background"] = mi.Color3f(behind) if len(behind) == 3 else mi.TensorXf(behind)
+    scene = mi.load_dict(
+        {"type": "scene", "refgs": own, "sensor": balls.scene(balls.camera(0, 24)).sensors()[0]}
+    )
+    with pytest.warns(RuntimeWarning, match="becomes black") if behind is None else nullcontext():
+        made = Reconstruction.from_params(scene)
+    before = mi.render(scene, spp=1).numpy()
+    if (params := mi.traverse(scene)).get("refgs.background") is not None:
+        params.update({"refgs.background": 0 * params["refgs.background"]})
+    np.testing.assert_allclose(made.render(balls.camera(0, 24))[..., :3], before[..., :3], atol=1e-5)
 
 
 def test_models_without_mirror_rays_keep_the_mesh(balls: Reconstruction) -> None:
@@ -82,6 +107,9 @@ def test_other_states_are_refused(balls: Reconstruction) -> None:
     refused(lambda: make(arrays | {"hue": arrays["opacity"]}), "hue")
     refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
     refused(lambda: make(arrays), "shading: light: reflectance = split_sum needs one")
+    traced = ShadingOptions(occlusion=True, traced_bounces=2, diffuse="irradiance")
+    lit = arrays | {"light": sky(16)}
+    refused(lambda: make(lit, shading=traced), "occlusion: there is no mesh to trace")
     refused(lambda: make(arrays | {"opacity": np.full_like(arrays["opacity"], np.nan)}), "NaN")
     refused(lambda: make(arrays | {"light": np.full((8, 16, 3), np.nan)}), "NaN")
     white = {"type": "refgs", **balls.trained.surfels.raw, "background": mi.Color3f(np.nan)}
@@ -91,7 +119,7 @@ def test_other_states_are_refused(balls: Reconstruction) -> None:
     refused(lambda: make(params), "NaN")
     sun = {"type": "directional", "direction": [0, 0, -1]}
     surfels = {"type": "refgs", **balls.trained.surfels.raw, "reflectance": "split_sum"}
-    lit = mi.load_dict({"type": "scene", "refgs": surfels, "sun": sun})
-    refused(lambda: make(lit), "its light is not an environment alone")
-    refused(lambda: make(mi.traverse(lit.integrator())), "its light is not an environment alone")
+    sunny = mi.load_dict({"type": "scene", "refgs": surfels, "sun": sun})
+    refused(lambda: make(sunny), "its light is not an environment alone")
+    refused(lambda: make(mi.traverse(sunny.integrator())), "its light is not an environment alone")
     refused(lambda: make(balls.scene(), shading=balls.trained.shading), "a scene has its own")

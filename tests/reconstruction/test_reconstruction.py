@@ -58,7 +58,8 @@ def test_render_size_keeps_the_view(balls: Reconstruction) -> None:
     mean = balls.render(0, size=2 * SIZE).reshape(SIZE, 2, SIZE, 2, 4).mean(axis=(1, 3))
     np.testing.assert_allclose(mean, balls.render(0, samples=4), atol=1e-5)
     camera = Camera.look_at([3, 0, 1], size=(64, 32))
-    assert balls.render(camera, size=20).shape == (10, 20, 4)
+    longest: Any = np.int64(20)
+    assert balls.render(camera, size=longest).shape == (10, 20, 4)
     assert balls.render(camera, size=(9, 7)).shape == (7, 9, 4)
 
 

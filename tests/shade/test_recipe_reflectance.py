@@ -17,11 +17,12 @@ from mi_refgs.evaluation.decomposition import material_maps
 from mi_refgs.evaluation.images import RenderedView
 from mi_refgs.formats.baking import bake
 from mi_refgs.formats.format import Shot
+from mi_refgs.methods.method import APART
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade import reflectance
 from mi_refgs.shade.light.constant import ConstantLight
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from mi_refgs.shade.options import ShadingOptions
+from mi_refgs.shade.options import QUALITY, ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, reflect, safe_normalize
 from mi_refgs.shade.reflectance import Reflectance, SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading
@@ -187,5 +188,21 @@ def test_a_model_may_trace_its_own_rays(order: str, tmp_path: Path) -> None:
 def test_suffixes_of_an_aov_are_those_of_its_columns(aov: str, widths: tuple[int, ...]) -> None:
     wrong = Attribute("sheen", widths, "sigmoid", 0.02, ("sheen",) * widths[0], aov=aov)
     refused(lambda: attributes.register(wrong), "attribute 'sheen': aov: ", "columns; use Mitsuba's")
-    taken = replace(wrong, name="specular", aov="")  # one of the image's own maps
-    refused(lambda: attributes.register(taken), "attribute 'specular': the integrator has it")
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"name": "specular"}, "attribute 'specular': the name is taken"),  # one of the image's own maps
+        ({"activation": "softplus"}, "'softplus' is unknown; use identity or exp or sigmoid or harmonics"),
+        ({"widths": 1}, "widths, properties: not tuples"),
+        ({"properties": "sheen"}, "widths, properties: not tuples"),
+        ({"properties": ("the sheen",)}, "not all are names in a PLY file"),
+        ({"widths": (3,)}, "properties: 1 for 3 columns; name one for each"),
+        ({"properties": ("x",)}, "'position' has its PLY property"),
+    ],
+)
+def test_attributes_that_no_file_or_fit_keeps_are_refused(change: dict[str, Any], message: str) -> None:
+    sheen = Attribute("sheen", (1,), "sigmoid", 0.02, ("sheen",))
+    refused(lambda: attributes.register(replace(sheen, **change)), message)
+    assert {*APART, *QUALITY} <= {*attributes.RESERVED}

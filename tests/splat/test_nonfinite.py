@@ -155,3 +155,7 @@ def test_plugin_warns_once_with_attribute_count_and_first_surfel() -> None:
         warnings.simplefilter("error")
         params.update({"integrator.metallic": mi.TensorXf(values)})
         mi.render(made, spp=1)
+    params.update({"integrator.roughness": params["integrator.roughness"] * np.nan})
+    made.integrator().next_check = 0
+    with pytest.warns(RuntimeWarning, match=r"beyond 1e\+18: \d+ surfels in roughness"):
+        mi.render(made, spp=1)
