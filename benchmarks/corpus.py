@@ -38,7 +38,6 @@ READERS: dict[str, tuple[str, Callable[[Any], str]]] = {
     ".exr .hdr": (".shade.light.light_file:read_radiance", lambda x: f"{x.shape[1]} × {x.shape[0]} texels"),
     ".json": (".formats.cameras:read_cameras", lambda cameras: f"{len(cameras)} cameras"),
     ".xml": (".synthesis.settings:load_scene", lambda scene: f"{len(scene.shapes())} shapes"),
-    ".mp4": (".capture.photographs:find_photographs", lambda found: f"{len(found)} photographs"),
 }
 """Endings, "" for data sets → reader, and what is said of its result."""
 

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
-from mi_refgs.data.colmap_model import MODELS
-from mi_refgs.errors import require_package
+from mi_refgs.data.colmap_model import MODELS, read_cameras, read_images, read_points
+from mi_refgs.errors import InputError, require_package
 from mi_refgs.io.progress import progress_bar
 
 SEED = 0  # seed of all random numbers; a second run gives the same result
@@ -48,6 +48,16 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         pycolmap.logging.minloglevel = before
+
+
+def write(model: Reconstruction, folder: Path) -> None:
+    """Write COLMAP's binary files; raises InputError if they are not whole, of which COLMAP says nothing."""
+    model.write_binary(folder)
+    try:
+        for file, read in (("cameras", read_cameras), ("images", read_images), ("points3D", read_points)):
+            read(folder / f"{file}.bin")
+    except InputError as error:
+        raise InputError("not written whole", folder, "output", "free some space, and repeat") from error
 
 
 def _run(call: Callable[[Any], Result]) -> Result:

@@ -135,4 +135,4 @@ def write_model(
         own.params = [*camera.focal, *camera.centre]
         image.name = photographs[image.name].name
     folder.mkdir(parents=True, exist_ok=True)
-    written.write_binary(folder)
+    colmap.write(written, folder)

@@ -2,26 +2,21 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import laplace
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
 from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
-from mi_refgs.errors import InputError, counted, require_package
+from mi_refgs.errors import InputError, counted
 from mi_refgs.io.images import exif_tags, image_header, open_image, positive, read_mask, to_8_bits
+from mi_refgs.io.ownership import MARK
 from mi_refgs.io.progress import Tell
 
-VIDEOS = ".mp4 .mov .m4v .avi .mkv .webm .mts".split()
-FRAMES = 120  # of a video that are used, at most: with every pair matched, some minutes
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .avif".split()  # for a message
 WORK = ".work"  # folder of working copies, features, matches and the model; it may be removed afterwards
 REPORT = "capture.json"  # written last: with a folder WORK or this file, the folder is a capture
@@ -99,10 +94,9 @@ def find_photographs(folder: Path, tell: Tell = lambda _: None) -> list[Photogra
     all have one size and one lens; `tell` is called with what is not read. Raises InputError for too few
     images, many sizes, and unreadable files."""
     if not folder.is_dir():
-        what = "is no video" if folder.exists() else "no such folder"
-        raise InputError(what, folder, "photographs", "give a folder with JPEG or PNG files")
+        raise InputError("no such folder", folder, "photographs", "give one with JPEG or PNG files")
     paths, below = image_files(folder, deep=False), [*folder.rglob("*")]
-    captures = {path.parent for path in below if path.name in (REPORT, WORK)}
+    captures = {path.parent for path in below if path.name in (REPORT, WORK, MARK)}
     inner = [p for p in image_files(folder, deep=True) if captures.isdisjoint(p.parents)]
     inner = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
     if len(paths) < FEWEST:
@@ -124,34 +118,12 @@ def find_photographs(folder: Path, tell: Tell = lambda _: None) -> list[Photogra
     return kept
 
 
-@contextmanager
-def folder_of(source: Path) -> Iterator[Path]:
-    """A folder of photographs; for a video, a temporary one with the sharpest of every few frames, at most
-    FRAMES. Raises InputError for an unreadable video, and without PyAV."""
-    if source.suffix.lower() not in VIDEOS or not source.is_file():
-        yield source
-        return
-    av = require_package("av", "video", source)
-    with TemporaryDirectory(prefix=f"{source.stem}_") as folder:
-        try:
-            with av.open(str(source)) as count, av.open(str(source)) as opened:
-                step = -(-sum(packet.size > 0 for packet in count.demux(video=0)) // FRAMES)
-                frames = enumerate(opened.decode(video=0))
-                for number, group in groupby(frames, lambda frame: frame[0] // step):
-                    images = (frame.to_image().rotate(frame.rotation, expand=True) for _, frame in group)
-                    sharpest = max(images, key=lambda image: np.var(laplace(np.float32(image.convert("L")))))
-                    sharpest.save(Path(folder) / f"{number:04}.jpg", quality=95, subsampling=0)
-        except (av.FFmpegError, IndexError, ZeroDivisionError) as error:
-            remedy = "record it again, or give a folder with JPEG or PNG files"
-            raise InputError(f"cannot be read ({error})", source, "video", remedy) from error
-        yield Path(folder)
-
-
 def _photograph(path: Path) -> Photograph:
     with open_image(path) as image:
         exif, detail = exif_tags(image)
-        size, plain = image.size, image.mode in ("RGB", "L")
-        cut_out = image.mode in ("RGBA", "LA") and image.getchannel("A").getextrema()[0] < 255
+        size, alpha = image.size, image.has_transparency_data
+        plain = image.mode in ("RGB", "L") and not alpha
+        cut_out = alpha and image.convert("RGBA").getchannel("A").getextrema()[0] < 255
     said = exif.get(ORIENTATION, 1)
     orientation = int(said) if said in range(1, 9) else 1
     size = size[::-1] if orientation in SIDEWAYS else size

@@ -78,7 +78,10 @@ def capture(
         work.mkdir()
         mark.write_text(given)
     if not (work / "model").is_dir():
-        _solve(source, work, copies, camera, tell)
+        try:
+            _solve(source, work, copies, camera, tell)
+        except RuntimeError as error:  # of COLMAP, as on a full disk
+            raise InputError(f"COLMAP: {error}", work, remedy="free some space, and repeat") from error
     model = pycolmap.Reconstruction(work / "model")
     straight = output.straighten(model, copies)
     solved = Solved.of(model)
@@ -91,9 +94,8 @@ def capture(
     # Undistorted images and COLMAP's files, unless the last capture wrote the same.
     mask_digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in mask_files.values()]
     key, last = _hash([inputs, repr(straight), mask_digests]), folder / REPORT
-    before = read_json(last) if last.is_file() else {}
-    if before.get("key") != key:
-        if (folder / MASKS).is_dir() and not before.get("masks"):  # a user's
+    if not last.is_file() or read_json(last).get("key") != key:
+        if (folder / MASKS).is_dir():  # a user's, or corrected by one
             _set_aside(folder / MASKS, OLD_MASKS, "images", tell)
         for stale in (*folder.glob(f"{SPARSE}/*.bin"), last):  # without them the folder is no data set
             stale.unlink(missing_ok=True)
@@ -105,7 +107,6 @@ def capture(
     cameras = model.cameras.values()
     report = {
         "key": key,
-        "masks": bool(mask_files),
         "photographs": len(photographs),
         "placed": len(registered),
         "not_placed": [p.name for p in photographs if p.name not in registered],
@@ -166,7 +167,7 @@ def _solve(source: Path, work: Path, copies: dict[str, Photograph], camera: str 
     best = models[0] if camera else colmap.best_lens(models[0])
     shutil.rmtree(raw)
     raw.mkdir()
-    best.write_binary(raw)
+    colmap.write(best, raw)
     raw.rename(work / "model")
 
 

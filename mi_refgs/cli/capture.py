@@ -18,7 +18,7 @@ class Capture:
       refgs capture holiday/vase -o data/vase"""
 
     photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """folder with JPEG or PNG files of one scene, or a video (pip install "mi_refgs[video]" reads it)"""
+    """folder with JPEG or PNG files of one scene"""
     output: Output  # folder of the data set; an interrupted run is continued
     masks: Annotated[Path | None, optional("FOLDER")] = None
     """masks NAME.png, one per photograph, white where the object is"""
@@ -29,7 +29,6 @@ class Capture:
     common: Common = Common()
 
     def run(self) -> Result:
-        from mi_refgs.capture.photographs import folder_of
         from mi_refgs.capture.pipeline import capture, report_text
         from mi_refgs.data.region import Region
 
@@ -37,6 +36,5 @@ class Capture:
         if self.region is not None:
             region = Region.of({"centre": [*self.region[:3]], "radius": self.region[3]}, "--region")
         given: dict[str, Any] = {"masks": self.masks, "camera": self.camera_model, "region": region}
-        with folder_of(self.photographs) as source:
-            report = capture(source, self.output, tell=say, **given)
+        report = capture(self.photographs, self.output, tell=say, **given)
         return Result({"dataset": str(self.output), **report}, report_text(report, self.output))

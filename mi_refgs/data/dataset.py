@@ -20,6 +20,7 @@ from mi_refgs.data.region import Region, read_region, region_of
 from mi_refgs.data.view import FileCamera, View, evenly_spread
 from mi_refgs.errors import InputError, within
 from mi_refgs.io.images import image_header
+from mi_refgs.io.ownership import MARK
 from mi_refgs.registry import Registry
 
 HOLDOUT = 8  # every eighth image is a test view where a data set names none (LLFF, 3DGS, 2DGS)
@@ -324,10 +325,12 @@ def read_dataset(
 
 def require_no_data(path: Path) -> None:
     """Raise InputError if a file that the user names as output is one of a data set."""
-    folders = path.resolve().parents[:2] if path.exists() else ()
-    if any(reader.recognises(folder) for folder in folders for reader in READERS.values()):
-        what = "belongs to a data set, which is never overwritten"
-        raise InputError(what, path, "output", "choose another output")
+    for folder in path.resolve().parents if path.exists() else ():
+        if any(reader.recognises(folder) for reader in READERS.values()):
+            what = "belongs to a data set, which is never overwritten"
+            raise InputError(what, path, "output", "choose another output")
+        if (folder / MARK).is_file():  # of a run in the folder of a data set
+            return
 
 
 def _own_alpha(view: View) -> bool:

@@ -236,10 +236,10 @@ def find_image(folders: Sequence[Path], name: str, tell: Callable[[str, str, obj
     return None
 
 
-def mask_of(image: Path, root: Path, beside: bool = True) -> Mask | None:
-    """The mask of an image of the folder `root`: `beside` it, such as a_mask.png of a.jpg, or in a folder of
-    `root` such as masks, or of its own folder `train`, train_mask. Raises InputError if it is not there."""
-    if beside and (found := _mask_file(image.parent, image.name, MARKS[1:])):
+def mask_of(image: Path, root: Path, marks: Sequence[str] = MARKS[1:]) -> Mask | None:
+    """The mask of an image of `root`: beside it with one of `marks`, such as a_mask.png of a.jpg, or
+    in a folder such as masks, or train_mask of its folder train. Raises InputError if it is not there."""
+    if found := _mask_file(image.parent, image.name, marks):
         return Mask(found)
     name = image.relative_to(root)
     own = name.parts[0] if len(name.parts) > 1 else ""

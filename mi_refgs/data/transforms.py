@@ -20,7 +20,7 @@ import numpy as np
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.colmap_model import MODELS
 from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
-from mi_refgs.data.images import FOLDERS, ImageFile, Mask, block_mean, find_image, mask_of
+from mi_refgs.data.images import FOLDERS, MARKS, ImageFile, Mask, block_mean, find_image, mask_of
 from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
@@ -152,10 +152,11 @@ class Frame:
 
 
 def _frames(folder: Path, split: str) -> list[Frame]:
-    own = folder / f"transforms_{split}.json"
+    tests = [p for x in ("test", "val") if (p := folder / f"transforms_{x}.json").is_file()]
+    own = tests[0] if split == "test" and tests else folder / f"transforms_{split}.json"
     shared = [p for p in (folder / "transforms_train.json", folder / "transforms.json") if p.is_file()]
     # A training file beside a test file is used whole; alone, it is shared by both splits.
-    whole = own.is_file() and (split != "train" or (folder / "transforms_test.json").is_file())
+    whole = own.is_file() and (split != "train" or bool(tests))
     if not whole and (split not in ("train", "test") or not shared):
         raise InputError("missing", folder, own.name, "give a complete data set in the Blender convention")
     file = own if whole else shared[0]
@@ -210,8 +211,8 @@ def _view(frame: Frame, options: ReadOptions) -> View:
     image = ImageFile.of(file, options.downscale)
     if (mask := frame.path("mask_path", options)) == file:
         raise frame.refuse("mask_path", "it is the image", "name a mask")
-    found = Mask(mask) if mask else mask_of(file, frame.file.parent, beside=not image.has_alpha())
-    image = replace(image, mask=found)
+    marks = MARKS[1:-1] if image.has_alpha() else MARKS[1:]  # a copy of its own alpha is no other mask
+    image = replace(image, mask=Mask(mask) if mask else mask_of(file, frame.file.parent, marks))
     name, where = _stem(str(Path(frame.name))), f"{frame.file}: {frame.place}"
     width, height = frame.number("w", positive=True), frame.number("h", positive=True)
     width = width or image.width * (height or image.height) / image.height

@@ -114,13 +114,11 @@ def material_maps(fitted: TrainedScene, samples: int = 1) -> Callable[[Camera, R
     the diffuse part was fitted as a colour, albedo is rendered from the materials that `relightable` makes of
     it, with `samples` per pixel: the fitted attribute is only the colour of metals."""
     if "radiance_sh" not in fitted.shading.required_attributes:
-
-        def comparable(camera: Camera, rendered: RenderedView) -> Maps:
-            """Convert MATERIALS by `Reflectance.textures`; leave them out if it does not convert them."""
-            others = {name: shown for name, shown in rendered.maps.items() if name not in MATERIALS}
-            return others | (fitted.shading.model.textures(rendered.maps) or {})
-
-        return comparable
+        convert = fitted.shading.model.textures  # of MATERIALS; None if it does not convert them
+        return lambda camera, rendered: (
+            {name: shown for name, shown in rendered.maps.items() if name not in MATERIALS}
+            | (convert(rendered.maps) or {})
+        )
     try:
         scene = relightable(fitted)
     except InputError:  # without light or materials there is no albedo

@@ -46,9 +46,6 @@ def started(names: Sequence[str], wanted: Wanted) -> Start:
     """The start by the first initialiser of these that fits the data; raises InputError if none does."""
     for name in names:
         if (start := INITIALISERS.find(name, "surfels.start").start(wanted)) is not None:
-            if not isinstance(start, Start):
-                what, remedy = f"'{name}' returned a {type(start).__name__}", "return a Start, or None"
-                raise InputError(what, "surfels.start", remedy=remedy)
             return start
     raise InputError("no initialiser fits the data", field="surfels.start", remedy="add 'random'")
 
@@ -109,8 +106,7 @@ def initial_surroundings(method: Method, data: Dataset, rng: np.random.Generator
         opacity=options.opacity,
     )
     # One colour: a map of the images would leave the surfels nothing to explain.
-    shape = (options.height, 2 * options.height, 3)
-    background = EnvironmentLight.from_radiance(np.broadcast_to(np.median(colours, axis=0), shape))
+    background = EnvironmentLight.constant(np.median(colours, axis=0), options.height)
     return {AROUND + name: tensor for name, tensor in table.raw.items()} | {BACKGROUND: background.raw}
 
 

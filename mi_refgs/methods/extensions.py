@@ -59,19 +59,11 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Start:
-    """Where surfels start; raises InputError for arrays of other shapes."""
+    """Where surfels start."""
 
     position: np.ndarray  # (count, 3) scene units
     colour: np.ndarray  # (count, 3) linear radiance
     normal: np.ndarray | None = None  # (count, 3) unit; by default random
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            shape: tuple[int, ...] = getattr(value, "shape", ())
-            fits = shape[1:] == (3,) and shape[0] == len(self.position) > 0
-            if not fits and (name != "normal" or value is not None):
-                what, remedy = f"{name}: shape {shape}", "give arrays (N, 3), N from 1"
-                raise InputError(what, "surfels.start", remedy=remedy)
 
 
 @dataclass(frozen=True)

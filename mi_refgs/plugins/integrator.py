@@ -106,7 +106,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.aovs = parse_aovs(str(properties.get(props, "aovs", "")))
         self.check()
         self.changed, self.next_check = False, 0.0  # since the last check; seconds of the monotonic clock
-        self.announced: set[tuple[str, str]] = set()  # what was warned of
+        self.announced = set[str]()  # unusable values that were warned of
         self._warn_of_unusable()
 
     def check(self) -> None:
@@ -248,15 +248,11 @@ class RefGSIntegrator(mi.SamplingIntegrator):
 
     def _warn_of_unusable(self) -> None:
         """Warn of unusable values, once for each attribute and map."""
-        found = {
-            (kind, name): f"{len(rows)} {kind} in {name} (first: {rows[0]})"
-            for kind, model in self._models.items()
-            for name, rows in model.unusable().items()
-        }
         maps = self._maps.items()
-        found |= {
-            ("", name): f"{black} values of {name}" for name, light in maps if (black := light.unusable())
-        }
+        found = {name: f"{black} values of {name}" for name, light in maps if (black := light.unusable())}
+        for kind, model in self._models.items():
+            rows = model.unusable().items()
+            found |= {f"{kind} {n}": f"{len(row)} {kind} in {n} (first: {row[0]})" for n, row in rows}
         new = [text for key, text in found.items() if key not in self.announced]
         self.announced |= {*found}
         if new:

@@ -13,7 +13,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.motion import motion_of, rotation_part
 from mi_refgs.shade.light import envmap
 from mi_refgs.shade.light.constant import ConstantLight
-from mi_refgs.shade.light.envmap import DEFAULT_HEIGHT, MIN_HEIGHT, EnvironmentLight, bounded, is_height
+from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight, bounded, is_height
 from mi_refgs.shade.light.light import Light, RotatedLight
 from mi_refgs.shade.light.lobe_matrices import resample
 from mi_refgs.shade.light.prefilter import prefilter
@@ -33,9 +33,7 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
         turned = mi.Transform4f(params["to_world"])
         rotated(None, turned)  # checks it
         return EnvironmentLight.from_radiance(radiance.numpy()), turned
-    colour = np.array(_constant_radiance(params, emitter)).ravel()
-    tiled = np.tile(colour, (DEFAULT_HEIGHT, 2 * DEFAULT_HEIGHT, 1))
-    return EnvironmentLight.from_radiance(tiled), mi.Transform4f()
+    return EnvironmentLight.constant(np.array(_constant_radiance(params, emitter)).ravel()), mi.Transform4f()
 
 
 def emitter_light(emitter: Any, filtered: bool = True, other: Light | None = None) -> Light:

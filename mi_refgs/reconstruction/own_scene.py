@@ -12,7 +12,7 @@ import numpy as np
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
 from mi_refgs.plugins.light import light_of, own_light, used_emitters
-from mi_refgs.render.surroundings import Surroundings
+from mi_refgs.render.surroundings import Surroundings, nothing_around
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.light.latlong import lat_long
@@ -49,20 +49,15 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
         light = own_light(lights[0])[0]
     if isinstance(seen, RotatedLight):
         light = EnvironmentLight.from_radiance(lat_long(seen.radiance, light.height))
-    around, behind = integrator.surroundings, integrator.behind
-    if around is not None:
-        if behind is None:
-            what = "background: behind surroundings a reconstruction has one, so it becomes black"
-            warnings.warn(what, RuntimeWarning, stacklevel=3)
-        elif around.background is None:
-            every = np.tile(np.array(behind).ravel(), (MIN_HEIGHT, 2 * MIN_HEIGHT, 1))
-            behind = EnvironmentLight.from_radiance(every)
-        behind = behind and EnvironmentLight(dr.detach(behind.raw))
-        around = Surroundings(Surfels(around.surfels.raw).detach(), behind)
+    around, behind = integrator.around, integrator.behind
+    if not isinstance(behind, EnvironmentLight | None):
+        behind = EnvironmentLight.constant(np.array(behind).ravel(), MIN_HEIGHT)
+    elif behind is None and around is not None:
+        warnings.warn("background: behind surroundings it becomes black", RuntimeWarning, stacklevel=3)
+    if around is not None or behind is not None:
+        surfels = nothing_around(integrator.surfels) if around is None else Surfels(around.raw).detach()
+        around = Surroundings(surfels, behind and EnvironmentLight(dr.detach(behind.raw)))
         around.surfels.validate()
-    elif behind is not None and dr.any(behind != 0):
-        what = "background: a reconstruction has none of one colour, so it becomes transparent"
-        warnings.warn(what, RuntimeWarning, stacklevel=3)
     return TrainedScene(
         integrator.surfels.detach(),
         None if light is None else EnvironmentLight(dr.detach(light.raw)),

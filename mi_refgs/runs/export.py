@@ -10,7 +10,7 @@ from typing import Any
 
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import BusyError, make_folder, read_json, write_json
+from mi_refgs.io.files import make_folder, read_json, write_json
 from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import write_mesh
@@ -84,11 +84,11 @@ def newest(run: Run, method: Method) -> TrainedScene:
 
 def write_if_stale(run: Run, method: Method, camera: Callable[[TrainedScene], Camera]) -> TrainedScene:
     """Write the artefacts of a run if the newest checkpoint is newer, and read them; or return that
-    checkpoint if another process trains the run. Raises InputError if there is neither."""
+    checkpoint if they cannot be written, as while another process trains. Raises InputError without both."""
     if (newer := fresh(run, method)) is not None:
         try:
             export(newer, run.path, camera(newer))
-        except BusyError:
+        except InputError:
             return newer
     return TrainedScene.read(run.path, method.plugins)
 

@@ -46,10 +46,8 @@ def read_views(method: Method, path: Path | Dataset, split: str, truth: bool = T
         if path.split != split:
             raise InputError(f"it has {path.split} views", path.path, "split", f"give {split} views")
         return path
-    options, size = method.data, {"downscale": method.data.downscale} | size
-    return read_dataset(
-        path, split, background=options.background, images=options.images, truth=truth, **size
-    )
+    options, size = method.data, {"downscale": method.data.downscale, "truth": truth} | size
+    return read_dataset(path, split, background=options.background, images=options.images, **size)
 
 
 def measured_views(method: Method, path: Path | Dataset, truth: bool = True) -> Dataset:

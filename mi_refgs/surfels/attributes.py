@@ -97,13 +97,12 @@ def _check(attribute: Attribute) -> None:
         raise InputError(f"attribute '{attribute.name}': {what}", remedy=remedy)
 
     names, widths, aov = attribute.properties, attribute.widths, attribute.aov
-    if not (isinstance(names, tuple) and isinstance(widths, tuple) and widths):
-        refuse("widths, properties: not tuples", "write widths=(1,) and properties=('name',)")
+    tuples = isinstance(names, tuple) and isinstance(widths, tuple) and widths
+    if not tuples or not all(re.fullmatch("[!-~]+", name) for name in names):
+        refuse("widths, properties: not tuples, or not of names", "write (1,) and ('name',), in ASCII")
     known = [name for name in get_args(Activation) if attribute.geometry or name != "quaternion"]
     if attribute.activation not in known:
         refuse(f"activation: {attribute.activation!r} is unknown", f"use {' or '.join(known)}")
-    if not all(re.fullmatch("[!-~]+", name) for name in names):
-        refuse(f"properties: {names}: not all are names in a PLY file", "use ASCII without spaces")
     if len(names) < (columns := 1 if attribute.harmonics else max(widths)):
         refuse(f"properties: {len(names)} for {columns} columns", "name one for each")
     if aov not in ("", "Y", "RGB", "XYZ") or len(aov) not in (0, *widths):
@@ -111,9 +110,8 @@ def _check(attribute: Attribute) -> None:
         refuse(what, 'use Mitsuba\'s "Y" for one, "RGB" or "XYZ" for three, or ""')
     if attribute.name in RESERVED:
         refuse("the name is taken", "rename it")
-    for other in ATTRIBUTES.values():
-        if {*other.properties} & {*names}:
-            refuse(f"'{other.name}' has its PLY property", "rename it")
+    if taken := [other.name for other in ATTRIBUTES.values() if {*other.properties} & {*names}]:
+        refuse(f"'{taken[0]}' has its PLY property", "rename it")
 
 
 ATTRIBUTES: Registry[Attribute] = Registry("attribute", _check, of=Attribute)

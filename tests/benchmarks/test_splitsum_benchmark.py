@@ -42,16 +42,6 @@ def test_errors_rise_with_frequency_and_angle(result: dict[str, Any]) -> None:
     assert by_rows == sorted(by_rows, reverse=True)
 
 
-@pytest.mark.slow
-def test_budgets_name_the_largest_part(result: dict[str, Any]) -> None:
-    """Only the torus has shadows; the table is never what errs; rough errors are the lobe's."""
-    for row in result["budgets"]:
-        parts = {part["name"]: part["relmse"] for part in row["parts"]}
-        assert ("no shadow" in parts) == (row["shape"] == "torus") and parts["table lookup"] < 1e-6
-        if (row["shape"], row["light"], row["roughness"]) == ("sphere", "gradient", 0.8):
-            assert max(parts, key=parts.__getitem__) == "lobe with N = V = R"
-
-
 def sphere(size: int = 16, light: str = "gradient") -> tuple[Any, common.Points]:
     """A sphere under a light, and its points."""
     emitter = common.make_light(light, 32).emitter()

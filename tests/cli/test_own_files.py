@@ -112,7 +112,11 @@ def test_a_file_is_replaced_unless_a_run_has_it(command: list[str], place: Path,
     image = place / "data" / ("environment.exr" if suffix == ".exr" else "train/points.ply")
     if suffix == ".ply":
         image.write_bytes(FOREIGN)
-    refused([*command, "-o", image], f"{image}: output: belongs to a data set")
+    deep = image.parent / f"a/b/deep{suffix}"
+    deep.parent.mkdir(parents=True, exist_ok=True)
+    deep.write_bytes(FOREIGN)
+    for file in (image, deep):
+        refused([*command, "-o", file], f"{file}: output: belongs to a data set")
 
 
 def test_files_of_a_run_are_known(finished: Path) -> None:

@@ -9,12 +9,14 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from mi_refgs import methods
 from mi_refgs.cli import main
+from mi_refgs.errors import InputError
 from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.files import BusyError
@@ -23,8 +25,6 @@ from mi_refgs.runs.run import LOCK, Run
 from tests.helpers import contents, read_exr, refused
 from tests.scenes.sphere import SCENE
 from tests.scenes.tiny import METHOD, SETTINGS, train_command
-
-TRACE = ["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--samples", "1"]
 
 
 def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path, tmp_path: Path) -> None:
@@ -61,7 +61,12 @@ def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path,
 def test_a_data_set_is_completed_or_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, out = tmp_path / "scene.xml", tmp_path / "out"
     scene.write_text(SCENE)
-    argv = [*TRACE, "-o", str(out), str(scene)]
+    argv = [
+        *["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--samples", "1"],
+        "-o",
+        str(out),
+        str(scene),
+    ]
     assert main([*argv, "--json"]) == 0 and json.loads(capsys.readouterr().out)["train_views"] == 2
     before = contents(out)
     for option in (["--views", "3"], ["--seed", "1"], ["--fov", "30"]):
@@ -135,6 +140,10 @@ def test_second_process_on_a_run_is_refused(
         (tmp_path / path.name).rename(path)
     process.send_signal(signal.SIGKILL)
     process.wait()
+    with mock.patch("mi_refgs.runs.export.export", side_effect=InputError("read-only")):
+        assert main(["render", str(run), "-o", str(tmp_path / "a.exr")]) == 0
+    with mock.patch("mi_refgs.evaluation.evaluate.evaluate", side_effect=OSError(13, "no", "a.png")):
+        refused(["eval", run], "no: 'a.png'; make it")
     assert main(argv) == 0 and not (run / LOCK).exists()
 
 

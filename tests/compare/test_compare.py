@@ -3,11 +3,8 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -149,36 +146,6 @@ def test_worker_ends_with_its_parent() -> None:
     assert process.stdin is not None
     process.stdin.close()
     assert process.wait(30) == -15
-
-
-@pytest.mark.slow
-def test_killed_cluster_worker_is_replaced(data: Path, variants: Paths, tmp_path: Path) -> None:
-    """Another worker goes on from the checkpoint; the log has each iteration once."""
-    distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
-    settings = ("iterations=150", "checkpoint_every=10", "log_every=10", *SIX[1:3])
-    [job] = jobs.plan(tmp_path, [data], [str(variants[1])], [0], preset="quick", settings=settings, threads=1)
-    reports, killed = list[tuple[Job, str | None]](), list[int]()
-
-    def kill(address: str) -> None:
-        until = time.monotonic() + 60
-        while not job.run.checkpoints() and time.monotonic() < until:
-            time.sleep(0.05)
-        with distributed.Client(address) as client:
-            [(worker, tasks)] = [item for item in client.processing().items() if item[1]]
-            assert tasks
-            killed.append(client.run(os.getpid, workers=[worker])[worker])
-        assert not job.run.checkpoints()[-1].stem.endswith("150")
-        os.kill(killed[0], signal.SIGKILL)
-
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
-        killer = threading.Thread(target=kill, args=[cluster.scheduler_address])
-        killer.start()
-        execute.execute_all([job], 1, lambda *said: reports.append(said), cluster.scheduler_address)
-        killer.join()
-    assert killed and reports == [(job, None)] and jobs.finished(job)
-    lines = (job.run.path / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line)["iteration"] for line in lines] == list(range(10, 151, 10))
-    assert (job.run.path / "job.log").read_text().count("resumed at iteration") == 1
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,9 @@ def test_scene_extent_is_that_of_3dgs(folder: Path) -> None:
 def test_holdout_without_a_test_file(folder: Path) -> None:
     more = [{"file_path": f"./test/r_{i}", "transform_matrix": pose(i).tolist()} for i in range(2)]
     edit(lambda content: content["frames"].extend(more))(folder)
-    (folder / "transforms_test.json").unlink()
+    (folder / "transforms_test.json").rename(folder / "transforms_val.json")
+    assert len(read_loaded(folder, "test").views) == 2 and len(read_loaded(folder, "train").views) == 10
+    (folder / "transforms_val.json").unlink()
     names = {split: [v.name for v in read_loaded(folder, split).views] for split in ("train", "test")}
     assert names["test"] == ["test/r_0", "train/r_6"]  # sorted: test/r_0, test/r_1, train/r_0 … train/r_7
     assert len(names["train"]) == 8 and not set(names["train"]) & set(names["test"])

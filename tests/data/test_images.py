@@ -162,6 +162,12 @@ def test_opaque_alpha_is_ignored(images: str, tmp_path: Path) -> None:
             write_png(path, read_png(path)[..., :3])
             write_png(path.with_name(f"{path.stem}_alpha.png"), np.ones((20, 20, 3)))
         assert read_dataset(data, "train").has_alpha
+        for path in data.glob("*/r_?.png"):
+            write_png(path, np.ones((20, 20, 4)))
+        assert not read_dataset(data, "train").has_alpha  # a copy of its own
+        for path in data.glob("*/r_?_alpha.png"):
+            path.rename(path.with_name(path.name.replace("alpha", "mask")))
+        assert read_dataset(data, "train").has_alpha
 
 
 def test_images_without_masks_among_others_are_noted(tmp_path: Path) -> None:

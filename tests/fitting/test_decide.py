@@ -163,7 +163,13 @@ def test_settings_of_images_are_those_of_the_first_read(given: Settings, tmp_pat
 
 def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> None:
     """Those of tables that the other method has not are left out; what Python changed is kept."""
-    given = ["loss.ssim=0.3", "light.height=16", "event.mesh.resolution=9", "stage.deferred.traced_bounces=1"]
+    given = [
+        "loss.ssim=0.3",
+        "loss.half_metal=0.1",
+        "light.height=16",
+        "event.mesh.resolution=9",
+        "stage.deferred.traced_bounces=1",
+    ]
     own = methods.load(file, "quick", [*SETTINGS, *given])
     own = replace(own.downscaled(3), seed=5)
     (decision,) = (x for name, x in own.event.items() if name == "colour_alone")

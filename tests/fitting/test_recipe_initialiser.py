@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -62,10 +61,3 @@ def test_others_are_refused_or_not_used(file: str, data: Dataset) -> None:
     assert np.linalg.norm(position, axis=1).std() > 0.01  # on the hull of three views
     method = methods.load(file, "quick", ["surfels.start=['points']"])
     refused(lambda: initial_surfels(method, data, np.random.default_rng(0)), "surfels.start: no initialiser")
-    tables = np.ones((4, 3)), np.ones((4, 3)), np.ones(3)
-    refused(lambda: Start(*tables), "surfels.start: normal: shape (3,); give arrays (N, 3)")
-    INITIALISERS.unregister("mesh")
-    pair: Any = tables[:2]
-    mi_refgs.register_initialiser(mi_refgs.Initialiser("mesh", lambda wanted: pair))
-    method = methods.load(file, "quick", ["surfels.start=['mesh']"])
-    refused(lambda: initial_surfels(method, data, np.random.default_rng(0)), "'mesh' returned a tuple")

@@ -20,7 +20,7 @@ from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.ply import write_ply
 from mi_refgs.surfels.table import Surfels
-from tests.helpers import refused, with_grad
+from tests.helpers import refused
 from tests.scenes import integrator as scenes
 
 
@@ -107,27 +107,6 @@ def test_wrong_shapes_are_refused(key: str, shape: tuple[int, ...], words: str) 
     params[f"integrator.{key}"] = dr.zeros(mi.TensorXf, shape)
     with pytest.raises(Exception, match=words):
         params.update()
-
-
-def test_a_node_of_a_torch_pipeline_may_be_a_render() -> None:
-    """tanh → mi.render → sigmoid: gradients as those of the same pipeline in Dr.Jit."""
-    torch = pytest.importorskip("torch")
-    of, key = scenes.scene(), "integrator.albedo"
-    params, raw = mi.traverse(of), scenes.raw_channels()["albedo"]
-    weights = np.random.default_rng(0).normal(size=(scenes.HEIGHT, scenes.WIDTH, 3)).astype(np.float32)
-
-    def rendered(albedo: mi.TensorXf) -> mi.TensorXf:
-        params[key] = albedo
-        params.update()
-        return mi.render(of, params)
-
-    theirs = torch.tensor(raw, requires_grad=True)
-    shown = dr.wrap("torch", "drjit")(rendered)(torch.tanh(theirs))
-    (torch.tensor(weights) * torch.sigmoid(shown)).sum().backward()
-    ours = with_grad(mi.TensorXf(raw))
-    dr.backward(dr.sum(mi.TensorXf(weights) / (1 + dr.exp(-rendered(dr.tanh(ours)))), axis=None))
-    np.testing.assert_allclose(theirs.grad.numpy(), dr.grad(ours).numpy(), rtol=1e-3, atol=1e-6)
-    assert np.abs(theirs.grad.numpy()).max() > 1e-3
 
 
 def test_recording_by_dr_freeze_is_refused() -> None:

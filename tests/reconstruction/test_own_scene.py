@@ -60,30 +60,32 @@ def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) 
     scene = mi.load_dict({"type": "scene", **parts, "sky": turned | {"to_world": mi.ScalarTransform4f()}})
     exact = Reconstruction.from_params(scene).render(camera)[..., :3]
     np.testing.assert_allclose(exact, mi.render(scene, spp=1)[..., :3], atol=1e-5)
-    surfels = {"type": "refgs", **balls.trained.surfels.raw, "light": turned, "background": mi.Color3f(1)}
-    with pytest.warns(RuntimeWarning, match="background: "):
-        Reconstruction.from_params(mi.load_dict(surfels))
 
 
 @pytest.mark.parametrize("behind", [None, [0.1, 0.2, 0.3], sky(16)])
-def test_what_is_behind_surroundings_is_taken(balls: Reconstruction, behind: Any) -> None:
-    """A colour, too; a copy, which the loop does not change."""
-    raw = balls.trained.surfels.raw
-    around = {
-        f"surroundings_{x}": raw[x] for x in ("position", "rotation", "scale", "opacity", "radiance_sh")
-    }
-    own = {"type": "refgs", **raw, **around, "reflectance": "radiance"}
+@pytest.mark.parametrize("surrounded", [True, False])
+def test_what_is_behind_is_taken(balls: Reconstruction, behind: Any, surrounded: bool) -> None:
+    """A colour, too; as a copy, which the loop does not change."""
+    camera, own = (
+        balls.camera(0, 24),
+        balls.trained.surfels.raw | {"type": "refgs", "reflectance": "radiance"},
+    )
+    if surrounded:
+        names = ("position", "rotation", "scale", "opacity", "radiance_sh")
+        own |= {f"surroundings_{name}": own[name] for name in names}
     if behind is not None:
         own["background"] = mi.Color3f(behind) if len(behind) == 3 else mi.TensorXf(behind)
-    scene = mi.load_dict(
-        {"type": "scene", "refgs": own, "sensor": balls.scene(balls.camera(0, 24)).sensors()[0]}
-    )
-    with pytest.warns(RuntimeWarning, match="becomes black") if behind is None else nullcontext():
+    scene = mi.load_dict({"type": "scene", "refgs": own, "sensor": balls.scene(camera).sensors()[0]})
+    with (
+        pytest.warns(RuntimeWarning, match="becomes black")
+        if surrounded and behind is None
+        else nullcontext()
+    ):
         made = Reconstruction.from_params(scene)
     before = mi.render(scene, spp=1).numpy()
-    if (params := mi.traverse(scene)).get("refgs.background") is not None:
+    if "refgs.background" in (params := mi.traverse(scene)):
         params.update({"refgs.background": 0 * params["refgs.background"]})
-    np.testing.assert_allclose(made.render(balls.camera(0, 24))[..., :3], before[..., :3], atol=1e-5)
+    np.testing.assert_allclose(made.render(camera)[..., :3], before[..., :3], atol=1e-5)
 
 
 def test_models_without_mirror_rays_keep_the_mesh(balls: Reconstruction) -> None:

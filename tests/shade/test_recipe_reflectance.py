@@ -197,7 +197,7 @@ def test_suffixes_of_an_aov_are_those_of_its_columns(aov: str, widths: tuple[int
         ({"activation": "softplus"}, "'softplus' is unknown; use identity or exp or sigmoid or harmonics"),
         ({"widths": 1}, "widths, properties: not tuples"),
         ({"properties": "sheen"}, "widths, properties: not tuples"),
-        ({"properties": ("the sheen",)}, "not all are names in a PLY file"),
+        ({"properties": ("the sheen",)}, "properties: not tuples, or not of names; write (1,)"),
         ({"widths": (3,)}, "properties: 1 for 3 columns; name one for each"),
         ({"properties": ("x",)}, "'position' has its PLY property"),
     ],

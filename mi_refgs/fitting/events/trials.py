@@ -10,7 +10,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting.decide import Decision, Trial
 from mi_refgs.fitting.events.densify import fill
 from mi_refgs.fitting.train import Trainer
-from mi_refgs.methods.extensions import register_event
+from mi_refgs.methods.extensions import LOSSES, register_event
 from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import table_at
 
@@ -36,7 +36,9 @@ class ColourAlone(Decision, Trial):
         here = Path(method.file).parent  # of a method file that names another one
         plain = methods.plain(methods.load(self.method, preset, folder=here))
         keys = [(text, text.partition("=")[0].strip().split(".")) for text in method.assignments]
-        fitting = [text for text, (*tables, _) in keys if table_at(plain, tables) is not None]
+        has = plain["surfels"]["attributes"]
+        lost = [["loss", x.name] for x in LOSSES.values() if not {*x.attributes} <= {*has}]
+        fitting = [t for t, path in keys if table_at(plain, path[:-1]) is not None and path[:2] not in lost]
         other = methods.load(self.method, preset, fitting, here)
         kept = "iterations seed checkpoint_every preview_every log_every about name file preset assignments"
         own = {name: getattr(method, name) for name in kept.split()}

@@ -182,7 +182,7 @@ class EnvironmentLight(FittedLight):
             raise InputError(f"shape {shape}", "EnvironmentLight", "raw", need)
 
     @classmethod
-    def constant(cls, radiance: float = 0.5, height: int = DEFAULT_HEIGHT) -> "EnvironmentLight":
+    def constant(cls, radiance: float | np.ndarray = 0.5, height: int = DEFAULT_HEIGHT) -> "EnvironmentLight":
         """The same positive radiance from everywhere."""
         return cls.from_radiance(np.full((height, 2 * height, 3), radiance))
 
