@@ -20,6 +20,7 @@ from mi_refgs.shade.light.light import Light
 from mi_refgs.types import Float
 
 MATERIALS = ("roughness", "metallic")  # maps that neighbouring pixels of similar colour share
+MIRROR = ("albedo", *MATERIALS)  # maps that say how much of the light a pixel mirrors
 MATERIAL_EDGE = 10.0  # steepness of edges that are kept: a step of 0.1 between pixels counts a third
 
 
@@ -73,11 +74,11 @@ def _ssim(inputs: LossInputs) -> Float:
 
 
 def _normal(inputs: LossInputs, mirrors: bool = False) -> Float | None:
-    frame, weight = inputs.frame, inputs.frame.alpha
+    frame, weight, maps = inputs.frame, inputs.frame.alpha, inputs.frame.maps
     if mirrors:
-        if not {*MATERIALS} <= {*frame.maps}:
+        if not {*MIRROR} <= {*maps}:
             return None
-        weight = weight * frame.maps["metallic"] * (1 - frame.maps["roughness"]) ** 8
+        weight = weight * dr.square(dr.mean(maps["albedo"]) * maps["metallic"] * (1 - maps["roughness"]) ** 2)
     depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, inputs.target.camera)
     covered = dr.detach(frame.alpha) if frame.background is None else frame.object_alpha
     return losses.normal_consistency(frame.normal, depth_normal, valid, weight, covered)
@@ -110,7 +111,7 @@ register_loss(Loss("l1", lambda of: losses.l1(of.image, of.target.image)))
 register_loss(Loss("gain", _gain))
 register_loss(Loss("ssim", _ssim))
 register_loss(Loss("normal", _normal, normals=True))
-register_loss(Loss("mirror_normal", lambda of: _normal(of, True), True, True, attributes=MATERIALS))
+register_loss(Loss("mirror_normal", lambda of: _normal(of, True), True, True, attributes=MIRROR))
 register_loss(Loss("smooth", _smooth, normals=True))
 register_loss(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
 register_loss(Loss("materials", _materials, maps=True, attributes=MATERIALS))

@@ -72,7 +72,8 @@ def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     data, target = made(True, *picture)
     radiance, alpha = picture
     maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}
-    uploaded = {name: upload(x.astype(np.float32)) for name, x in maps.items()}
+    uploaded = {"albedo": mi.Color3f(0, 0.5, 1)}
+    uploaded |= {name: upload(x.astype(np.float32)) for name, x in maps.items()}
     depth = upload(rng.uniform(2, 2.1, alpha.size).astype(np.float32))
     frame = replace(frame_of(radiance, alpha), maps=uploaded, depth=depth)
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
@@ -92,9 +93,9 @@ def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     expected = 0.2 * reference.smoothness(smooth, guide, 10.0)
     assert loss(materials=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3)
     normals = normals_from_depth(depth, frame.alpha, target.camera)
-    mirror = frame.alpha * uploaded["metallic"] * (1 - uploaded["roughness"]) ** 8
-    expected = 0.2 * float(losses.normal_consistency(frame.normal, *normals, mirror, frame.alpha)[0])
-    assert loss(mirror_normal=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3) and expected > 1e-5
+    mirror = frame.alpha * (0.5 * uploaded["metallic"] * (1 - uploaded["roughness"]) ** 2) ** 2
+    expected = 9 * float(losses.normal_consistency(frame.normal, *normals, mirror, frame.alpha)[0])
+    assert loss(mirror_normal=LossWeight(9)) - rest == pytest.approx(expected, rel=1e-3) and expected > 1e-5
     expected = 0.4 * float(losses.light_colour(light)[0])
     assert loss(light_colour=LossWeight(0.4)) - rest == pytest.approx(expected, rel=1e-3) and expected > 0.01
 

@@ -71,8 +71,7 @@ def test_what_is_behind_is_taken(balls: Reconstruction, behind: Any, surrounded:
         balls.trained.surfels.raw | {"type": "refgs", "reflectance": "radiance"},
     )
     if surrounded:
-        names = ("position", "rotation", "scale", "opacity", "radiance_sh")
-        own |= {f"surroundings_{name}": own[name] for name in names}
+        own |= {f"surroundings_{x}": own[x] for x in (*balls.trained.surfels.primitive.widths, "radiance_sh")}
     if behind is not None:
         own["background"] = mi.Color3f(behind) if len(behind) == 3 else mi.TensorXf(behind)
     scene = mi.load_dict({"type": "scene", "refgs": own, "sensor": balls.scene(camera).sensors()[0]})
