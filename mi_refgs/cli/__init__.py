@@ -95,6 +95,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of the output, such as `head`, has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the flush at exit would fail again
         return 141
+    except OSError as error:
+        print(f"refgs: {error}; make it readable and writable", file=sys.stderr)
+        return 2
     return code
 
 
@@ -105,7 +108,7 @@ def _run(argv: list[str]) -> int:
     from mi_refgs.cli.command import UnusableError, finite
     from mi_refgs.runs.interrupt import TerminatedError
 
-    codes: dict[type[BaseException], int] = {InputError: 2, OSError: 2, UnusableError: 1}
+    codes: dict[type[BaseException], int] = {InputError: 2, UnusableError: 1}
     codes |= {TerminatedError: 143, KeyboardInterrupt: 130}
     try:
         command = parse(argv)
@@ -116,8 +119,7 @@ def _run(argv: list[str]) -> int:
         return int(error.code or 0)
     except tuple(codes) as error:
         code = next(code for kind, code in codes.items() if isinstance(error, kind))
-        remedy = "; make it readable and writable" if isinstance(error, OSError) else ""
-        print(f"refgs: {str(error) or EXIT_CODES[code]}{remedy}", file=sys.stderr)
+        print(f"refgs: {str(error) or EXIT_CODES[code]}", file=sys.stderr)
         return code
     print(json.dumps(finite(result.data), allow_nan=False) if command.common.json else result.text)
     return int(result.code)

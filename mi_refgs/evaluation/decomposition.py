@@ -116,8 +116,7 @@ def material_maps(fitted: TrainedScene, samples: int = 1) -> Callable[[Camera, R
     if "radiance_sh" not in fitted.shading.required_attributes:
         convert = fitted.shading.model.textures  # of MATERIALS; None if it does not convert them
         return lambda camera, rendered: (
-            {name: shown for name, shown in rendered.maps.items() if name not in MATERIALS}
-            | (convert(rendered.maps) or {})
+            {n: m for n, m in rendered.maps.items() if n not in MATERIALS} | (convert(rendered.maps) or {})
         )
     try:
         scene = relightable(fitted)

@@ -78,7 +78,7 @@ def _normal(inputs: LossInputs, mirrors: bool = False) -> Float | None:
     if mirrors:
         if not {*MIRROR} <= {*maps}:
             return None
-        weight = weight * dr.square(dr.mean(maps["albedo"]) * maps["metallic"] * (1 - maps["roughness"]) ** 2)
+        weight = weight * dr.mean(maps["albedo"]) * maps["metallic"] * (1 - maps["roughness"]) ** 4
     depth_normal, valid = normals_from_depth(frame.depth, frame.alpha, inputs.target.camera)
     covered = dr.detach(frame.alpha) if frame.background is None else frame.object_alpha
     return losses.normal_consistency(frame.normal, depth_normal, valid, weight, covered)

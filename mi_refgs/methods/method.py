@@ -153,7 +153,7 @@ class Rates:
 @dataclass(frozen=True)
 class LossWeight:
     """Weight of the loss NAME over the iterations; a number in `[loss]`, `NAME = 0.1`, is its `weight` alone.
-    L = `l1` L1 + `ssim` (1 - SSIM) + `normal` L_n + `mirror_normal` (a m (1 - r)²)² L_n, of mean albedo a,
+    L = `l1` L1 + `ssim` (1 - SSIM) + `normal` L_n + `mirror_normal` a m (1 - r)⁴ L_n, of mean albedo a,
     metallic m and roughness r, + `smooth` L_s + `alpha` L_α, and priors: `gain` prefers equal exposures,
     `half_metal` metallic near 0 or 1, `materials` equal roughness and metallic of neighbouring pixels of
     similar colour, `light_colour` a grey light over a grey albedo, `photographed` a light that is the

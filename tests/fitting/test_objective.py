@@ -93,7 +93,7 @@ def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Gene
     expected = 0.2 * reference.smoothness(smooth, guide, 10.0)
     assert loss(materials=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3)
     normals = normals_from_depth(depth, frame.alpha, target.camera)
-    mirror = frame.alpha * (0.5 * uploaded["metallic"] * (1 - uploaded["roughness"]) ** 2) ** 2
+    mirror = frame.alpha * 0.5 * uploaded["metallic"] * (1 - uploaded["roughness"]) ** 4
     expected = 9 * float(losses.normal_consistency(frame.normal, *normals, mirror, frame.alpha)[0])
     assert loss(mirror_normal=LossWeight(9)) - rest == pytest.approx(expected, rel=1e-3) and expected > 1e-5
     expected = 0.4 * float(losses.light_colour(light)[0])
