@@ -14,7 +14,7 @@ from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.images import exif_tags, image_header, open_image, positive, read_mask, to_8_bits
-from mi_refgs.io.ownership import MARK
+from mi_refgs.io.ownership import RUN, owner_of
 from mi_refgs.io.progress import Tell
 
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .avif".split()  # for a message
@@ -90,13 +90,13 @@ class Photograph:
 
 
 def find_photographs(folder: Path, tell: Tell = lambda _: None) -> list[Photograph]:
-    """The photographs of a folder by name, or of its subfolders but captures, rotated as most of them are: so
-    all have one size and one lens; `tell` is called with what is not read. Raises InputError for too few
-    images, many sizes, and unreadable files."""
+    """The photographs of a folder by name, or of its subfolders but captures and runs, rotated as most of them
+    are: so all have one size and one lens; `tell` is called with what is not read. Raises InputError for too
+    few images, many sizes, and unreadable files."""
     if not folder.is_dir():
         raise InputError("no such folder", folder, "photographs", "give one with JPEG or PNG files")
     paths, below = image_files(folder, deep=False), [*folder.rglob("*")]
-    captures = {path.parent for path in below if path.name in (REPORT, WORK, MARK)}
+    captures = {p.parent for p in below if p.name in (REPORT, WORK) or owner_of(p.parent) == RUN}
     inner = [p for p in image_files(folder, deep=True) if captures.isdisjoint(p.parents)]
     inner = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
     if len(paths) < FEWEST:
