@@ -90,7 +90,7 @@ class Photograph:
 
 
 def find_photographs(folder: Path, tell: Tell = lambda _: None) -> list[Photograph]:
-    """The photographs of a folder by name, or of its subfolders but captures and runs, rotated as most of them
+    """The photographs of a folder by name, or of subfolders but captures and runs, rotated as most of them
     are: so all have one size and one lens; `tell` is called with what is not read. Raises InputError for too
     few images, many sizes, and unreadable files."""
     if not folder.is_dir():
