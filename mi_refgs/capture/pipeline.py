@@ -81,7 +81,7 @@ def capture(
         try:
             _solve(source, work, copies, camera, tell)
         except RuntimeError as error:  # of COLMAP, as on a full disk
-            raise InputError(f"COLMAP: {error}", work, remedy="free some space, and repeat") from error
+            raise InputError(f"COLMAP: {error}", work, remedy="free some space, or remove it") from error
     model = pycolmap.Reconstruction(work / "model")
     straight = output.straighten(model, copies)
     solved = Solved.of(model)

@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the flush at exit would fail again
         return 141
     except OSError as error:
-        print(f"refgs: {error}; make it readable and writable", file=sys.stderr)
+        print(f"refgs: {error}; check the disk and permissions", file=sys.stderr)
         return 2
     return code
 

@@ -87,7 +87,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
     parameter with gradients raises InputError.
 
     A surfel with a value that is NaN, infinite or, in position or SH coefficients, beyond 1e18 is not drawn,
-    with zero gradient; such a value of a light is black. One warning names the attribute, of no emitter."""
+    with zero gradient; such a value of a light is black. One warning names each attribute, of no emitter."""
 
     def __init__(self, props: Any) -> None:
         require_supported_variant("refgs")

@@ -235,7 +235,7 @@ def test_other_lens_rewrites_images(captured: Path, tmp_path: Path, monkeypatch:
     assert main(command) == 130 and not (data / "region.json").exists()
     assert json.loads((data / "region.old.json").read_text())["radius"] == 2
     monkeypatch.setattr(pipeline, "_solve", Mock(side_effect=RuntimeError("disk")))
-    refused(command, ".work: COLMAP: disk; free some space, and repeat")
+    refused(command, ".work: COLMAP: disk; free some space, or remove it")
 
 
 @needs_colmap

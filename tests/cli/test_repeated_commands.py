@@ -143,7 +143,7 @@ def test_second_process_on_a_run_is_refused(
     with mock.patch("mi_refgs.runs.export.export", side_effect=InputError("read-only")):
         assert main(["render", str(run), "-o", str(tmp_path / "a.exr")]) == 0
     with mock.patch("mi_refgs.evaluation.evaluate.evaluate", side_effect=OSError(13, "no", "a.png")):
-        refused(["eval", run], "no: 'a.png'; make it")
+        refused(["eval", run], "no: 'a.png'; check the disk")
     assert main(argv) == 0 and not (run / LOCK).exists()
 
 

@@ -34,9 +34,9 @@ class ColourAlone(Decision, Trial):
             raise InputError("it is given", field="light")
         preset = method.preset or f"{method.iterations}:{method.surfels.max_count}"
         here = Path(method.file).parent  # of a method file that names another one
-        plain = methods.plain(methods.load(self.method, preset, folder=here))
+        plain = methods.plain(bare := methods.load(self.method, preset, folder=here))
         keys = [(text, text.partition("=")[0].strip().split(".")) for text in method.assignments]
-        lost = [["loss", n] for n, x in LOSSES.items() if {*x.attributes} - {*plain["surfels"]["attributes"]}]
+        lost = [["loss", n] for n, x in LOSSES.items() if {*x.attributes} - {*bare.surfels.names}]
         fitting = [t for t, path in keys if table_at(plain, path[:-1]) is not None and path[:2] not in lost]
         other = methods.load(self.method, preset, fitting, here)
         kept = "iterations seed checkpoint_every preview_every log_every about name file preset assignments"
