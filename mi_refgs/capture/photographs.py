@@ -14,7 +14,7 @@ from mi_refgs.data.exposure import EXPOSURE
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.images import exif_tags, image_header, open_image, positive, read_mask, to_8_bits
-from mi_refgs.io.ownership import RUN, owner_of
+from mi_refgs.io.ownership import MARK, RUN, owner_of
 from mi_refgs.io.progress import Tell
 
 OTHER_ENDINGS = ".heic .heif .dng .cr2 .cr3 .nef .arw .raf .tif .tiff .avif".split()  # for a message
@@ -96,11 +96,11 @@ def find_photographs(folder: Path, tell: Tell = lambda _: None) -> list[Photogra
     if not folder.is_dir():
         raise InputError("no such folder", folder, "photographs", "give one with JPEG or PNG files")
     paths, below = image_files(folder, deep=False), [*folder.rglob("*")]
-    captures = {p.parent for p in below if p.name in (REPORT, WORK) or owner_of(p.parent) == RUN}
-    inner = [p for p in image_files(folder, deep=True) if captures.isdisjoint(p.parents)]
+    marked = [p for p in below if p.name in (REPORT, WORK, MARK)]  # folders of captures and runs
+    made = {p.parent for p in marked if p.name != MARK or owner_of(p.parent) == RUN}
+    inner = [p for p in image_files(folder, deep=True) if made.isdisjoint(p.parents)]
     inner = [p for p in inner if not any(map(MASK.search, p.relative_to(folder).parts[:-1]))]
-    if len(paths) < FEWEST:
-        paths = inner
+    paths = inner if len(paths) < FEWEST else paths
     other = Counter(path.suffix for path in below if path.suffix.lower() in OTHER_ENDINGS).most_common(1)
     if len(paths) < FEWEST:
         remedy = f"convert its {other[0][0]} files to JPEG" if other else "photograph all sides"

@@ -66,20 +66,15 @@ def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) 
 @pytest.mark.parametrize("surrounded", [True, False])
 def test_what_is_behind_is_taken(balls: Reconstruction, behind: Any, surrounded: bool) -> None:
     """A colour, too; as a copy, which the loop does not change."""
-    camera, own = (
-        balls.camera(0, 24),
-        balls.trained.surfels.raw | {"type": "refgs", "reflectance": "radiance"},
-    )
+    camera = balls.camera(0, 24)
+    own = balls.trained.surfels.raw | {"type": "refgs", "reflectance": "radiance"}
     if surrounded:
         own |= {f"surroundings_{x}": own[x] for x in (*balls.trained.surfels.primitive.widths, "radiance_sh")}
     if behind is not None:
         own["background"] = mi.Color3f(behind) if len(behind) == 3 else mi.TensorXf(behind)
     scene = mi.load_dict({"type": "scene", "refgs": own, "sensor": balls.scene(camera).sensors()[0]})
-    with (
-        pytest.warns(RuntimeWarning, match="becomes black")
-        if surrounded and behind is None
-        else nullcontext()
-    ):
+    black = surrounded and behind is None
+    with pytest.warns(RuntimeWarning, match="becomes black") if black else nullcontext():
         made = Reconstruction.from_params(scene)
     before = mi.render(scene, spp=1).numpy()
     if "refgs.background" in (params := mi.traverse(scene)):
