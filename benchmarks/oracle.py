@@ -223,7 +223,7 @@ def renderer(
     with dr.suspend_grad():
         filtered = shading.light_of(EnvironmentLight.from_radiance(scale * light.radiance().numpy()))
         occluder = TrueOccluder(mesh, fitted.mesh.voxel, truth, true)
-        lighted = hits if hits.ambient_rays else shading
+        lighted = ShadingOptions(**lit if {"materials", "hit materials"} & {*true} else given)
         update_occluder_caches(occluder, fitted.surfels, filtered, lighted)
     scene = SurfelScene(fitted.surfels, shading, filtered, occluder, fitted.surroundings, fitted.near)
     once = partial(render, scene, request=Request(("normal",), forward_only=True))
