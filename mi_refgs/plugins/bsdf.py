@@ -98,9 +98,10 @@ class RefGSBSDF(mi.BSDF):
             specular = sample1 < _specular_probability(ctx, material, wi.z)
             normal, _ = material.distribution().sample(wi, sample2)
             cosine = mi.warp.square_to_cosine_hemisphere(sample2)
-            wo, above = _front(dr.select(specular, mi.reflect(wi, normal), cosine), active)
-            sampled = dr.zeros(mi.BSDFSample3f, dr.width(wo))
-            sampled.wo = wo
+            sampled = dr.zeros(mi.BSDFSample3f, dr.width(wi))
+            # Also below the surface, where a blend's other parts reflect nothing.
+            sampled.wo = dr.select(specular, mi.reflect(wi, normal), cosine)
+            wo, above = _front(sampled.wo, active)
             sampled.pdf = dr.select(above, _density(ctx, material, wi, wo), 0)
             sampled.eta = 1
             sampled.sampled_component = dr.select(specular, mi.UInt32(SPECULAR), mi.UInt32(DIFFUSE))
