@@ -21,7 +21,7 @@ from mi_refgs.io.progress import command_line
 from mi_refgs.methods.method import DataOptions, Method
 from mi_refgs.methods.read import load
 from mi_refgs.runs.run import Run
-from mi_refgs.runs.views import measured_views, sized
+from mi_refgs.runs.views import changed, measured_views, read_views, sized
 
 RUNS = "runs"  # runs/<data>/<method>/seed<k>
 SETTINGS = "compare.json"
@@ -170,6 +170,9 @@ def require_same(job: Job) -> None:
     if data is None or data.resolve() != Path(job.data).resolve():
         what = f"the run was fitted to {data or 'unknown data'}, not to {job.data}"
         raise InputError(what, f"{job.folder}/dataset.json", "DATA", remedy)
+    if other := changed(read_views(job.method(), data, "train", truth=False), job.run.images()):
+        what = f"{len(other)} images or cameras are not as when {job.folder} began"
+        raise InputError(what, job.data, other[0], f"restore them, {remedy[0].lower()}{remedy[1:]}")
 
 
 def finished(job: Job) -> bool:

@@ -66,7 +66,10 @@ class Reconstruction:
         test_list = self.source.with_name(TEST_LIST)
         if not is_file(test_list):
             return held_out(images, split, self.source)
-        tests = {line.strip() for line in test_list.read_text("utf-8", "replace").splitlines()}
+        lines = test_list.read_text("utf-8-sig", "replace").splitlines()
+        tests = {line.strip() for line in lines if line.strip()}
+        for name in sorted(tests - {image.name for image in self.images}):
+            self.options.say(f"named in {TEST_LIST}, but not in the model", name, name)
         chosen = [image for image in images if (image.name in tests) == (split == "test")]
         if not chosen:
             raise InputError(f"zero {split} views", test_list, remedy="name some of the images, not all")

@@ -24,7 +24,7 @@ from mi_refgs.data.images import FOLDERS, MARKS, ImageFile, Mask, block_mean, fi
 from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
 from mi_refgs.data.view import View
-from mi_refgs.errors import InputError, abbreviated
+from mi_refgs.errors import InputError, abbreviated, counted
 from mi_refgs.io.exr import read_exr_image
 from mi_refgs.io.files import inside, is_file, read_json
 from mi_refgs.io.images import ENDINGS, linear_from_srgb, read_png, read_tiff, with_ending
@@ -71,7 +71,8 @@ class Frame:
         for i, own in enumerate(frames):
             if not isinstance(own, dict):
                 raise InputError("not an object", file, f"frames[{i}]", "give it a file_path")
-        return [Frame(file, f"frames[{i}]", own, content | own) for i, own in enumerate(frames)]
+        known = ({key: x for key, x in own.items() if x is not None} for own in frames)
+        return [Frame(file, f"frames[{i}]", own, content | own) for i, own in enumerate(known)]
 
     @property
     def name(self) -> str:
@@ -180,6 +181,9 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError("not a list of paths", frames[0].file, f"{key}_filenames", "correct it")
         lists[key] = {*map(os.path.normpath, names)}
+        if lost := sorted(lists[key] - {os.path.normpath(frame.name) for frame in frames}):
+            what = f"{counted(len(lost), 'path')} of no frame, such as {abbreviated(lost[0])}"
+            raise InputError(what, frames[0].file, f"{key}_filenames", "write them as `file_path` does")
     test = lists["test"] or lists["val"]
     if not test:
         return {*held_out(sorted(lists["train"]), split)} or None

@@ -17,6 +17,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.shade.light.envmap import MIN_HEIGHT, EnvironmentLight
 from mi_refgs.shade.light.latlong import lat_long
 from mi_refgs.shade.light.light import RotatedLight
+from mi_refgs.shade.light.light_file import CONVERTED_ROWS
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading, spare
@@ -48,7 +49,8 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     if light is None and seen is not None:
         light = own_light(lights[0])[0]
     if isinstance(seen, RotatedLight):
-        light = EnvironmentLight.from_radiance(lat_long(seen.radiance, light.height))
+        rows = max(light.height, min(4 * light.height, CONVERTED_ROWS))  # finer, so that little is blurred
+        light = EnvironmentLight.from_radiance(lat_long(seen.radiance, rows))
     around, behind = integrator.around, integrator.behind
     if not isinstance(behind, EnvironmentLight | None):
         behind = EnvironmentLight.constant(np.array(behind).ravel(), MIN_HEIGHT)

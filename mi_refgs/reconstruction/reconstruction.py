@@ -5,6 +5,7 @@ run folder. Images are NumPy arrays (H, W, channels) of float32, linear radiance
 """
 
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,6 +34,7 @@ from mi_refgs.reconstruction.provenance import EDITS, Provenance
 from mi_refgs.render.display import composited, image_array
 from mi_refgs.render.load_scene import load_scene
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.render.scene_xml import has_square_pixels
 from mi_refgs.runs.export import export, newest, save, write_if_stale
 from mi_refgs.runs.relightable import relightable
 from mi_refgs.runs.run import Run
@@ -206,10 +208,13 @@ class Reconstruction:
 
         `mi.traverse` of it lists the raw attributes (N, D) of the surfels, such as "refgs.roughness", and the
         raw environment map, "refgs.light": `mi.render(scene, params)` differentiates all of them. aovs:
-        types, or name:type, appended to the image. Raises InputError for a camera that no Mitsuba sensor
-        represents, and unknown AOVs."""
+        types, or name:type, appended to the image. A sensor's pixels are square: with a warning, those of a
+        camera of fx ≠ fy are others. Raises InputError for mirrored cameras and unknown AOVs."""
         several = cameras if isinstance(cameras, list | tuple) and cameras else [cameras]
         first, *more = map(self.camera, several)
+        if not all(map(has_square_pixels, (first, *more))):
+            what = "fx and fy differ: the scene's square pixels are not those of `render`"
+            warnings.warn(what, RuntimeWarning, stacklevel=2)
         with tempfile.TemporaryDirectory(prefix="refgs_") as folder:
             export(self.trained, Path(folder), first, more)
             return load_scene(Path(folder) / SCENE, aovs, object_only)
@@ -220,8 +225,8 @@ class Reconstruction:
         It renders the same images, bit for bit. Raises InputError for a folder that has other files."""
         source, camera = self.provenance, self.provenance.first_camera(self.trained)
         records = source.records | ({EDITS: {"edits": source.edits}} if source.edits else {})
-        options: dict[str, Any] = {"data": source.data, "region": source.region, "records": records}
-        save(self.trained, Path(folder), source.method, camera, **options)
+        about: Any = {"data": source.data, "region": source.region, "images": source.images}
+        save(self.trained, Path(folder), source.method, camera, records=records, **about)
         return load(folder)
 
     def export(self, form: str, path: str | Path, **options: Any) -> list[Path]:

@@ -64,6 +64,12 @@ def sensors_of(cameras: Sequence[Camera]) -> list[Any]:
     return list(mi.load_string(ElementTree.tostring(scene, encoding="unicode")).sensors())
 
 
+def has_square_pixels(camera: Camera) -> bool:
+    """Whether the film of the camera's sensor has its pixels."""
+    fx, fy = sorted(abs(float(focal[0])) for focal in (camera.fx, camera.fy))
+    return fy < fx * (1 + SQUARE)
+
+
 def write_xml(path: str | Path, scene: ElementTree.Element) -> None:
     """Write a scene, indented, whole or not at all; raises InputError if the path cannot be written."""
     ElementTree.indent(scene, "    ")
@@ -94,13 +100,13 @@ def add_sensor(scene: ElementTree.Element, camera: Camera, name: str) -> None:
     per_pixel = focal / abs(fx), focal / abs(fy)
     width = max(1, round(camera.width * per_pixel[0]))
     height = max(1, round(camera.height * per_pixel[1]))
-    if (width, height) != (camera.width, camera.height):
+    if not (square := has_square_pixels(camera)):
         size = f"{camera.width} x {camera.height} pixels of focal lengths {abs(fx):g} and {abs(fy):g}"
         scene.append(ElementTree.Comment(f" the view of {size}, with square pixels "))
 
     # The field of view and the principal point are those of the whole film, of which a crop is rendered.
     (left, top), whole = (0, 0), (width, height)
-    if camera.film is not None and max(per_pixel) < 1 + SQUARE:
+    if camera.film is not None and square:
         (left, top), whole = camera.offset, camera.film
     x, y = cx * per_pixel[0] + left, cy * per_pixel[1] + top
     sensor = ElementTree.SubElement(scene, "sensor", type="perspective", id=name)

@@ -5,6 +5,7 @@ import hashlib
 import os
 import sys
 import warnings
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -79,12 +80,13 @@ def views_of_run(
 
 
 def digests(views: Dataset) -> dict[str, str]:
-    """A digest of the camera, the size of the file and the presence of alpha of each image, by name."""
+    """A digest of the camera, the files of image and mask and the presence of alpha of each view, by name."""
     found = {}
     for view in views.views:
-        size = view.file.path.stat().st_size if view.file and view.file.path.is_file() else 0
+        paths = [one.path for one in (view.file, view.file and view.file.mask) if one and one.path.is_file()]
+        files = [zlib.crc32(path.read_bytes()) for path in paths]
         camera = np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 5)
-        text = repr((size, view.has_alpha, view.width, view.height, (camera + 0.0).tolist()))
+        text = repr((files, view.has_alpha, view.width, view.height, (camera + 0.0).tolist()))
         found[view.name] = hashlib.sha256(text.encode()).hexdigest()[:16]
     return found
 

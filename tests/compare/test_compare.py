@@ -14,9 +14,11 @@ from mi_refgs.cli import main
 from mi_refgs.compare import execute, jobs
 from mi_refgs.compare.jobs import Job
 from mi_refgs.compare.table import write
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.fitting import decide
 from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.runs.run import DECISIONS, Run
+from mi_refgs.runs.views import digests
 from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS, write_open_data
 
@@ -204,9 +206,11 @@ def test_a_decided_run_is_accepted(data: Path, tmp_path: Path) -> None:
     job = jobs.plan(tmp_path / "out", [data], ["auto"], [0], preset="quick", threads=1)[0]
     rows = [{"component": name, "stays": True} for name in ("colour_alone", "surfels_2x")]
     chosen = decide.as_decided(job.method(), rows)
-    job.run.create(chosen, str(data))
+    job.run.create(chosen, str(data), images=digests(read_dataset(data, "train")))
     assert chosen.light is None and chosen.surfels.capacity == 2
     job.run.write_json(DECISIONS, rows)
     jobs.require_same(job)
+    job.run.write_dataset(str(data), None, {**job.run.images(), "another": ""})
+    refused(lambda: jobs.require_same(job), "another: 1 images or cameras are not as when")
     job.run.write_method(replace(chosen, seed=3))
     refused(lambda: jobs.require_same(job), "seed: the run was made with 3")

@@ -20,6 +20,7 @@ from mi_refgs.data.region import Region
 from mi_refgs.data.survey import write_masks
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import read_png, write_png
+from mi_refgs.runs.views import changed, digests
 from tests.helpers import refused
 from tests.scenes.layouts import change_transforms, write_colmap
 from tests.scenes.tiny import train_command, write_data, write_method
@@ -152,6 +153,10 @@ def test_constant_background_becomes_masks(tmp_path: Path, capsys: pytest.Captur
         mask = view.load().alpha
         assert (mask <= alpha).all() and mask.sum() > 0.6 * alpha.sum()  # type: ignore[union-attr, operator]
     refused(["doctor", data, "--masks"], "--masks")
+    known = digests(read_dataset(data, "train"))
+    mask = next(data.glob("**/masks/train/*.png"))
+    write_png(mask, 1 - read_png(mask))
+    assert len(changed(read_dataset(data, "train"), known)) == 1  # the file may be as long as before
 
 
 def test_masks_are_written_where_they_are_read(tmp_path: Path) -> None:

@@ -158,7 +158,8 @@ def test_region_of_both_splits_is_that_of_the_training_cameras(tmp_path: Path) -
     for count in (2, 1):
         train, test = read_dataset(data, "train"), read_dataset(data, "test")
         assert len(test.views) == count and test.region == train.region == region_of(train.views)
-        (data / "sparse/0/test.txt").write_text("d.png\n")
+        (data / "sparse/0/test.txt").write_text("\ufeffd.png\n\nmistyped.png\n", "utf-8")
+    assert "1 images: named in test.txt, but not in the model, such as mistyped.png" in train.notes
 
 
 def test_truncated_binary_files_are_refused(tmp_path: Path) -> None:

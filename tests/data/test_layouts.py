@@ -25,11 +25,12 @@ def test_filenames_define_splits(tmp_path: Path) -> None:
     change_transforms(data, lambda content: content.update(train_filenames=["images/a.png", "images/b.png"]))
     assert [v.name for v in read_dataset(data, "train").views] == ["images/a", "images/b"]
     change_transforms(data, lambda content: content.update(test_filenames=["./images/c.png"]))
+    change_transforms(data, lambda content: content["frames"][2].update(fl_x=None))  # as if it were not there
     assert [v.name for v in read_dataset(data, "test").views] == ["images/c"]
     change_transforms(data, lambda content: [content.pop(f"{split}_filenames") for split in ("test", "val")])
     for split, listed in (("train", "images/b"), ("test", "images/a")):  # held out of those that are listed
         assert [v.name for v in read_dataset(data, split).views] == [listed]
-    for names_given, words in ((["images/no.png"], "zero test views"), ([3], "not a list of paths")):
+    for names_given, words in ((["no.png"], "1 path of no frame"), ([3], "not a list of paths")):
         change_transforms(data, partial(dict.update, test_filenames=names_given))
         refused(partial(read_dataset, data, "test"), words)
 

@@ -54,9 +54,9 @@ def test_light_of_the_scene_is_taken_in_world_directions(balls: Reconstruction) 
         scene = mi.load_dict({"type": "scene", **parts})
         expected = mi.render(scene, spp=1).numpy()
         found = Reconstruction.from_params(scene)
-        assert found.trained.light is not None and found.trained.light.height == 16
+        assert found.trained.light is not None and found.trained.light.height == 64
         shown = found.render(camera)[..., :3]
-        np.testing.assert_allclose(shown, expected[..., :3], atol=0.03 * expected.max())
+        np.testing.assert_allclose(shown, expected[..., :3], atol=0.01 * expected.max())
     scene = mi.load_dict({"type": "scene", **parts, "sky": turned | {"to_world": mi.ScalarTransform4f()}})
     exact = Reconstruction.from_params(scene).render(camera)[..., :3]
     np.testing.assert_allclose(exact, mi.render(scene, spp=1)[..., :3], atol=1e-5)
