@@ -75,8 +75,6 @@ compare -o out --methods tiny.toml
 compare -o out
 compare data -o out
 compare data -o out --methods nothing
-profile run --steps 0
-profile nothing
 """.strip().splitlines()
 
 

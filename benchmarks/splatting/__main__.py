@@ -29,12 +29,12 @@ from benchmarks.common import timing
 from benchmarks.common.fits import large_step, make_trainer, sphere_data
 from benchmarks.common.report import Row, benchmark
 from benchmarks.common.timing import once
+from benchmarks.profile import phases_of, stepper
 from benchmarks.splatting.cases import COLOUR, FEATURES, PAGE, SMALL, Settings, Workload, sphere
 from benchmarks.splatting.renderers import Ours, Volprim
 from benchmarks.stability.cases import Case, sky
 from benchmarks.stability.measure import measure as measure_case
 from mi_refgs.constants import tile_size
-from mi_refgs.evaluation.profile import phases_of, stepper
 from mi_refgs.splat import list_by_tile, project
 
 FLOPS = {"forward": 60, "both": 260}

@@ -35,8 +35,7 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
         "export": ("export:command", "write the files of a run anew, or files of other programs"),
         "import": ("import_splats:Import", "convert a 3DGS or 2DGS PLY to a run folder"),
     },
-    "Measure and set up": {
-        "profile": ("profile:Profile", "measure where the time of a step goes"),
+    "Set up": {
         "doctor": ("doctor:Doctor", "examine the installation or a data set: problems and remedies"),
     },
 }

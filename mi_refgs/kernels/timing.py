@@ -1,4 +1,4 @@
-"""Named phases (of `evaluation.profile`) of a step, for a listener that times them, if there is one."""
+"""Named phases (of `benchmarks.profile`) of a step, for a listener that times them, if there is one."""
 
 import functools
 from collections.abc import Callable, Iterator

@@ -42,7 +42,7 @@ FILLS: dict[str, Arguments] = {
     "import": lambda at: [at / "a.ply", "-o", at / "out"],
 }
 """Commands that fill the folder `out`."""
-OTHERS = ("completion", "doctor", "eval", "profile", "render", "view")
+OTHERS = ("completion", "doctor", "eval", "render", "view")
 """Commands that write one file, into a run, or nothing."""
 
 

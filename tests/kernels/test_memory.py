@@ -24,7 +24,6 @@ BOUNDED = {
     "edit": ["edit", "RUN", "--where", "metallic > 0.5", "--set", "roughness=0.3", "-o", "OUT"],
     "export": ["export", "RUN", "--to", "exr", "-o", "OUT"],
     "import": ["import", "RUN/surfels.ply", "-o", "OUT"],
-    "profile": ["profile", "RUN"],
     "view": ["view", "RUN", "--port", "0"],
     "dataset": ["dataset", "SCENE", "-o", "OUT"],
 }

@@ -180,7 +180,7 @@ def test_a_comparison_takes_it_along(place: Path, tmp_path: Path, monkeypatch: p
 
 
 COMMAND_LINES = """
-    render -o x.exr, relight --envmap {light}, eval, edit -o x --set coat=0, export -o x, view, profile,
+    render -o x.exr, relight --envmap {light}, eval, edit -o x --set coat=0, export -o x, view,
     train --resume
 """
 

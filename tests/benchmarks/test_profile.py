@@ -1,6 +1,5 @@
-"""`refgs profile`: time is booked where it is spent, and nothing is changed."""
+"""Phases of a step: time is booked where it is spent, and nothing is changed."""
 
-import json
 import shutil
 import time
 from collections.abc import Callable
@@ -10,13 +9,13 @@ from typing import Any
 import drjit as dr
 import pytest
 
+from benchmarks import profile as phases
 from mi_refgs import methods
-from mi_refgs.cli import main
 from mi_refgs.data.dataset import read_dataset
-from mi_refgs.evaluation import profile as phases
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels import timing
 from mi_refgs.render.pipeline import Frame
+from mi_refgs.runs.run import Run
 from mi_refgs.shade.light.envmap import PrefilteredLight
 from mi_refgs.splat import Composited, Footprints
 from tests.helpers import refused
@@ -99,15 +98,11 @@ def test_hooks_do_nothing_unless_somebody_listens() -> None:
     assert twice(3) == 6 and notes.calls == ["sort"]
 
 
-def test_command_prints_a_table(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_of_a_run(finished: Path, tmp_path: Path) -> None:
+    """Nothing is written; what was not fitted has no step."""
     before = {file: file.stat().st_mtime_ns for file in finished.rglob("*")}
-    assert main(["profile", str(finished), "--steps", "1", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["phases"]
-    assert {"project", "splat forward", "optimiser"} <= {row["phase"] for row in rows}
-    assert all(row["ms"] >= 0 and row["launches"] >= 0 and 0 <= row["share"] <= 1 for row in rows)
+    names = {line.split("  ")[0] for line in phases.table(Run(finished), 1).splitlines()}
+    assert {"project", "splat forward", "optimiser", "sum"} <= names
     assert {file: file.stat().st_mtime_ns for file in finished.rglob("*")} == before
-
-
-def test_what_was_not_fitted_has_no_step(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run", ignore=shutil.ignore_patterns("checkpoints"))
-    refused(["profile", tmp_path / "run"], "run: checkpoints: none; measure the run that was fitted")
+    refused(lambda: phases.table(Run(tmp_path / "run")), "run: checkpoints: none; measure the run")

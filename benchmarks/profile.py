@@ -1,7 +1,10 @@
-"""Where the time of a training step goes: wall time and kernel launches by phase, between barriers. The clock
-listens to the hooks of `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit: identities at the
-boundaries between phases notify the clock of the phase that the pass has reached."""
+"""Where the time of a step of a fitted run goes: python -m benchmarks.profile RUN
 
+Wall time and kernel launches by phase, between barriers. The clock listens to the hooks of
+`mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit: identities at the boundaries between
+phases notify the clock of the phase that the pass has reached. Nothing is written."""
+
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -10,12 +13,16 @@ from itertools import cycle
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from mi_refgs.errors import InputError
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.kernels.timing import listening
 from mi_refgs.kernels.trees import mapped
+from mi_refgs.runs.run import Run
+from mi_refgs.runs.views import views_of_run
 
 PHASES = (
     *("prefilter forward", "shade forward", "project", "tile lists", "sort", "splat forward", "ssim forward"),
@@ -113,3 +120,21 @@ def stepper(trainer: Trainer, name: str) -> Callable[[], None]:
     trainer.setup = FitSetup(method, trainer.data)
     iterations = cycle(range(max(begin + 1, end - NEAR_END), end + 1))
     return lambda: trainer.gradient_step(next(iterations))
+
+
+def table(run: Run, steps: int = 15) -> str:
+    """Lines of the phases of a run, at its newest checkpoint; raises InputError without one."""
+    method = run.method()
+    if not run.checkpoints():
+        raise InputError("none", run.path, "checkpoints", "measure the run that was fitted")
+    trainer = Trainer(method, views_of_run(run, method, "train"), run)
+    rows = phases_of(stepper(trainer, trainer.method.stage_at(max(trainer.iteration, 1))[0]), steps)
+    rows.append({"phase": "sum", "share": 1, **{n: sum(row[n] for row in rows) for n in ("ms", "launches")}})
+    line = "{phase:<20}{ms:>10.2f}{launches:>10}{share:>8.0%}"
+    head = f"{'phase':<20}{'ms':>10}{'launches':>10}{'share':>8}"
+    return "\n".join([head, *(line.format(**row) for row in rows)])
+
+
+if __name__ == "__main__":
+    mi.set_variant("llvm_ad_rgb")
+    print(table(Run(sys.argv[1])))
