@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.stability.cases import Array, Case
+from mi_refgs.occlusion.visibility import ALONG
 from mi_refgs.reference import image as oracle
 from mi_refgs.reference.light import Light, dense_filter, filtered
 from mi_refgs.reference.occlusion import mirror_visibility
@@ -84,4 +85,4 @@ def visibility_of(case: Case, normal: Array, ray: Array, further: float = 0.0) -
     """Visibility (P,) of the mirror direction, with `further` added to the offset of its rays."""
     vertices, faces, offset = case.surface
     eye = case.camera.to_world[:3, 3]
-    return mirror_visibility(vertices, faces, eye, normal, ray, offset + further)
+    return mirror_visibility(vertices, faces, eye, normal, ray, offset + further, ALONG)

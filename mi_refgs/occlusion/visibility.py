@@ -18,6 +18,7 @@ from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Array, Bool, Float, Point2f, Point3f, Scene, UInt32, Vector3f
 
 OFFSET_VOXELS = 2.0  # of a ray's origin off the surface: above the mesh's error (0.4) and the depth's
+ALONG = 2.5  # offsets along the ray at most, which stays where it is: what is nearer is not hit
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ class Occluder:
         self, origin: Point3f, direction: Vector3f, normal: Vector3f = None, active: Bool = True
     ) -> Float:
         """1 where the ray, of any length, leaves freely, is not `active` or not finite; 0 where it is
-        blocked. It starts (world) OFFSET_VOXELS off along the normal, or along itself without one."""
+        blocked. It starts (world) OFFSET_VOXELS off the surface of this normal, or along itself without one:
+        farther along the ray, up to ALONG offsets, and for what is missing along the normal."""
         if self.empty:
             return dr.full(mi.Float, 1, max(dr.width(origin), dr.width(direction)))
         with dr.suspend_grad():
@@ -118,11 +120,13 @@ class Occluder:
             raise RuntimeError(f"Occluder was made {variants}: call update again")
         offset = OFFSET_VOXELS * dr.opaque(mi.Float, self.mesh.voxel)
         d, active = _unit(mi.Vector3f(direction))
-        away = d
+        start = offset * d
         if normal is not None:
             n, has_normal = _unit(mi.Vector3f(normal))
-            away = dr.select(has_normal, n, d)
-        o = mi.Vector3f(origin) + offset * away
+            cosine = dr.dot(n, d)
+            along = dr.select(cosine > 0, offset * dr.minimum(dr.rcp(dr.maximum(cosine, 1e-3)), ALONG), 0)
+            start = dr.select(has_normal, along * d + (offset - along * cosine) * n, start)
+        o = mi.Vector3f(origin) + start
         active &= dr.all(dr.isfinite(o))
         return mi.Ray3f(mi.Point3f(dr.select(active, o, 0)), d), active
 

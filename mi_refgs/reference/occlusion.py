@@ -131,17 +131,25 @@ def mesh_distance(vertices: Array, faces: Array, origin: Array, direction: Array
     return np.array([mesh_hit(vertices, faces, o, d)[0] for o, d in zip(origin, direction, strict=True)])
 
 
+def beyond(normal: Array, direction: Array, offset: float, along: float) -> Array:
+    """From a surface to where rays (…, 3) start, `offset` above it: along them, at most `along` offsets."""
+    cosine = np.sum(normal * direction, -1, keepdims=True)
+    with np.errstate(divide="ignore"):
+        length = offset * np.clip(1 / cosine, 0, along)
+    return length * direction + (offset - length * cosine) * normal
+
+
 def mirror_visibility(
-    vertices: Array, faces: Array, eye: Array, normal: Array, ray: Array, offset: float
+    vertices: Array, faces: Array, eye: Array, normal: Array, ray: Array, offset: float, along: float
 ) -> Array:
-    """1 (P,), or 0 where mirror rays of unit rays (P, 3) from the eye, `offset` off the mesh, are blocked."""
+    """1 (P,), or 0 where mirror rays of unit rays (P, 3) from the eye, `beyond` the mesh, are blocked."""
     if not len(faces):
         return np.ones(len(normal))
     origin = np.broadcast_to(eye, ray.shape)
     t = mesh_distance(vertices, faces, origin, ray)
     hit = np.isfinite(t)
-    start = origin + np.where(hit, t, 0)[:, None] * ray + offset * normal
     mirror = ray - 2 * np.sum(normal * ray, 1, keepdims=True) * normal
+    start = origin + np.where(hit, t, 0)[:, None] * ray + beyond(normal, mirror, offset, along)
     return np.where(hit & np.isfinite(mesh_distance(vertices, faces, start, mirror)), 0.0, 1.0)
 
 
@@ -154,21 +162,22 @@ def ambient(
     outgoing: Callable[[Array, Array, bool, Array], Array],
     *,
     offset: float,
+    along: float,
     bounces: int,
     brightest: float,
 ) -> Array:
     """Ratios (V, 3) by the formula of `shade.ambient`, for normals (V, 3), unit directions (V, K, 3) of
-    density cosine / π, blurred light(ω) (3,), rays from `offset` off the surface, and radiance (3,)
+    density cosine / π, blurred light(ω) (3,), rays from `beyond` the surface, and radiance (3,)
     outgoing(normal, view, free, ratio) of a hit, `free` if light arrives along its mirror direction."""
     ratio = np.ones((len(vertices), 3))
     for _ in range(bounces):
         found = np.zeros_like(ratio)
         for vertex, (place, normal) in enumerate(zip(vertices, normals, strict=True)):
-            start = place + offset * normal
             arrives, every = np.zeros(3), np.zeros(3)
             for direction in directions[vertex]:
                 radiance = light(direction)
                 every += radiance
+                start = place + beyond(normal, direction, offset, along)
                 distance, face, shares = mesh_hit(vertices, faces, start, direction)
                 if not np.isfinite(distance):
                     arrives += radiance
@@ -177,7 +186,7 @@ def ambient(
                     there = there / np.linalg.norm(there)
                     there = -there if there @ direction > 0 else there
                     mirror = direction - 2 * (direction @ there) * there
-                    hit = start + distance * direction + offset * there
+                    hit = start + distance * direction + beyond(there, mirror, offset, along)
                     free = not np.isfinite(mesh_hit(vertices, faces, hit, mirror)[0])
                     arrives += outgoing(there, -direction, free, shares @ ratio[faces[face]])
             found[vertex] = arrives / every

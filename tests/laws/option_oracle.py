@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter
 
 from benchmarks.stability.exact import filters
 from mi_refgs import constants as c
-from mi_refgs.occlusion.visibility import OFFSET_VOXELS
+from mi_refgs.occlusion.visibility import ALONG, OFFSET_VOXELS
 from mi_refgs.reference import image, occlusion
 from mi_refgs.reference.camera import PinholeCamera, look_at, rotation_axes
 from mi_refgs.reference.footprint import GEOMETRY
@@ -100,8 +100,8 @@ class Oracle:
         """Visibility (P,) of the mirror direction, that of the first image."""
         if self.visible is None:
             found, eye = mesh(), self.camera.to_world[:3, 3]
-            offset = OFFSET_VOXELS * found.voxel
-            self.visible = occlusion.mirror_visibility(found.vertices, found.faces, eye, normal, ray, offset)
+            start = OFFSET_VOXELS * found.voxel, ALONG
+            self.visible = occlusion.mirror_visibility(found.vertices, found.faces, eye, normal, ray, *start)
         return self.visible
 
     def _blocks(self, values: Array) -> Array:
@@ -177,8 +177,9 @@ def _facing(raw: dict[str, Array], camera: PinholeCamera) -> Array:
 
 def _free(position: Array, normal: Array, count: int) -> Array:
     found, free = mesh(), []
-    for origin, about in zip(position + OFFSET_VOXELS * found.voxel * normal, normal, strict=True):
+    for place, about in zip(position, normal, strict=True):
         rays = hemisphere(count, about)
-        distance = occlusion.mesh_distance(found.vertices, found.faces, np.tile(origin, (count, 1)), rays)
+        start = place + occlusion.beyond(about, rays, OFFSET_VOXELS * found.voxel, ALONG)
+        distance = occlusion.mesh_distance(found.vertices, found.faces, start, rays)
         free.append(~np.isfinite(distance))
     return np.stack(free)

@@ -63,8 +63,7 @@ def test_mirror_rays_against_the_true_shape(name: str) -> None:
     grazing = np.sum(mirror * normal, axis=1) < 0.2
     false_occlusion, missed = np.mean(truth & ~seen), np.mean(~truth & seen)
     assert grazing.sum() > 100 and np.mean((truth & ~seen)[grazing]) < 0.02
-    # Two voxels of offset are a ninth of the plates' gap on this coarse grid; their edges shift by as much.
-    assert false_occlusion < 0.015 and missed < 0.01
+    assert false_occlusion < 0.003 and missed < 0.003  # of grazing rays, which start beside themselves
     assert seen.all() if name == "sphere" else np.mean(~truth) > 0.03
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import Mesh
-from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
+from mi_refgs.occlusion.visibility import ALONG, OFFSET_VOXELS, Occluder
 from mi_refgs.reference.light import specular
 from mi_refgs.reference.occlusion import ambient as exact
 from mi_refgs.shade import ambient
@@ -60,7 +60,7 @@ def test_ratios_against_rays_one_by_one() -> None:
     found = occluder.ambient.numpy()
 
     exact_levels = exact_light(light)
-    normals = occluder.surface(surfels).vertex_surfels.normal.numpy().T.astype(np.float64)
+    normals = occluder.surface(surfels).vertex_surfels.normals(surfels).numpy().T.astype(np.float64)
     share = {name: 1 / (1 + np.exp(-np.array(value))) for name, value in LOGIT.items()}
 
     def outgoing(normal: np.ndarray, view: np.ndarray, free: bool, ratio: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def test_ratios_against_rays_one_by_one() -> None:
 
     rays = directions(normals, RAYS).astype(np.float64)
     shape = (mesh.vertices.astype(np.float64), mesh.faces.astype(int), normals, rays)
-    limits: dict[str, Any] = {"offset": OFFSET_VOXELS * VOXEL, "brightest": ambient.BRIGHTEST}
+    limits: dict[str, Any] = {"offset": OFFSET_VOXELS * VOXEL, "along": ALONG, "brightest": ambient.BRIGHTEST}
     expected, once = (exact(*shape, sky, outgoing, bounces=k, **limits) for k in (ambient.BOUNCES, 1))
     assert np.abs(once - expected).max() > 5e-3
     assert found.min() < 0.9 and np.ptp(found, axis=1).max() > 0.05
