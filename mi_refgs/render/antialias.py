@@ -55,7 +55,10 @@ def _traced(nodes: list[ShadingPoints], trace: Trace, chosen: UInt32) -> list[Sh
     every = dr.gather(mi.UInt32, chosen, lane % size)
 
     def joined(vectors: Iterable[Vector3f]) -> Vector3f:
-        return sum(dr.gather(type(v), v, every, lane // size == i) for i, v in enumerate(vectors))
+        return sum(
+            dr.gather(type(v), v, every, lane // size == i, dr.ReduceMode.NoConflicts)
+            for i, v in enumerate(vectors)
+        )
 
     normal, view = joined(node.normal for node in nodes), joined(node.view for node in nodes)
     attributes = {name: dr.gather(type(x), x, every) for name, x in nodes[0].attributes.items()}

@@ -50,7 +50,7 @@ def ambient(occluder: Occluder, surfels: Surfels, light: Light, options: Shading
     mesh = occluder.mesh
     assert mesh is not None
     position = mi.Point3f(mesh.vertices.T)
-    normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normal)
+    normal = safe_normalize(occluder.surface(surfels).vertex_surfels.normals(surfels))
     frame, turn = mi.Frame3f(normal), lobe_turn(dr.arange(mi.UInt32, dr.width(normal)))
     rays = dr.opaque(mi.UInt32, options.ambient_rays)
     blur = dr.opaque(mi.Float, (4 * options.ambient_rays) ** -0.25)  # 4 π α², its solid angle, is π / rays

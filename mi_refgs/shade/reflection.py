@@ -74,9 +74,13 @@ class MeshRadiance:
             free = dr.select(further.valid, mi.Float(0), mi.Float(1))
             return MeshHit(hit.valid, hit.triangle, hit.barycentric, free, further)
 
-    def radiance(self, hit: MeshHit, direction: Vector3f) -> Color3f:
-        """Radiance that leaves the hits against the rays, under AD."""
-        sample = self.surface.at(hit.triangle, hit.barycentric, hit.valid)
+    def radiance(self, hit: MeshHit, direction: Vector3f, origin: Point3f | None = None) -> Color3f:
+        """Radiance that leaves the hits against the rays, under AD. Given an `origin`, hits move with rays;
+        later hits stay: errors of normals are magnified there beyond what a derivative says."""
+        where = hit.barycentric
+        if origin is not None and dr.grad_enabled(direction):
+            where = self.surface.followed(hit.triangle, where, origin, direction, hit.valid)
+        sample = self.surface.at(hit.triangle, where, hit.valid)
         normal = self._facing(sample, direction)
         ambient = indirect = None
         attributes = dict(sample.values)
@@ -89,20 +93,21 @@ class MeshRadiance:
         if self.options.ambient_rays and self.ambient is not None:
             ambient = self.ambient.at(hit.triangle, hit.barycentric, hit.valid)
         if hit.next is not None:
-            indirect = self.radiance(hit.next, reflect(view=-direction, normal=normal))
+            indirect = self.radiance(hit.next, dr.detach(reflect(view=-direction, normal=normal)))
         traced = {"visibility": hit.visibility, "indirect": indirect, "ambient": ambient}
         points = ShadingPoints(values.pop("normal", normal), -direction, values | traced)
         return model.shade(points, self.light, self.options).total()
 
     def _facing(self, sample: SurfaceSample, direction: Vector3f) -> Vector3f:
         """Unit normal on the ray's side, unless it only leans away (see `FACING_TOLERANCE`)."""
-        normal = dr.detach(safe_normalize(sample.normal))
-        return dr.select(dr.dot(normal, direction) > FACING_TOLERANCE, -normal, normal)
+        normal = safe_normalize(sample.normal)
+        return dr.select(dr.detach(dr.dot(normal, direction)) > FACING_TOLERANCE, -normal, normal)
 
 
 def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOptions) -> ShadingPoints:
     """The points with visibility (mi.Float, 0 … 1, detached) and indirect light, as `options` require: of
-    what blocked rays hit with `traced_bounces`, with gradients of light and materials around hits only."""
+    what blocked rays hit with `traced_bounces`, with gradients of the light, of materials and normals around
+    hits, and for one ray of the points' normals."""
     occluder, scene, bounces = context.occluder, None, options.traced_bounces
     sampled = options.visibility_rays > 1
     if occluder.empty and (sampled or bounces):
@@ -112,7 +117,7 @@ def reflection(points: ShadingPoints, context: TraceContext, options: ShadingOpt
         scene = MeshRadiance(occluder, context.surfels, context.light, options, occluder.ambient)
     with dr.suspend_grad():
         start = point, facing, seen = context.start(dr.detach(points.normal))
-        ray = point, reflect(view=points.view, normal=facing), facing
+    ray = point, reflect(view=dr.detach(points.view), normal=safe_normalize(points.normal)), facing
     if sampled:
         visibility, indirect = _average(points, context, scene, start, options)
     else:
@@ -127,10 +132,11 @@ def _met(scene: MeshRadiance, ray: tuple[Point3f, Vector3f, Vector3f], free: Flo
     found, blocked = dr.zeros(mi.Color3f, dr.width(free)), dr.compress(free == 0)
     if dr.width(blocked):
         dr.eval(ray)  # in one kernel, not in each gather's
-        point, direction, normal = (dr.gather(type(x), x, blocked) for x in ray)
+        once = dr.ReduceMode.NoConflicts
+        point, direction, normal = (dr.gather(type(x), x, blocked, mode=once) for x in ray)
         hit = scene.trace(point, direction, normal, True, bounces)
         dr.eval(hit)
-        dr.scatter(found, dr.select(hit.valid, scene.radiance(hit, direction), 0), blocked)
+        dr.scatter(found, dr.select(hit.valid, scene.radiance(hit, direction, point), 0), blocked)
     return found
 
 

@@ -32,11 +32,6 @@ def test_named_tests_exist() -> None:
         assert not name or name.partition("[")[0] in functions(file), mutant.name
 
 
-def test_mutant_names_are_unique() -> None:
-    names = [mutant.name for mutant in MUTANTS]
-    assert sorted(set(names)) == sorted(names)
-
-
 def test_every_folder_of_the_package_has_mutants() -> None:
     """A new folder gets mutants, or is listed as one that computes nothing of its own."""
     packages = {path.parent.name for path in (ROOT / "mi_refgs").glob("*/__init__.py")}

@@ -2,15 +2,13 @@
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from benchmarks.common import errors, montecarlo as mc, view as common
+from benchmarks.common import errors, view as common
 from benchmarks.common.errors import Step
 from benchmarks.common.report import where
-from mi_refgs.reference.lobe import split_sum_entry
 
 BENCHMARK = "splitsum"
 LIGHTS = ("constant", "gradient", "checker", "sunsky")
@@ -58,19 +56,6 @@ def test_samples_go_through_pixel_centres() -> None:
     image = np.array(mi.render(scene, sensor=sensor, integrator=depth, spp=16))[..., -3:]
     assert points.count > 100
     np.testing.assert_allclose(points.of_image(image), np.array(points.position).T, atol=2e-6)
-
-
-@pytest.mark.parametrize("roughness", [0.1, 1.0])
-def test_integrals_of_a_constant_light_are_the_table(roughness: float) -> None:
-    """∫ (1 - Fc) f cosθ and ∫ Fc f cosθ against float64 quadrature, and their noise says how far."""
-    scene, points = sphere(8, "constant")
-    α = dr.opaque(mi.Float, roughness**2)
-    found = mc.integrate(lambda p: mc.brdf_lobe(p, α), points, scene.environment(), samples=1597)
-    wanted = np.array([split_sum_entry(float(c), roughness) for c in points.n_dot_v()])
-    for k, batches in enumerate(found):
-        estimate = mc.estimate(batches)
-        error = np.abs(estimate.mean[:, 0] - wanted[:, k])
-        assert (error < 6 * estimate.error[:, 0] + 1e-4).all() and error.max() < 2e-3
 
 
 def test_budget_recovers_known_parts() -> None:

@@ -3,18 +3,15 @@
 from dataclasses import replace
 from typing import Any
 
-import mitsuba as mi
-import numpy as np
 import pytest
 
 from benchmarks.common.errors import compare
 from benchmarks.common.montecarlo import estimate
 from benchmarks.common.report import where
-from benchmarks.visibility import cases, harmonics
+from benchmarks.visibility import cases
 from benchmarks.visibility.__main__ import HARMONICS, tradeoffs
 from benchmarks.visibility.cases import SMALL, Rule
 from benchmarks.visibility.setup import Setup
-from mi_refgs.shade.sh import sh_basis
 
 BENCHMARK = "visibility"
 SCENES = ("bowl", "plates")
@@ -60,19 +57,3 @@ def test_setting_is_chosen_on_other_scenes_within_budget() -> None:
     assert (found["scene"], found["method"]) == ("here", "steady")
     assert found["gain"] == pytest.approx(2) and found["price"] == pytest.approx(2)
     assert found["best_gain"] == pytest.approx(4) and found["mirror_relmse"] == 1
-
-
-def test_sh_radiance_is_recovered(rng: np.random.Generator) -> None:
-    """From blocked directions alone: values in free ones are not used."""
-    d = rng.normal(size=(5 * 4000, 3))
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    columns = sh_basis(mi.Vector3f(np.ascontiguousarray(d.T, np.float32)), harmonics.DEGREE)
-    values = [np.broadcast_to(np.array(y, np.float64), len(d)) for y in columns]
-    basis = np.stack(values, -1).reshape(5, 4000, -1)
-    wanted = rng.normal(size=(5, basis.shape[-1], 3)) * 0.1
-    wanted[:, 0] = 5
-    blocked = d[:, 0].reshape(5, 4000) < 0.6
-    radiance = np.where(blocked[..., None], basis @ wanted, 1e3)
-    found = basis @ harmonics.solve([harmonics.sums(basis, radiance, blocked)])
-    truth = basis @ wanted
-    assert np.sqrt(np.mean((found - truth)[blocked] ** 2)) < 0.01 * truth.mean()

@@ -165,13 +165,6 @@ def test_components_and_masks(rng: np.random.Generator) -> None:
         assert dr.all(none == 0, axis=None)
 
 
-def test_a_blend_has_the_mean_of_its_parts() -> None:
-    parts = {"type": "diffuse"}, bsdf(0.8)
-    blend = {"type": "blendbsdf", "weight": 0.4, "a": parts[0], "b": parts[1]}
-    found, diffuse, own = (np.ravel(mean_weight(mi.load_dict(of), seen_at(0.9))) for of in (blend, *parts))
-    np.testing.assert_allclose(found, 0.6 * diffuse + 0.4 * own, rtol=2e-3)
-
-
 def test_reflects_on_one_side_unless_wrapped() -> None:
     front, back = np.array([0.6, 0, 0.8]), np.array([0.6, 0, -0.8])
     one = mi.load_dict(bsdf())

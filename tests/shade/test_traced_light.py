@@ -46,6 +46,25 @@ def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
     np.testing.assert_allclose(np.linalg.norm(rows[:, 5:], axis=1), 1, rtol=1e-5)
 
 
+def test_normals_at_vertices_vary_over_the_surfels() -> None:
+    """Discs on a sphere with its curvature, and one across: the sphere's normals between them, where means of
+    the discs' own are off."""
+    around = [[0.3 * np.cos(a), 0.3 * np.sin(a), 1] for a in range(12)]
+    towards = unit(np.array([[0, 0, 1], [0, 0, 1], *around]))
+    quaternion = np.stack([-towards[:, 1], towards[:, 0], 0 * towards[:, 0], 1 + towards[:, 2]], 1)
+    quaternion[0] = [1, 0, 0, 1]  # across
+    curved = {"rotation": quaternion, "curvature": np.tile([1.0, 0, 1.0], (14, 1)), "opacity": np.zeros(14)}
+    surfels = Surfels.from_numpy(discs(position=towards, scale=np.full((14, 2), np.log(0.3)), **curved))
+    ring = [[0.15 * np.cos(a), 0.15 * np.sin(a), 1] for a in np.linspace(0, 6, 20)]
+    vertices = unit(np.array([[0, 0, 1], *ring, [0, 0, -1]]))
+    faces = np.array([[0, k, k + 1] for k in range(1, 20)], np.uint32)
+    mesh = Mesh(vertices.astype(np.float32), faces, 0.1)
+    made = scenes.with_materials(mesh, surfels).vertex_surfels
+    assert made is not None
+    found = made.normals(surfels).numpy().T[:21]
+    assert np.degrees(np.arccos(np.sum(found * vertices[:21], axis=1))).max() < 2.5
+
+
 def test_misuse_is_refused() -> None:
     occluder, surfels = Occluder(scenes.corner()), scenes.wall_surfels()
     refused(lambda: occluder.surface(surfels), "none are set")
@@ -153,13 +172,17 @@ def test_bounces_of_rays_of_the_lobe_against_the_oracle(rays: int) -> None:
         ("roughness", 5),
         ("albedo", 1),
         ("radiance_sh", 1),
+        ("rotation", 1),
+        ("normal", 1),
+        slow("rotation", 5),
         slow("metallic", 5),
         slow("light", 1),
     ],
 )
 def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two bounces, both modes against central differences of the indirect radiance, with random weights and
-    steps; what is held back of bright rays stays as it was, as the derivative has it."""
+    """Bounces, both modes against central differences of the indirect radiance, with random weights and
+    steps; "normal" is that of the points, "rotation" that of the hits. What is held back of bright rays stays
+    as it was, as the derivative has it."""
     rng = np.random.default_rng(8)
     place, points = scenes.floor_points(0.4, count=60, eye=scenes.LOW_EYE)
     surfels = harmonic_channel_surfels(rng.normal(size=(400, 3)), 0.1)
@@ -167,15 +190,20 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
     sky = scenes.gradient_sky()
     sky[1:4, 4:7] += 20.0  # a lamp
     leaves = surfels.raw | {"light": EnvironmentLight.from_radiance(sky).raw}
-    options = ShadingOptions(visibility_rays=rays, traced_bounces=2)
+    leaves |= {"normal": mi.TensorXf(points.normal.numpy().T.copy())}
+    bounces = 1 if name in ("normal", "rotation") else 2  # their derivatives end at the first hit
+    options = ShadingOptions(visibility_rays=rays, traced_bounces=bounces)
     diffuse = "sh" if name == "radiance_sh" else "irradiance"
     weight = vector(rng.normal(size=(len(place), 3)))
 
     def indirect(value: Any) -> Any:
         changed = leaves | {name: value}
         light = EnvironmentLight(changed.pop("light")).prefilter()
+        turned = ShadingPoints(
+            dr.unravel(mi.Vector3f, changed.pop("normal").array), points.view, points.attributes
+        )
         made = Surfels(changed)
-        return scenes.seen(points, place, options, made, light, diffuse, occluder, scenes.LOW_EYE).indirect
+        return scenes.seen(turned, place, options, made, light, diffuse, occluder, scenes.LOW_EYE).indirect
 
     kept: list[Any] = []
     held_back = reflection._firefly_clamp
@@ -191,8 +219,15 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
 
     base = leaves[name].numpy().copy()
     step = rng.normal(size=base.shape).astype(np.float32)
-    ends = [indirect(mi.TensorXf(base + t * step)).numpy().astype(np.float64) for t in (-0.01, 0.01)]
-    difference = np.sum((ends[1] - ends[0]) * weight.numpy()) / 0.02
+    size = 1e-3 if bounces == 1 else 1e-2  # few rays then leave their triangles
+    low, middle, high = (
+        indirect(mi.TensorXf(base + t * step)).numpy().astype(np.float64) for t in (-size, 0, size)
+    )
+    bend = np.linalg.norm(high - 2 * middle + low, axis=0)
+    kept_rays = bend < 0.05 * np.linalg.norm(high - low, axis=0) + 1e-6
+    assert kept_rays.mean() > 0.7
+    weight *= mi.Float(kept_rays.astype(np.float32))
+    difference = np.sum((high - low) * weight.numpy()) / (2 * size)
     assert abs(difference) > 1e-3
     assert rays == 1 or 0 < (kept[0].numpy() < 0.9).mean() < 0.5
 
@@ -206,7 +241,8 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
     assert abs(forward - difference) < 5e-3 * scale
 
 
-def test_rays_and_geometry_are_detached() -> None:
+def test_places_are_detached() -> None:
+    """Of hits, and of several rays the directions; visibility."""
     place, points = scenes.floor_points(0.4)
     surfels, light = scenes.wall_surfels(), EnvironmentLight.from_radiance(scenes.gradient_sky()).prefilter()
     occluder = scenes.with_materials(scenes.corner(), surfels)
@@ -217,9 +253,11 @@ def test_rays_and_geometry_are_detached() -> None:
         found = scenes.seen(points, place, options, surfels, light, occluder=occluder)
         assert not dr.grad_enabled(found.visibility)
         dr.backward(dr.sum(found.indirect.x))
-        assert dr.all(dr.grad(points.roughness) == 0) and dr.all(dr.grad(points.normal) == 0, axis=None)
+        assert dr.all(dr.grad(points.roughness) == 0) and dr.all(dr.grad(points.view) == 0, axis=None)
+        assert dr.all(dr.grad(points.normal) == 0, axis=None) == (rays > 1)
         assert dr.all(dr.grad(surfels.raw["position"]).array == 0)
         assert not dr.all(dr.grad(surfels.raw["roughness"]).array == 0)
+        dr.set_grad(points.normal, 0)
 
 
 def test_degenerate_pixels_stay_finite() -> None:
