@@ -34,6 +34,7 @@ def turned(scene: TrainedScene) -> TrainedScene:
 
 SPOILT: dict[tuple[str, ...], Callable[[TrainedScene], TrainedScene]] = {
     ("normals",): changed("rotation", 0.2),
+    ("materials",): changed("albedo", 2),
     ("materials", "hit materials"): changed("albedo", 2),
     ("light",): lambda scene: replace(scene, light=EnvironmentLight.constant(1, 32)),
     ("mesh",): turned,

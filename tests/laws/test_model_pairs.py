@@ -179,10 +179,8 @@ def test_a_comparison_takes_it_along(place: Path, tmp_path: Path, monkeypatch: p
     forget(*NEEDED, *FIT_ONLY)
 
 
-COMMAND_LINES = """
-    render -o x.exr, relight --envmap {light}, eval, edit -o x --set coat=0, export -o x, view,
-    train --resume
-"""
+COMMAND_LINES = """render -o x.exr, relight --envmap {light}, eval, edit -o x --set coat=0,
+    export -o x, view, train --resume"""
 
 
 @pytest.mark.parametrize("command", COMMAND_LINES.split(","))
