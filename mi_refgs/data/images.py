@@ -6,6 +6,7 @@ import math
 import os
 import re
 import threading
+import unicodedata
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -220,10 +221,13 @@ def image_files(folder: Path, deep: bool) -> list[Path]:
 def find_image(folders: Sequence[Path], name: str, tell: Callable[[str, str, object], None]) -> Path | None:
     """The file in one of `folders` that another program calls `name`, whatever its ending; of an absolute
     name, or one in FOLDERS, that of its last parts, of which `tell`, such as `ReadOptions.say`, is told."""
-    parts = os.path.normpath(name.replace("\\", "/")).split("/")
+    path = os.path.normpath(name.replace("\\", "/"))
+    written = dict.fromkeys((path, *(unicodedata.normalize(form, path) for form in ("NFC", "NFD"))))
+    parts = path.split("/")
     away = parts[0] in ("", os.pardir) or parts[0].endswith(":")
     starts = range(len(parts)) if away else range(1 + (parts[0] in FOLDERS))
-    for start, folder in product(starts, folders):
+    for text, start, folder in product(written, starts, folders):
+        parts = text.split("/")
         if parts[start:] and parts[start] not in ("", os.curdir, os.pardir):
             file = folder.joinpath(*parts[start:])
             found = file if is_file(file) else io.with_ending(file)

@@ -70,10 +70,11 @@ def load(
         table["surfels"] |= {"count": round(START_FRACTION * most), "max_count": most}
     if method.surroundings is not None:
         table["surroundings"]["count"] = max(round(method.surroundings.start * chosen.surfels), 1)
-    for assignment in assignments or []:
+    assignments = [_placed(assignment) for assignment in assignments or ()]
+    for assignment in assignments:
         _assign(table, assignment)
     file = str(path.resolve()) if name.endswith(".toml") else name
-    table |= {"name": path.stem, "file": file, "preset": preset, "assignments": [*(assignments or [])]}
+    table |= {"name": path.stem, "file": file, "preset": preset, "assignments": assignments}
     return _built(table, "--set" if assignments else path)
 
 
@@ -226,15 +227,28 @@ def _inline(value: object) -> str:
     return tomli_w.dumps({"_": value})[len("_ = ") : -1]
 
 
+def _placed(assignment: str) -> str:
+    """The assignment with the path of a light from the root: a run is read from anywhere."""
+    key, _, text = assignment.partition("=")
+    if key.strip() != "light.file":
+        return assignment
+    return f"{key}={_inline(str(Path(_value(text)).absolute()))}"
+
+
+def _value(text: str) -> Any:
+    """What TOML makes of a text, or the text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text
+
+
 def _assign(table: dict[str, Any], assignment: str) -> None:
     """Apply `key=value`; `event.NAME=false` removes an event."""
     key, separator, text = assignment.partition("=")
     if not separator:
         raise InputError("expected key=value, such as loss.ssim=0.1", "--set", assignment)
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        value = text
+    value = _value(text)
     *parents, last = key.strip().split(".")
     if parents == ["loss"] and _is_number(value):  # its weight; the rest of its table stays
         parents, last = ["loss", last], "weight"

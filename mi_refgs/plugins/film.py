@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.errors import InputError
+from mi_refgs.errors import InputError, require_between
 from mi_refgs.kernels.device import children_of
 from mi_refgs.kernels.memory import DERIVATIVE_SAMPLES, require_image
 from mi_refgs.plugins.aovs import aov_values
@@ -84,7 +84,8 @@ class FilmImage:
 
     @property
     def _samples(self) -> int:
-        return max(1, int(self.spp) or int(self.sensor.sampler().sample_count()))
+        require_between(int(self.spp), "spp", 0)
+        return int(self.spp) or max(1, int(self.sensor.sampler().sample_count()))
 
     @property
     def _sensors(self) -> list[Any]:

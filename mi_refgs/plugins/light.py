@@ -156,8 +156,10 @@ def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
 
 
 def _constant_radiance(params: Any, emitter: Any) -> Any:
-    if emitter.class_name() != "ConstantBackgroundEmitter" or "radiance.value" not in params:
+    if emitter.class_name() != "ConstantBackgroundEmitter":
         what = f"emitter '{emitter.id()}': type: refgs takes no {emitter.class_name()}"
         raise InputError(what, remedy="use an `envmap` or a `constant` environment")
+    if "radiance.value" not in params:
+        raise InputError(f"emitter '{emitter.id()}': radiance: no colour", remedy="give an `rgb`")
     colour = mi.Color3f(params["radiance.value"])
     return bounded(colour, colour)

@@ -21,8 +21,7 @@ from mi_refgs.splat import Composited, Footprints
 from tests.helpers import refused
 from tests.scenes.tiny import SETTINGS
 
-PAUSE = 0.25
-"""Seconds that a planted sleep takes: far more than any phase of the tiny scene, on a busy machine too."""
+PAUSE = 0.25  # seconds that a planted sleep takes: far more than any phase, on a busy machine too
 
 
 @pytest.fixture(scope="module")

@@ -150,6 +150,8 @@ def test_what_no_light_can_be(tmp_path: Path) -> None:
     data, learns = write_data(tmp_path / "data"), ["light.kind=file", "light.file=a", "light.learn=['scale']"]
     refused(lambda: methods.load("ref_gaussian", "quick", learns), "add fixed = true")
     refused(lambda: methods.load("ref_gaussian", "quick", learns[:1]), "light: file: none is named")
+    made = methods.load("ref_gaussian", "quick", [*learns[:2], "light.fixed=true"])
+    assert made.assignments[1] == f'light.file="{Path.cwd() / "a"}"'  # commands run elsewhere, too
     command = ["train", str(data), "-o", str(tmp_path / "run"), "--method", "base_2dgs"]
     refused([*command, "--light", str(data / "environment.exr")], "light: no stage uses it")
     refused([*command, "--light-fixed"], "--light-fixed: no map is given; give its file as --light")

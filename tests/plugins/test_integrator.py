@@ -128,6 +128,7 @@ def test_recording_by_dr_freeze_is_refused() -> None:
         ({"mesh": "nowhere.ply"}, "nowhere.ply: mesh: no such file"),
         ({"mesh": "nowhere.ply", "shade_at": "surfel"}, "occlusion: needs shading at pixel"),
         ({"light": {"type": "point"}}, "takes no PointLight"),
+        ({"light": {"type": "constant", "radiance": {"type": "blackbody", "temperature": 5e3}}}, "no colour"),
         ({"ball": {"type": "sphere"}}, "ball: refgs takes no Shape"),
     ],
 )
