@@ -220,9 +220,8 @@ def test_derivatives_of_traced_light(name: str, rays: int, monkeypatch: pytest.M
     base = leaves[name].numpy().copy()
     step = rng.normal(size=base.shape).astype(np.float32)
     size = 1e-3 if bounces == 1 else 1e-2  # few rays then leave their triangles
-    low, middle, high = (
-        indirect(mi.TensorXf(base + t * step)).numpy().astype(np.float64) for t in (-size, 0, size)
-    )
+    moved = (mi.TensorXf(base + t * step) for t in (-size, 0, size))
+    low, middle, high = (indirect(x).numpy().astype(np.float64) for x in moved)
     bend = np.linalg.norm(high - 2 * middle + low, axis=0)
     kept_rays = bend < 0.05 * np.linalg.norm(high - low, axis=0) + 1e-6
     assert kept_rays.mean() > 0.7
