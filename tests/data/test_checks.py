@@ -155,8 +155,8 @@ def test_constant_background_becomes_masks(tmp_path: Path, capsys: pytest.Captur
     refused(["doctor", data, "--masks"], "--masks")
     known = digests(read_dataset(data, "train"))
     file = next(data.glob("masks/train/*.png"))
-    write_png(file, 1 - read_png(file))
-    assert len(changed(read_dataset(data, "train"), known)) == 1  # the file may be as long as before
+    file.write_bytes(file.read_bytes()[:-1] + b"\0")  # as long as before
+    assert len(changed(read_dataset(data, "train"), known)) == 1
 
 
 def test_masks_are_written_where_they_are_read(tmp_path: Path) -> None:
