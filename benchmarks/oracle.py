@@ -295,7 +295,7 @@ def measured(run: Run, settings: Settings, quiet: bool) -> tuple[list[Row], dict
                 budget.add(image, view, of)
             psnr = np.mean([metrics.psnr(image.image, of) for image, of in zip(images, targets, strict=True)])
             squared = 1e5 * budget.sums[1] / (3 * budget.sums[0].sum())
-            row = {"run": run.path.name, "scene": truth.name, "case": name, "samples": count}
+            row = {"scene": truth.name, "case": name, "samples": count}
             row |= {"psnr": float(psnr)} | dict(zip(CLASSES, map(float, squared), strict=True))
             rows.append(row)
             if not quiet:
@@ -314,7 +314,8 @@ def measure(settings: Settings, quiet: bool) -> dict[str, Any]:
     spectra = {}
     for run in settings.runs:
         try:
-            own, spectra[Path(run).name] = measured(Run(run), settings, quiet)
+            own, found = measured(Run(run), settings, quiet)
+            spectra[own[0]["scene"]] = found
             rows += own
         except InputError as error:
             print(f"{run}: left out: {error}", file=sys.stderr)

@@ -439,8 +439,7 @@ def oracle(result: Result) -> Values:
     def angles(spectrum: dict[str, float]) -> str:
         return ", ".join(f"{angle:.1f}°" for angle in spectrum.values())
 
-    runs = dict(zip(scenes, result["spectra"].values(), strict=True))
-    spectra = {f"{scene}_spectrum": angles(spectrum) for scene, spectrum in runs.items()}
+    spectra = {f"{scene}_spectrum": angles(spectrum) for scene, spectrum in result["spectra"].items()}
     return spectra | {"table": table(["", *(f"`{scene}`" for scene in scenes)], map(line, cases))}
 
 
