@@ -156,9 +156,10 @@ class TrueHits:
 
 
 def _replaced(values: dict[str, Any], materials: Materials) -> dict[str, Any]:
-    """The materials among values, true where they are known."""
+    """The materials among values, true where they are known, and nothing that was fitted beside them."""
     true = materials._asdict()
-    return {name: dr.select(true[name][1], true[name][0], values[name]) for name in true if name in values}
+    found = {name: dr.select(true[name][1], true[name][0], values[name]) for name in true if name in values}
+    return found | ({"residual": mi.Color3f(0)} if "residual" in values else {})
 
 
 class TrueOccluder(Occluder):
