@@ -4,18 +4,19 @@ Wall time and kernel launches by phase, between barriers. The clock listens to t
 `mi_refgs.kernels.timing`. The backward pass is one call of Dr.Jit: identities at the boundaries between
 phases notify the clock of the phase that the pass has reached. Nothing is written."""
 
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import cycle
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.common.report import plain_parser
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
@@ -136,5 +137,7 @@ def table(run: Run, steps: int = 15) -> str:
 
 
 if __name__ == "__main__":
+    parser = plain_parser("profile", __doc__)
+    parser.add_argument("run", type=Path, help="run folder with a checkpoint")
     mi.set_variant("llvm_ad_rgb")
-    print(table(Run(sys.argv[1])))
+    print(table(Run(parser.parse_args().run)))
