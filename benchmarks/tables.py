@@ -296,7 +296,7 @@ def _budget(result: Result, lights: list[str]) -> str:
     for light in lights:
         for row in where(budgets, light=light, metallic=metallic, roughness=shown):
             if row["total"] >= row["floor"]:
-                parts = [f"{100 * part['share']:.0f}" for part in row["parts"]]
+                parts = [str(round(100 * part["share"])) for part in row["parts"]]
                 lines.append([f"`{light}`, r = {row['roughness']:g}", *parts, number(row["total"], 2)])
     return table(["case, parts in percent", *names, "relMSE"], lines)
 
