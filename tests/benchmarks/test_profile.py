@@ -86,10 +86,8 @@ def test_hooks_enclose_the_phases_of_their_names(trainer: Trainer) -> None:
 
 
 def test_hooks_do_nothing_unless_somebody_listens() -> None:
-    value = [object()]
-    assert timing.boundary(value, "sort") is value
-    twice = timing.phase("sort")(lambda x: 2 * x)
-    assert twice(3) == 6
+    value, twice = [object()], timing.phase("sort")(lambda x: 2 * x)
+    assert timing.boundary(value, "sort") is value and twice(3) == 6
     notes = Notes()
     with timing.listening(notes):
         assert twice(3) == 6 and timing.boundary(value, "project") is value

@@ -153,8 +153,7 @@ def test_constant_background_becomes_masks(tmp_path: Path, capsys: pytest.Captur
         mask = view.load().alpha
         assert (mask <= alpha).all() and mask.sum() > 0.6 * alpha.sum()  # type: ignore[union-attr, operator]
     refused(["doctor", data, "--masks"], "--masks")
-    known = digests(read_dataset(data, "train"))
-    file = next(data.glob("masks/train/*.png"))
+    known, file = digests(read_dataset(data, "train")), next(data.glob("masks/train/*.png"))
     file.write_bytes(file.read_bytes()[:-1] + b"\0")  # as long as before
     assert len(changed(read_dataset(data, "train"), known)) == 1
 

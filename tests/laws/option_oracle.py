@@ -93,8 +93,12 @@ class Oracle:
         if chosen.occlusion and chosen.model.visibility == "mirror":
             scene = replace(scene, visibility=self._visibility)
         found = image.render(scene)
-        visible = np.ones(len(self.pixels)) if self.visible is None else self.visible
-        return found.maps | {"visibility": visible[:, None]}, found.band
+        visible = np.ones((len(self.pixels), 1)) if self.visible is None else self.visible[:, None]
+        if self.options.free is not None:  # the mean over directions, blended as a material is
+            share = np.clip(self.options.free.mean(1, keepdims=True), 1e-15, 1 - 1e-15)
+            marked = own | {"roughness": np.log(share / (1 - share))}
+            visible = image.render(replace(scene, raw=marked, terms=False)).maps["roughness"]
+        return found.maps | {"visibility": visible}, found.band
 
     def _visibility(self, normal: Array, ray: Array) -> Array:
         """Visibility (P,) of the mirror direction, that of the first image."""

@@ -59,8 +59,7 @@ def test_normals_at_vertices_vary_over_the_surfels() -> None:
     vertices = unit(np.array([[0, 0, 1], *ring, [0, 0, -1]]))
     faces = np.array([[0, k, k + 1] for k in range(1, 20)], np.uint32)
     mesh = Mesh(vertices.astype(np.float32), faces, 0.1)
-    made = scenes.with_materials(mesh, surfels).vertex_surfels
-    assert made is not None
+    made: Any = scenes.with_materials(mesh, surfels).vertex_surfels
     found = made.normals(surfels).numpy().T[:21]
     assert np.degrees(np.arccos(np.sum(found * vertices[:21], axis=1))).max() < 2.5
 
