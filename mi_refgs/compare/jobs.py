@@ -172,7 +172,7 @@ def require_same(job: Job) -> None:
         raise InputError(what, f"{job.folder}/dataset.json", "DATA", remedy)
     if other := changed(read_views(job.method(), data, "train", truth=False), job.run.images()):
         what = f"{len(other)} images or cameras are not as when {job.folder} began"
-        raise InputError(what, job.data, other[0], f"restore them, {remedy[0].lower()}{remedy[1:]}")
+        raise InputError(what, job.data, other[0], f"restore them, {remedy}")
 
 
 def finished(job: Job) -> bool:

@@ -175,13 +175,13 @@ def _frames(folder: Path, split: str) -> list[Frame]:
 
 def _split_names(frames: list[Frame], split: str) -> set[str] | None:
     """The file paths of the frames of a split; None where the file lists no test images."""
-    lists = {}
+    lists, every = {}, {os.path.normpath(frame.name) for frame in frames}
     for key in ("train", "val", "test"):
         names = frames[0].given.get(f"{key}_filenames") or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError("not a list of paths", frames[0].file, f"{key}_filenames", "correct it")
         lists[key] = {*map(os.path.normpath, names)}
-        if lost := sorted(lists[key] - {os.path.normpath(frame.name) for frame in frames}):
+        if lost := sorted(lists[key] - every):
             what = f"{counted(len(lost), 'path')} of no frame, such as {abbreviated(lost[0])}"
             raise InputError(what, frames[0].file, f"{key}_filenames", "write them as `file_path` does")
     test = lists["test"] or lists["val"]
@@ -189,7 +189,7 @@ def _split_names(frames: list[Frame], split: str) -> set[str] | None:
         return {*held_out(sorted(lists["train"]), split)} or None
     if split == "test":
         return test
-    return lists["train"] or {os.path.normpath(frame.name) for frame in frames} - test - lists["val"]
+    return lists["train"] or every - test - lists["val"]
 
 
 def read_points(path: Path) -> PointCloud | None:

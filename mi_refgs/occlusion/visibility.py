@@ -124,6 +124,7 @@ class Occluder:
         if normal is not None:
             n, has_normal = _unit(mi.Vector3f(normal))
             cosine = dr.dot(n, d)
+            # The floor keeps the reciprocal finite; ALONG cuts it long before.
             along = dr.select(cosine > 0, offset * dr.minimum(dr.rcp(dr.maximum(cosine, 1e-3)), ALONG), 0)
             start = dr.select(has_normal, along * d + (offset - along * cosine) * n, start)
         o = mi.Vector3f(origin) + start

@@ -8,6 +8,7 @@ import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -79,12 +80,19 @@ def views_of_run(
     return with_region(views, run.region())
 
 
+@lru_cache(maxsize=1 << 14)
+def _checksum(path: Path, size: int, modified: int) -> int:
+    """Of a file of this size and time of change, read once in a process."""
+    return zlib.crc32(path.read_bytes())
+
+
 def digests(views: Dataset) -> dict[str, str]:
     """A digest of the camera, the files of image and mask and the presence of alpha of each view, by name."""
     found = {}
     for view in views.views:
         paths = [one.path for one in (view.file, view.file and view.file.mask) if one and one.path.is_file()]
-        files = [zlib.crc32(path.read_bytes()) for path in paths]
+        stats = ((path, path.stat()) for path in paths)
+        files = [_checksum(path, stat.st_size, stat.st_mtime_ns) for path, stat in stats]
         camera = np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 5)
         text = repr((files, view.has_alpha, view.width, view.height, (camera + 0.0).tolist()))
         found[view.name] = hashlib.sha256(text.encode()).hexdigest()[:16]
