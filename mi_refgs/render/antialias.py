@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterable
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.render.stencil import neighbours
+from mi_refgs.render.stencil import ChosenPixels, neighbours
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.splat import Camera
-from mi_refgs.splat.lanes import CompactedPixels
 from mi_refgs.types import Float, UInt32, Vector3f
 
 NODE = 0.5 / math.sqrt(3)  # pixels from the centre, per axis: Gauss-Legendre, exact for cubic radiance
@@ -23,7 +22,7 @@ def averaged(
     shade: Callable[[ShadingPoints], RadianceTerms],
     points: ShadingPoints,  # (P,) at the pixels' centres, with the normals as they were blended
     camera: Camera,
-    pixels: CompactedPixels | None,  # those of the P; None: all, in raster order
+    pixels: ChosenPixels | None,  # those of the P; None: all, in raster order
     trace: Trace | None = None,
 ) -> RadianceTerms:
     """Mean over each pixel of the radiance at NODES, under AD. Normals and visibility are interpolated, or
@@ -74,7 +73,7 @@ def _traced(nodes: list[ShadingPoints], trace: Trace, chosen: UInt32) -> list[Sh
     return nodes
 
 
-def _interpolated(plane: Float, camera: Camera, pixels: CompactedPixels | None) -> list[Float]:
+def _interpolated(plane: Float, camera: Camera, pixels: ChosenPixels | None) -> list[Float]:
     """Values (P,) at each of NODES of a plane (P,) given at pixel centres."""
     at = dict(zip(STEPS, neighbours(plane, camera.width, camera.height, STEPS, pixels), strict=True))
     side, corner = NODE * (1 - NODE), NODE**2

@@ -7,9 +7,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refgs.kernels.linear import linear
 from mi_refgs.kernels.rows import joined
+from mi_refgs.render.stencil import ChosenPixels
 from mi_refgs.splat.composite import Composited, inverse_alpha
-from mi_refgs.types import Array, Float
+from mi_refgs.types import Array, Arrays, Float
 
 OBJECT = "object"  # slot of the object's opacity; where it is blended, slots are divided by it
 SURROUNDINGS = "surroundings"  # slot of the radiance of the surroundings
@@ -19,15 +21,33 @@ Slots = Mapping[str, Any]  # values by name, such as mi.Color3f; each costs time
 class GBuffer:
     """Blended slots of a view, in raster order or in that of `pixels`. A slot that nobody needs is absent."""
 
-    def __init__(self, blended: Composited, kinds: Slots, attribution: int | None = None) -> None:
+    def __init__(
+        self,
+        blended: Composited,
+        kinds: Slots,
+        attribution: int | None = None,
+        pixels: ChosenPixels | None = None,
+    ) -> None:
         """`blended` has the `features` of slots like `kinds`, and at `attribution` that of errors."""
-        self.alpha, self.pixels, maps = blended.alpha, blended.pixels, [*blended.features]
+        self.blended, self.alpha, self.pixels, maps = blended, blended.alpha, pixels, [*blended.features]
         self.attribution = None if attribution is None else maps.pop(attribution)
         self.slots = _grouped(kinds, maps)  # premultiplied by alpha
-        inverse = inverse_alpha(blended.alpha)
-        self.depth = None if blended.depth is None else blended.depth * inverse  # of the camera's z
-        # 1/alpha, or 1/opacity of the object, where that is seen, else 0.
-        self.inverse = inverse_alpha(self.slots[OBJECT]) if OBJECT in self.slots else inverse
+        self.opacity = self.slots.get(OBJECT, self.alpha)  # of the object
+        self.inverse = inverse_alpha(self.opacity)
+        self.depth = blended.expected_depth  # of the camera's z
+
+    def of_object(self) -> "GBuffer":
+        """The slots of the pixels that show the object, under AD; those of all, if none does."""
+        raster = dr.compress(dr.detach(self.opacity) > 0)
+        if not dr.width(raster):
+            return self
+        pixels, blended = ChosenPixels(raster, dr.width(self.alpha)), self.blended
+        planes = linear((features(self.slots), blended.depth, self.alpha), pixels.of, pixels.placed)
+        return GBuffer(Composited(*planes), self.slots, pixels=pixels)
+
+    def placed(self, values: Arrays) -> Arrays:
+        """Values of the pixels of `of_object` in raster order, under AD, 0 elsewhere."""
+        return values if self.pixels is None else linear(values, self.pixels.placed, self.pixels.of)
 
     def divided(self, name: str) -> Any:
         """A slot divided by alpha or the object's opacity: the mean of what is seen, 0 where nothing is."""

@@ -27,8 +27,7 @@ from mi_refgs.shade.light.near_field import LocalLight, NearField
 from mi_refgs.shade.points import TERMS, RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance import SurfelView, TraceContext
 from mi_refgs.shade.shading import Shading, shade, trace
-from mi_refgs.splat import Camera, list_by_tile, project, splat
-from mi_refgs.splat.composite import composite_compact
+from mi_refgs.splat import Camera, splat
 from mi_refgs.surfels.attributes import attribute
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
@@ -73,7 +72,7 @@ class Request:
     """Requested outputs of a render, and how they are computed."""
 
     aovs: Collection[str] = ()  # materials, terms of the radiance, "visibility", "normal", "depth", by name
-    forward_only: bool = False  # without derivatives: faster, equal to rounding
+    forward_only: bool = False  # for images without derivatives: frames have what was asked for only
     sh_degree: int | None = None  # highest SH degree of the radiance, for coarse-to-fine schedules
     attribution: Float | None = None  # (N,) zeros, which get Σ w δ for adjoints δ of the frame's
 
@@ -127,9 +126,10 @@ def render(scene: SurfelScene, camera: Camera, request: Request = RADIANCE) -> F
     if around is not None:
         around = replace(around, surfels=around.surfels.never_empty())
     scene = replace(scene.lit_for(camera), surfels=scene.surfels.never_empty(), surroundings=around)
-    view = _View(scene, request, camera)
-    frame = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
-    return boundary(frame, "shade backward")
+    with dr.suspend_grad(when=request.forward_only):
+        view = _View(scene, request, camera)
+        frame = _shade_at_surfels(view) if scene.shading.shaded_at == "surfel" else _shade_at_pixels(view)
+        return boundary(frame, "shade backward")
 
 
 def render_depth(surfels: Surfels, camera: Camera, around: Surfels | None = None) -> tuple[Float, Float]:
@@ -173,15 +173,10 @@ class _View:
             slots = joined_slots(slots, first | others, (own, beside))  # begin with those of the surroundings
             turns = joined_slots(turns, {}, (own, beside))
         values = features(slots)
-        if self.request.forward_only:
-            depth = "depth" in self.asked or self.scene.near is not None
-            lists = list_by_tile(project(self.geometry, self.camera), self.camera, values, features(turns))
-            blended = composite_compact(lists, depth)
-        else:
-            if self.request.attribution is not None:
-                values.insert(few, self.request.attribution)
-                place = few
-            blended = splat(self.geometry, values, self.camera, features(turns), few + (place is not None))
+        if self.request.attribution is not None:
+            values.insert(few, self.request.attribution)
+            place = few
+        blended = splat(self.geometry, values, self.camera, features(turns), few + (place is not None))
         return GBuffer(blended, slots, place)
 
     def frame(self, buffer: GBuffer, **fields: Any) -> Frame:
@@ -189,7 +184,6 @@ class _View:
         frame = Frame(buffer.alpha, buffer.depth, attribution=buffer.attribution, **fields)
         if self.request.forward_only:
             frame = frame.only(self.request.aovs)
-            frame = frame if buffer.pixels is None else buffer.pixels.to_raster(frame)
         return replace(frame, background=self.background)
 
 
@@ -248,31 +242,28 @@ def _shade_at_pixels(view: _View) -> Frame:
     others = {SURROUNDINGS: view.others["radiance"]} if view.others else {}
     turns = scene.surfels.primitive.turns(scene.surfels, view.points.normal)
     buffer = view.blend(slots | view.presence, others, turns)
-    values = {name: buffer.divided(name) for name in slots if name != "normal"}
-    normal, alpha = buffer.slots["normal"], buffer.slots.get(OBJECT, buffer.alpha)
 
-    # Points to shade.
-    pixel = None if buffer.pixels is None else buffer.pixels.raster
+    # Points to shade: the background has no materials.
+    shown = buffer.of_object()
+    pixel = None if shown.pixels is None else shown.pixels.raster
     ray, index = camera.rays(pixel), camera.image_index(pixel)
-    attributes = {name: values[name] for name in view.points.attributes}
-    points = ShadingPoints(normal, -dr.normalize(ray), attributes)
-    maps = {name: values[name] for name in scene.surfels.raw if name in values}
+    attributes = {name: shown.divided(name) for name in view.points.attributes}
+    points = ShadingPoints(shown.slots["normal"], -dr.normalize(ray), attributes)
+    maps = {name: buffer.divided(name) for name in scene.surfels.raw if name in slots and name != "normal"}
 
     # Visibility along the mirror direction, where there is something to reflect.
     at_nodes = shading.antialias and shading.traced_bounces > 0
     unshaded = at_nodes and shading.model.visibility == "mirror"  # of the centre, visibility is enough
     if shading.occlusion:
         assert scene.occluder is not None  # by `Shading.require_inputs`
-        covered = dr.detach(alpha) > COVERAGE_FLOOR
+        covered = dr.detach(shown.opacity) > COVERAGE_FLOOR
         context = TraceContext(scene.occluder, scene.surfels, scene.light, camera.origin, ray, covered, index)
         points = trace(points, context, replace(shading, traced_bounces=0) if unshaded else shading)
-        if (seen := points.get("visibility")) is not None:  # a model may trace its own rays
-            maps["visibility"] = seen
 
     # Radiance, premultiplied.
     light = scene.light
     if scene.near is not None:
-        light = scene.light_at(camera.along(ray, buffer.depth))
+        light = scene.light_at(camera.along(ray, shown.depth))
     shaded_at = partial(shade, light=light, shading=shading)
     if shading.antialias:
 
@@ -280,9 +271,13 @@ def _shade_at_pixels(view: _View) -> Frame:
             place = of if index is None else dr.gather(mi.UInt32, index, of)
             return trace(at, replace(context, ray=-at.view, covered=True, pixel=place), shading)
 
-        shaded = averaged(shaded_at, points, camera, buffer.pixels, again if at_nodes else None)
+        shaded = averaged(shaded_at, points, camera, shown.pixels, again if at_nodes else None)
     else:
         shaded = shaded_at(points)
-    terms = RadianceTerms(**{name: term * alpha for name, term in shaded.known().items()}).filled()
+    found = {name: term * shown.opacity for name, term in shaded.known().items()}
+    seen = {name: x for name, x in points.attributes.items() if name == "visibility"}
+    found, seen = shown.placed((found, seen))
+    terms = RadianceTerms(**found).filled()
     radiance = terms.total() + buffer.slots[SURROUNDINGS] if view.others else terms.total()
-    return view.frame(buffer, normal=normal, radiance=radiance, terms=terms, maps=maps, object_alpha=alpha)
+    own = {"normal": buffer.slots["normal"], "object_alpha": buffer.opacity, "maps": maps | seen}
+    return view.frame(buffer, radiance=radiance, terms=terms, **own)

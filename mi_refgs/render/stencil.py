@@ -1,47 +1,88 @@
-"""Neighbouring pixels of an image plane, with an adjoint that only gathers (deterministic)."""
+"""Some pixels of an image, and neighbours in a plane, with an adjoint that only gathers (deterministic)."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.kernels.linear import linear
-from mi_refgs.splat.lanes import CompactedPixels
-from mi_refgs.types import Bool, Float, UInt32
+from mi_refgs.kernels.trees import mapped
+from mi_refgs.types import Array, Arrays, Bool, Float, UInt32
 
 # A step (dx, dy) in pixels, each -1, 0 or 1.
 Step = tuple[int, int]
+NOWHERE = 0xFFFFFFFF  # place of a pixel that was not chosen
+
+
+@dataclass(frozen=True)
+class ChosenPixels:
+    """P of the pixels of an image, each once."""
+
+    raster: UInt32  # (P,): index in the image
+    count: int  # pixels of the image
+
+    @cached_property
+    def place(self) -> UInt32:
+        """Which of the P each pixel of the image is (H·W,), NOWHERE for the others."""
+        place = dr.full(mi.UInt32, NOWHERE, self.count)
+        index = dr.arange(mi.UInt32, dr.width(self.raster))
+        dr.scatter(place, index, self.raster, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(place)
+        return place
+
+    def of(self, planes: Arrays) -> Arrays:
+        """Values (P,) of planes (H·W,)."""
+        dr.eval(planes)
+        return mapped(lambda plane: dr.gather(type(plane), plane, self.raster), planes)
+
+    def placed(self, values: Arrays) -> Arrays:
+        """Planes (H·W,) of values (P,), evaluated, 0 at other pixels."""
+
+        def placed(value: Array) -> Array:
+            plane = dr.zeros(type(value), self.count)
+            dr.scatter(plane, value, self.raster, mode=dr.ReduceMode.NoConflicts)
+            return plane
+
+        planes = mapped(placed, values)
+        dr.eval(planes)
+        return planes
+
+    def at(self, values: Float, raster: UInt32, active: Bool = True) -> Float:
+        """Values (P,) at pixels by their index in the image, 0 where there is nothing."""
+        place = dr.gather(mi.UInt32, self.place, raster, active)
+        return dr.gather(mi.Float, values, place, active & (place != NOWHERE))
 
 
 def neighbours(
-    plane: Float, width: int, height: int, steps: Sequence[Step], pixels: CompactedPixels | None = None
+    plane: Float, width: int, height: int, steps: Sequence[Step], pixels: ChosenPixels | None = None
 ) -> list[Float]:
     """The plane (mi.Float, raster order) by each step: out_k(x, y) = plane(x + dx_k, y + dy_k), dx, dy in
-    {-1, 0, 1}, borders repeated. A plane of compacted `pixels`, detached, is 0 at all others."""
+    {-1, 0, 1}, borders repeated. A plane (P,) of some `pixels` is 0 at all others."""
 
     def beside(pixel: UInt32) -> list[UInt32]:
         x, y = pixel % width, pixel // width
         return [_moved(y, dy, height) * width + _moved(x, dx, width) for dx, dy in steps]
 
-    if pixels is not None:
-        dr.eval(plane)
-        inside = dr.minimum(pixels.raster, width * height - 1)  # patches reach beyond the image
-        return [pixels.at(plane, i) for i in beside(inside)]
+    own = dr.arange(mi.UInt32, width * height) if pixels is None else pixels.raster
+
+    def at(plane: Float, place: UInt32, mask: Bool = True) -> Float:
+        return dr.gather(mi.Float, plane, place, mask) if pixels is None else pixels.at(plane, place, mask)
 
     def shifted(plane: Float) -> list[Float]:
         dr.eval(plane)
-        return [dr.gather(mi.Float, plane, i) for i in beside(dr.arange(mi.UInt32, width * height))]
+        return [at(plane, place) for place in beside(own)]
 
     def gathered(shifts: list[Float]) -> Float:
         """Pixel s was read by the pixels p = s - step and, where the border repeats, by s itself."""
-        index = dr.arange(mi.UInt32, width * height)
-        x, y = index % width, index // width
+        x, y = own % width, own // width
         total = mi.Float(0)
         dr.eval(shifts)
         for (dx, dy), shift in zip(steps, shifts, strict=True):
             for reader_y, read_y in _readers(y, dy, height):
                 for reader_x, read_x in _readers(x, dx, width):
-                    total += dr.gather(mi.Float, shift, reader_y * width + reader_x, read_x & read_y)
+                    total += at(shift, reader_y * width + reader_x, read_x & read_y)
         return total
 
     return list(linear(plane, shifted, gathered))

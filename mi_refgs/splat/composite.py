@@ -28,7 +28,7 @@ from mi_refgs.constants import COVERAGE_FLOOR
 from mi_refgs.kernels.rows import PackedRows
 from mi_refgs.kernels.timing import boundary, phase
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.lanes import CompactedPixels, Lanes, advance, any_of, walk
+from mi_refgs.splat.lanes import Lanes, advance, any_of, walk
 from mi_refgs.splat.tiles import TileLists
 from mi_refgs.surfels.primitives.primitive import Footprints
 from mi_refgs.types import Bool, Float, UInt32
@@ -36,18 +36,17 @@ from mi_refgs.types import Bool, Float, UInt32
 
 @dataclass(frozen=True)
 class Composited:
-    """Maps of H·W pixels in raster order, or of P pixels in that of `pixels`; not divided by alpha."""
+    """Maps of H·W pixels in raster order, not divided by alpha."""
 
     features: list[Float]  # K maps Σ w f
-    depth: Float  # Σ w z; None if not asked for
+    depth: Float  # Σ w z
     alpha: Float  # Σ w
-    pixels: CompactedPixels | None = None
 
     @staticmethod
-    def nothing(features: int, camera: Camera, depth: bool = True) -> Composited:
+    def nothing(features: int, camera: Camera) -> Composited:
         """Maps of a view without surfels."""
         *maps, z, alpha = _blank(features + 2, camera)
-        return Composited(maps, z if depth else None, alpha)
+        return Composited(maps, z, alpha)
 
     @property
     def expected_depth(self) -> Float:
@@ -69,21 +68,6 @@ def composite(
     footprints, features, turns = boundary((footprints, features, turns or []), "surfels backward")
     out = dr.custom(_Composite, [*footprints.columns, *features, *turns], lists)
     return Composited(out[: len(features)], *out[-2:])
-
-
-@phase("splat forward")
-def composite_compact(lists: TileLists, depth: bool) -> Composited:
-    """Detached maps of the pixels of patches that list a surfel, in the order of `pixels`; alpha is 1 - T."""
-    if not lists.pairs:
-        return Composited.nothing(lists.features, lists.camera, depth)
-    dr.eval(lists.rows.data)
-    chosen = Lanes.filled(lists)
-    lanes = Lanes.of(lists, chosen)
-    transmittance, sums = _forward(lists, lanes, lists.features, lists.features + depth)
-    values = [[*of_pixel, 1 - T] for of_pixel, T in zip(sums, transmittance, strict=True)]
-    maps = CompactedPixels.scattered(values, dr.width(chosen))
-    pixels = CompactedPixels.of(lists.camera, chosen, lanes)
-    return Composited(maps[: lists.features], maps[-2] if depth else None, maps[-1], pixels)
 
 
 def _values(lists: TileLists, row: list[Float], sample: Any, count: int) -> list[Float]:

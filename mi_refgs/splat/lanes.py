@@ -25,16 +25,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_refgs.constants import LANE_PIXELS_PER_AXIS, PATCH_EDGE, TRANSMITTANCE_MIN
-from mi_refgs.kernels.trees import mapped
 from mi_refgs.splat.camera import Camera
 from mi_refgs.splat.tiles import TileLists
 from mi_refgs.surfels.primitives.primitive import FootprintSample
-from mi_refgs.types import Array, Arrays, Bool, Float, Point2f, UInt32
+from mi_refgs.types import Bool, Float, Point2f, UInt32
 
 SIDE = LANE_PIXELS_PER_AXIS
 LANE_PIXELS = SIDE**2
 PATCH_LANES = PATCH_EDGE**2 // LANE_PIXELS
-NOWHERE = 0xFFFFFFFF  # slot of a patch that was not chosen
 
 
 @dataclass(frozen=True)
@@ -101,12 +99,6 @@ class Lanes:
         )
 
     @staticmethod
-    def filled(lists: TileLists) -> UInt32:
-        """The patches with a tile that lists a surfel; waits for the device."""
-        lanes = Lanes.of(lists)
-        return dr.compress(_of_patches(lanes.begin < lanes.end))
-
-    @staticmethod
     def parts(lists: TileLists) -> list[tuple[Lanes, int]]:
         """All lanes, with the number of features that their surfels have: those of patches with a surfel of
         the first table, then the others; waits for the device if rows differ."""
@@ -131,61 +123,6 @@ class Lanes:
     def from_raster(self, images: list[Float]) -> list[list[Float]]:
         """Inverse of `to_raster`; 0 outside the image."""
         return [[dr.gather(mi.Float, x, raster, inside) for x in images] for _, raster, inside in self.each()]
-
-
-@dataclass(frozen=True)
-class CompactedPixels:
-    """The P pixels of the patches that list a surfel, patch by patch, lane by lane: squares of the image."""
-
-    raster: UInt32  # (P,): index in the image
-    index: UInt32  # (H·W,): which of the P each pixel of the image is
-    there: Bool  # (H·W,): whether it is one of them
-
-    @staticmethod
-    def of(camera: Camera, chosen: UInt32, lanes: Lanes) -> CompactedPixels:
-        """The pixels of the `chosen` patches, to which these lanes belong."""
-        grid, patches = Grid(camera), dr.width(chosen)
-        lanes_x, lanes_y = grid.lanes
-        (raster,) = CompactedPixels.scattered([[x] for x in lanes.raster], patches)
-        slot = dr.full(mi.UInt32, NOWHERE, grid.patches)
-        dr.scatter(slot, dr.arange(mi.UInt32, patches), chosen, mode=dr.ReduceMode.NoConflicts)
-        dr.eval(slot)
-
-        # From a pixel of the image to its patch, tile and lane.
-        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
-        x, y = pixel % camera.width + camera.tile_offset[0], pixel // camera.width + camera.tile_offset[1]
-        slot = dr.gather(mi.UInt32, slot, y // PATCH_EDGE * grid.columns + x // PATCH_EDGE)
-        x, y = x % PATCH_EDGE, y % PATCH_EDGE
-        tile = y // camera.tile[1] * grid.tiles[0] + x // camera.tile[0]
-        x, y = x % camera.tile[0], y % camera.tile[1]
-        lane = tile * (lanes_x * lanes_y) + y // SIDE * lanes_x + x // SIDE
-        index = (slot * PATCH_LANES + lane) * LANE_PIXELS + y % SIDE * SIDE + x % SIDE
-        return CompactedPixels(raster, index, slot != NOWHERE)
-
-    @staticmethod
-    def scattered(values: list[list[Any]], patches: int) -> list[Any]:
-        """Maps (P,) of values per pixel of the lanes, written in the kernel of the loop that made them."""
-        lane = dr.arange(mi.UInt32, patches * PATCH_LANES)
-        maps = [dr.empty(type(value), LANE_PIXELS * patches * PATCH_LANES) for value in values[0]]
-        for image, of_lane in zip(maps, zip(*values, strict=True), strict=True):
-            packet = mi.ArrayXf if type(image) is mi.Float else mi.ArrayXu
-            dr.scatter(image, packet(list(of_lane)), lane, mode=dr.ReduceMode.NoConflicts)
-        dr.eval(maps)
-        return maps
-
-    def at(self, values: Float, raster: UInt32) -> Float:
-        """Values (P,) at pixels by their index in the image, 0 where there is nothing."""
-        there = dr.gather(mi.Bool, self.there, raster)
-        return dr.gather(mi.Float, values, dr.gather(mi.UInt32, self.index, raster, there), there)
-
-    def to_raster(self, values: Arrays) -> Arrays:
-        """Arrays (P,), and what contains them, as ones (H·W,), 0 where there is nothing; constants stay."""
-        dr.eval(values)
-
-        def raster(value: Array) -> Array:
-            return value if dr.width(value) == 1 else dr.gather(type(value), value, self.index, self.there)
-
-        return mapped(raster, values)
 
 
 def _of_patches(flags: Bool) -> Bool:

@@ -215,7 +215,7 @@ def test_full_disk_leaves_what_was_saved(method: Method, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "options, most", [({}, 60), ({"crop": 12 * 12}, 60), ({"traced_bounces": 1, "antialias": True}, 120)]
+    "options, most", [({}, 60), ({"crop": 12 * 12}, 60), ({"traced_bounces": 1, "antialias": True}, 130)]
 )
 def test_warm_step_compiles_nothing(options: dict[str, Any], most: int, method: Method) -> None:
     trainer = Trainer(without(with_deferred(method, options)), ball())

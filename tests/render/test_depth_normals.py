@@ -13,7 +13,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.reference import losses as reference
 from mi_refgs.render import display
 from mi_refgs.render.depth_normals import normals_from_depth
-from mi_refgs.render.stencil import neighbours
+from mi_refgs.render.stencil import ChosenPixels, neighbours
 from mi_refgs.splat.camera import Camera
 from tests.fitting.image_checks import HEIGHT, WIDTH, check, stack
 from tests.helpers import with_grad
@@ -28,12 +28,16 @@ def test_neighbours_adjoint_is_the_transpose(size: tuple[int, int], rng: np.rand
         unit = np.zeros(width * height, dtype=np.float32)
         unit[source] = 1
         matrix[:, :, source] = [np.array(out) for out in neighbours(mi.Float(unit), width, height, steps)]
-    weights = rng.normal(size=(len(steps), width * height))
-    plane = with_grad(mi.Float(rng.normal(size=width * height).astype(np.float32)))
-    out = neighbours(plane, width, height, steps)
-    losses_of = (o * mi.Float(w.astype(np.float32)) for o, w in zip(out, weights, strict=True))
-    dr.backward(sum(losses_of, mi.Float(0)))
-    np.testing.assert_allclose(np.array(dr.grad(plane)), np.einsum("ki,kij->j", weights, matrix), atol=1e-5)
+    every, some = np.arange(width * height), np.flatnonzero(rng.random(width * height) < 0.7)[::-1]
+    for own in (every, some) if len(some) else (every,):  # of an image, and of some pixels of it alone
+        among = None if own is every else ChosenPixels(upload(own, mi.UInt32), width * height)
+        weights, part = rng.normal(size=(len(steps), len(own))), matrix[:, own][:, :, own]
+        plane = with_grad(mi.Float(rng.normal(size=len(own)).astype(np.float32)))
+        out = neighbours(plane, width, height, steps, among)
+        np.testing.assert_allclose(np.array(out), part @ np.array(plane), atol=1e-6)
+        losses_of = (o * mi.Float(w.astype(np.float32)) for o, w in zip(out, weights, strict=True))
+        dr.backward(sum(losses_of, mi.Float(0)))
+        np.testing.assert_allclose(np.array(dr.grad(plane)), np.einsum("ki,kij->j", weights, part), atol=1e-5)
 
 
 INTRINSICS = (-21.0, -19.0, 7.3, 8.1)  # Mitsuba's signs, off-centre
