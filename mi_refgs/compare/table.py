@@ -185,7 +185,7 @@ def remarks(scene: Scene) -> list[str]:
     for column in COLUMNS:
         reasons = [row.missing[column.key] for row in scene.rows if column.key in row.missing]
         if reasons and column not in columns_of(scene):
-            said.append(f"{column.title}: none: {reasons[0]}.")
+            said.append(f"{column.title}: none: {'; '.join(dict.fromkeys(reasons))}.")
     return said
 
 

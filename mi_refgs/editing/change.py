@@ -19,7 +19,6 @@ from mi_refgs.surfels.attributes import SH_DC, logit, sigmoid
 from mi_refgs.surfels.table import Surfels
 
 ASSIGNMENT = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(\*?=)(.*)", re.ASCII)
-COLOUR_FLOOR = 1e-3  # below it, a new colour sets the SH of higher degrees to 0 instead of scaling them
 NEIGHBOURS, MAJORITY = 8, 0.5  # surfels that decide about a triangle, by a share of their opacity
 
 
@@ -160,14 +159,18 @@ def _assign(values: SurfelValues, own: dict[str, np.ndarray], assignment: Assign
         remedy = "give 0 or more" if is_colour or assignment.multiplies else "give 0 to 1"
         raise InputError("out of range", "--set", assignment.text, remedy)
 
-    # The raw values (chosen, columns). A new colour scales the SH of all degrees.
+    # The raw values (chosen, columns). A new colour scales the SH of all degrees, those of a surfel that is
+    # darker than they are in the mean so that they are at most as bright as it.
     old = activated(attribute, own)[:, columns]
     new = given * old if assignment.multiplies else np.broadcast_to(given, old.shape)
     if not is_colour:
         own[attribute][:, columns] = logit(np.clip(new, 0, 1))
         return
     raw = own["radiance_sh"]
-    factor = np.where(old > COLOUR_FLOOR, new / np.maximum(old, COLOUR_FLOOR), 0).astype(np.float32)
     for i, column in enumerate(columns):
+        harmonics = raw[:, 3 + column :: 3]
+        spread = SH_DC * np.linalg.norm(harmonics, axis=1)  # root mean square over all directions
+        factor = new[:, i] / np.maximum(np.maximum(old[:, i], spread), 1e-12)
+        factor = np.broadcast_to(given, len(columns))[i] if assignment.multiplies else factor[:, None]
+        harmonics *= np.float32(factor)
         raw[:, column] = (np.maximum(new[:, i], 0) - 0.5) / SH_DC
-        raw[:, 3 + column :: 3] *= factor[:, i, None]

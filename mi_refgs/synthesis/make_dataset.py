@@ -123,7 +123,10 @@ def write_views(out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str
     if height and cameras.objects and not light.exists():
         write_exr(light, incident(without(tracer.scene, cameras.objects), cameras.centre, cameras.options))
     elif height and tracer.scene.environment() is not None and not light.exists():
-        write_exr(light, environment_image(tracer.scene, height))
+        if len(tracer.scene.emitters()) == 1:
+            write_exr(light, environment_image(tracer.scene, height))
+        elif tell:
+            say(f"{light}: not written, since the scene has lamps beside its map: no light is scored")
     jobs = [job for split in splits for job in views[split]]
     for name, pose, seed in with_bar(jobs, f"dataset {out.name}", unit="view", disable=not tell):
         _trace_view(tracer, out / name, pose, seed, maps)

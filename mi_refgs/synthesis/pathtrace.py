@@ -93,9 +93,15 @@ def camera_poses(
     return poses_around(outward, centre, rng.uniform(*distance, (count, 1)))
 
 
+def path_integrator(scene: Scene, **options: Any) -> Any:
+    """Mitsuba's path tracer, that of volumes for a scene with media."""
+    media = any(shape.is_medium_transition() for shape in scene.shapes())
+    return mi.load_dict({"type": "volpath" if media else "path", **options})
+
+
 def incident(scene: Scene, point: np.ndarray, options: DatasetOptions) -> np.ndarray:
     """Path-traced radiance that arrives at a point (3,), on the grid of `environment_image`."""
-    integrator = mi.load_dict({"type": "path", "max_depth": options.max_depth})
+    integrator = path_integrator(scene, max_depth=options.max_depth)
     sampler = mi.load_dict({"type": "independent"})
     passes = max(1, options.spp // OVERSAMPLING**2)
     seeds = iter(np.random.SeedSequence(options.seed).generate_state(passes))
@@ -149,8 +155,7 @@ class Tracer:
         strata = math.isqrt(-(-spp // self.passes))
         self.spp = strata * -(-spp // (self.passes * strata))
         opaque = bool(self.objects)
-        path = {"type": "path", "max_depth": options.max_depth, "hide_emitters": not opaque}
-        self.integrator = mi.load_dict(path)
+        self.integrator = path_integrator(scene, max_depth=options.max_depth, hide_emitters=not opaque)
         film: dict[str, Any] = {"type": "hdrfilm", "component_format": "float32", "rfilter": {"type": "box"}}
         film |= {"width": self.width, "height": self.height, "pixel_format": "rgb" if opaque else "rgba"}
         lens: dict[str, Any] = {"type": "perspective", "fov": options.fov, "fov_axis": "smaller"}

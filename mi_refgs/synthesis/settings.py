@@ -50,9 +50,9 @@ def load_scene(scene: Path, define: Sequence[str] = ()) -> Any:
 
 
 def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
-    """The scene with a lat-long map (EXR, HDR) in place of its environment; its other emitters are kept.
-    `objects`: shapes that are lit alone, without the other shapes and emitters. The map is rotated as the
-    scene's own `envmap` is; without one, its y becomes z, which is up."""
+    """The scene with a lat-long map (EXR, HDR) in place of all of its emitters. `objects`: shapes that are
+    lit alone, without the other shapes. The map is rotated as the scene's own `envmap` is; without one, its
+    y becomes z, which is up."""
     turned: Any = mi.ScalarTransform4f().rotate(*Z_UP)
     environment = scene.environment()
     if environment is not None:
@@ -60,7 +60,8 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
         if "data" in params and "to_world" in params:
             turned = mi.ScalarTransform4f(np.array(params["to_world"].matrix, np.float64).reshape(4, 4))
     environment = {"type": "envmap", "bitmap": mi.Bitmap(read_radiance(light)), "to_world": turned}
-    return scene_of([*(objects or _parts_but(scene, ())), mi.load_dict(environment)])
+    lit = objects or [shape for shape in scene.shapes() if not shape.is_emitter()]
+    return scene_of([*lit, mi.load_dict(environment)])
 
 
 def without(scene: Scene, objects: Sequence[Any]) -> Any:

@@ -134,6 +134,11 @@ def test_a_new_colour_scales_all_sh_degrees(scene: TrainedScene) -> None:
     np.testing.assert_allclose(after[:, 3:6], before[:, 3:6] * ratio, rtol=1e-4)
     one = edit(plain, set=["colour.g=0.7"])[0].surfels.to_numpy()["radiance_sh"]
     np.testing.assert_array_equal(one[:, [0, 2, 3, 5]], before[:, [0, 2, 3, 5]])
+    # Harmonics that exceed a dark colour do not outshine the new one.
+    black = {"radiance_sh": np.concatenate([0 * before[:, :3] - 1.7, 50 * before[:, 3:]], axis=1)}
+    dark = replace(plain, surfels=Surfels.from_numpy(plain.surfels.to_numpy() | black))
+    after = edit(dark, set=["colour=0.5"])[0].surfels.to_numpy()["radiance_sh"][:, 3:].reshape(-1, 8, 3)
+    assert 0.4 < SH_DC * np.linalg.norm(after, axis=1).max() < 0.501
 
 
 @pytest.mark.parametrize("change", [{"materials": True}, {"set": {"roughness": 0.3}}])

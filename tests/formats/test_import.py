@@ -210,7 +210,9 @@ def test_bad_transforms_file_is_refused(change: dict[str, object], message: str,
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e5])
-def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path: Path) -> None:
+def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(
+    scale: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A black ball in white light is not cut off; the scene of Mitsuba's has no sensor."""
     scene, file, out = tmp_path / "scene.xml", tmp_path / "camera.json", tmp_path / "out.exr"
     scene.write_text(
@@ -227,3 +229,6 @@ def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(scale: float, tmp_path
     assert main([*command, "--camera", str(file)]) == 0
     seen = read_exr(out)["R"]
     assert seen.shape == (12, 16) and seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)
+    file.write_text(json.dumps({"w": 16, "h": 12, "fl_x": 20, "fl_y": 25, "frames": [frame]}))
+    assert main([*command, "--camera", str(file)]) == 0
+    assert "20 × 12 pixels, not 16 × 12: fx and fy differ" in capsys.readouterr().err

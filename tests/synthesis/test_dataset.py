@@ -270,7 +270,16 @@ def test_replacement_light_is_rotated_like_the_scenes_own(made: Path, tmp_path: 
     changed = under_light(load_scene(tmp_path / "plain.xml"), tmp_path / "top.exr")
     found = emitted(changed.environment(), np.array([[0, 0, 1], [0, 1, 0]]))
     np.testing.assert_allclose(found[:, 0], [5, 0.1], rtol=1e-5)
-    assert len(changed.emitters()) == 2  # the lamp stays
+    assert len(changed.emitters()) == 1  # the lamp goes
+
+
+def test_volumes_are_traced_and_a_map_beside_lamps_is_not_all_of_the_light(tmp_path: Path) -> None:
+    fog = '<medium type="homogeneous" name="interior"><float name="sigma_t" value="3"/></medium>'
+    parts = f'<emitter type="constant"/><emitter type="point"/><shape type="sphere"><bsdf type="null"/>{fog}'
+    (tmp_path / "fog.xml").write_text(f'<scene version="3.0.0">{parts}</shape></scene>')
+    data = read_loaded(make_dataset(tmp_path / "fog.xml", tmp_path / "fog", **OPTIONS), "train")
+    assert data.environment is None
+    assert all(view.alpha is not None and view.alpha.max() > 0.5 for view in data.views)
 
 
 def test_parameters_of_a_scene_are_given(tmp_path: Path) -> None:
