@@ -234,6 +234,17 @@ class Dataset:
         kept = tuple(view for i, view in enumerate(self.views) if i % every)
         return replace(self, views=kept), replace(self, views=self.views[::every])
 
+    def relative_to(self, offset: Sequence[float]) -> "Dataset":
+        """The same data set with positions relative to another `offset`, such as that of a run."""
+        shift = np.subtract(offset, self.offset)
+        if not shift.any():
+            return self
+        points = self.points and replace(self.points, position=self.points.position - shift)
+        views, region = tuple(_moved(view, shift) for view in self.views), self.region
+        x, y, z = map(float, offset)
+        moved = replace(self, views=views, points=points, offset=(x, y, z))
+        return moved if region is None else replace(moved, region=region.moved(-shift))
+
     @cached_property
     def scene_extent(self) -> float:
         """1.1 × the largest distance of a camera to their mean (3DGS); of a single one, to the origin."""
@@ -305,22 +316,18 @@ def read_dataset(
         notes = (*notes, f"no alpha and no mask for {which}; give all images masks, or none")
     # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training)
-    views = tuple(_moved(view, offset) for view in views)
     extent = _extent(views if len(views) > 1 else training)
     views = tuple(replace(view, near=NEAR_EXTENTS * extent) for view in views)
-    if (region := read_region(path)) is not None:
-        region = region.moved(-offset)
-    elif without:
+    if (region := read_region(path)) is None and without:
         with contextlib.suppress(InputError):  # views that share no point have none
-            region = region_of([_moved(view, offset) for view in training])
-    x, y, z = map(float, offset)
+            region = region_of([_moved(view, offset) for view in training]).moved(offset)
     if offset.any():
-        points = None if points is None else replace(points, position=points.position - offset)
-        position = f"({x:.12g}, {y:.12g}, {z:.12g})"
-        notes = (*notes, f"cameras are far from the origin: positions are relative to {position}")
-    colour, about = np.full(3, options.background, dtype=np.float32), (points, region, notes, (x, y, z))
-    known = (colour, True in linear, found.environment, *about)
-    return Dataset(path, split, views, *known, downscale=options.downscale, source=found.source)
+        position = ", ".join(f"{x:.12g}" for x in offset)
+        notes = (*notes, f"cameras are far from the origin: positions are relative to ({position})")
+    colour = np.full(3, options.background, dtype=np.float32)
+    known = (colour, True in linear, found.environment, points, region, notes)
+    read = Dataset(path, split, views, *known, downscale=options.downscale, source=found.source)
+    return read.relative_to(offset.tolist())
 
 
 def require_no_data(path: Path) -> None:

@@ -211,7 +211,7 @@ def begin(
     if resumed:
         run.rewind(trainer.iteration)
     else:
-        run.create(trainer.method, views.folder, views.region, digests(views))
+        run.create(trainer.method, views.folder, views.region, digests(views), views.offset)
         trainer.run = run
         if trainer.fit.decisions:  # of before the first step
             run.write_json(DECISIONS, trainer.fit.decisions)

@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,15 @@ class Provenance:
     records: dict[str, Any] = field(default_factory=dict)
     """Corrections of the fit by file: of its cameras and of the exposure."""
     images: dict[str, str] = field(default_factory=dict)  # digests of those that it was fitted to
+    offset: Sequence[float] | None = None  # subtracted from positions of its data set, if that is known
 
     @staticmethod
     def of(run: Run) -> "Provenance":
         """Read a run folder; raises InputError if it is none, or has a record that cannot be used."""
         made = run.record(EDITS).get("edits", [])
         records = {name: record for name in (CAMERAS, EXPOSURE) if (record := run.record(name))}
-        return Provenance(run.method(), run.dataset(), run.region(), tuple(made), records, run.images())
+        known = run.dataset(), run.region(), tuple(made), records, run.images(), run.offset()
+        return Provenance(run.method(), *known)
 
     def with_data(self, folder: Path | None) -> "Provenance":
         """Replace the data set, unless `folder` is None; raises InputError for a path that is no folder."""
@@ -56,6 +59,7 @@ class Provenance:
             raise InputError(gone, "views", split, "use cameras(), or restore the data set")
         views = read_views(self.method, self.data, split, truth)
         warn_of_changes(views, self.method, self.images)
+        views = views.relative_to(self.offset or views.offset)
         return with_poses(with_region(views, self.region), self.records.get(CAMERAS, {}))
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
@@ -74,6 +78,7 @@ class Provenance:
                 continue
             if split == "train":
                 warn_of_changes(data, self.method, self.images)
+            data = data.relative_to(self.offset or data.offset)
             for view in with_poses(data, self.records.get(CAMERAS, {})).views:
                 if (file := view.file) is not None:  # paths are relative to the data set
                     mask = file.mask and replace(file.mask, path=relative(file.mask.path))

@@ -225,7 +225,7 @@ class Reconstruction:
         It renders the same images, bit for bit. Raises InputError for a folder that has other files."""
         source, camera = self.provenance, self.provenance.first_camera(self.trained)
         records = source.records | ({EDITS: {"edits": source.edits}} if source.edits else {})
-        about: Any = {"data": source.data, "region": source.region, "images": source.images}
+        about: Any = {name: getattr(source, name) for name in ("data", "region", "images", "offset")}
         save(self.trained, Path(folder), source.method, camera, records=records, **about)
         return load(folder)
 

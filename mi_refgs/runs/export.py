@@ -103,19 +103,20 @@ def save(
     data: Path | None = None,
     region: Region | None = None,
     images: dict[str, str] | None = None,
+    offset: Sequence[float] | None = None,
     records: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """Write a scene that was not fitted here as a run folder, config.toml last; returns its artefacts.
     `camera` and `more` become the sensors of scene.xml, `data` the data set of test views, `images` digests
-    of its training images, `records` JSON files by name. Raises InputError for a folder with a run or other
-    files, and as `export` does."""
+    of its training images, `offset` that of positions, `records` JSON files by name. Raises InputError for a
+    folder with a run or other files, and as `export` does."""
     run = Run(folder)
     run.require_none()
     own_folder(folder, RUN)
     with run.alone():
         written = export(trained, folder, camera, more)
         if data is not None:
-            run.write_dataset(str(data.resolve()), region, images)
+            run.write_dataset(str(data.resolve()), region, images, offset)
         for name, content in (records or {}).items():
             run.write_json(name, content)
         run.write_method(method)

@@ -7,6 +7,7 @@ metrics.json  contact_sheet.png  eval/                                          
 import json
 import math
 import os
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -60,19 +61,26 @@ class Run:
         dataset: str | None,
         region: Region | None = None,
         images: dict[str, str] | None = None,
+        offset: Sequence[float] | None = None,
     ) -> None:
         """Start a run on the data set in folder `dataset`, None in memory; raises as `require_none`."""
         self.require_none()
         own_folder(self.path, RUN)
         self._make_folders()
-        self.write_dataset(dataset, region, images)
+        self.write_dataset(dataset, region, images, offset)
         self.write_method(method)
 
     def write_dataset(
-        self, dataset: str | None, region: Region | None, images: dict[str, str] | None = None
+        self,
+        dataset: str | None,
+        region: Region | None,
+        images: dict[str, str] | None = None,
+        offset: Sequence[float] | None = None,
     ) -> None:
-        """Record the folder of the data set, its region, and digests of its images, by default as before."""
+        """Record the folder of the data set and its region; digests of its images and its offset, by default
+        as before."""
         record: dict[str, Any] = {"path": dataset, "images": self.images() if images is None else images}
+        record["offset"] = self.offset() if offset is None else [*offset]
         if region is not None:
             began = self.record(DATASET).get("began", region.content)  # before it followed the object
             record |= {"region": region.content, "began": began}
@@ -97,6 +105,11 @@ class Run:
     def images(self) -> dict[str, str]:
         """Digests of the images and cameras that the run began with, by name; none of older runs."""
         return dict(self.record(DATASET).get("images") or {})
+
+    def offset(self) -> Sequence[float] | None:
+        """What was subtracted from positions of the data set (`Dataset.offset`), if the run records it."""
+        found: Sequence[float] | None = self.record(DATASET).get("offset")
+        return found
 
     def dataset(self) -> Path | None:
         """Folder of the data set that the run was fitted to, if it records one; raises InputError if not."""

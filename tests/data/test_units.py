@@ -16,6 +16,9 @@ from mi_refgs.data.survey import survey
 from mi_refgs.fitting.initial import initial_surfels
 from mi_refgs.fitting.optim import Adam, LearningRate
 from mi_refgs.fitting.schedule import FitSetup
+from mi_refgs.reconstruction.provenance import Provenance
+from mi_refgs.runs.run import Run
+from mi_refgs.runs.views import views_of_run
 from tests.scenes import dots, layouts
 from tests.scenes.tiny import write_data
 
@@ -103,6 +106,20 @@ def test_data_set_is_independent_of_unit_and_origin(place: str, tmp_path: Path) 
     assert after.region is not None
     np.testing.assert_allclose(np.array(after.region.centre) / scale, rest, atol=1e-5)
     assert not any("one place" in note for note in survey(data)["notes"])
+
+
+def test_a_run_keeps_its_own_origin(tmp_path: Path) -> None:
+    """Another part of the data has another mean, but is seen from the same places."""
+    data, run = write_data(tmp_path / "data", truth=False), Run(tmp_path / "run")
+    move_cameras(data, lambda position: position + UTM)
+    views = read_dataset(data, "train")
+    own = np.add(views.offset, [100, 0, 0])
+    run.create(methods.load("ref_gaussian", "quick"), str(data), None, {}, own.tolist())
+    run.write_dataset(str(data), None)
+    for found in (views_of_run(run, run.method(), "train"), Provenance.of(run).views("train")):
+        moved = found.views[0].to_world[:3, 3] + found.offset
+        np.testing.assert_array_equal(found.offset, own)
+        np.testing.assert_allclose(moved, views.views[0].to_world[:3, 3] + views.offset, rtol=1e-12)
 
 
 class FarShot(dots.Shot):
