@@ -35,7 +35,7 @@ class Render:
         from mi_refgs.formats.cameras import read_cameras
         from mi_refgs.io.ownership import require_no_run
         from mi_refgs.io.progress import warn
-        from mi_refgs.render.scene_xml import sensors_of
+        from mi_refgs.render.scene_xml import has_square_pixels, sensors_of
 
         out = self.output  # refused before the scene is read
         if out.suffix.lower() not in (".exr", ".png"):
@@ -66,10 +66,10 @@ class Render:
         names = write(scene, sensor, samples, out)
         width, height = (int(x) for x in sensor.film().crop_size())
         camera = cameras[self.sensor] if cameras else None
-        if camera and (width, height) != (camera.width, camera.height):
-            what = f"{width} × {height} pixels, not {camera.width} × {camera.height}: fx and fy differ, and"
-            remedy = "Mitsuba's pixels are square; `Reconstruction.render` has the camera's"
-            warn(f"{what} {remedy}")
+        if camera and not has_square_pixels(camera):
+            what = f"fx and fy differ, but Mitsuba's pixels are square: {width} × {height} of them"
+            given = f"for {camera.width} × {camera.height}; `Reconstruction.render` has the camera's"
+            warn(f"{what} {given}")
         data = {"output": str(out), "width": width, "height": height, "channels": names}
         return Result(data, f"{out}: {width} × {height}, {', '.join(names)}")
 

@@ -173,4 +173,4 @@ def _assign(values: SurfelValues, own: dict[str, np.ndarray], assignment: Assign
         factor = new[:, i] / np.maximum(np.maximum(old[:, i], spread), 1e-12)
         factor = np.broadcast_to(given, len(columns))[i] if assignment.multiplies else factor[:, None]
         harmonics *= np.float32(factor)
-        raw[:, column] = (np.maximum(new[:, i], 0) - 0.5) / SH_DC
+        raw[:, column] = (new[:, i] - 0.5) / SH_DC

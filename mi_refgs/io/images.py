@@ -116,9 +116,10 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
 
 
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
-    """Brightness (H, W) of a PNG or JPEG, of colours that of the brightest channel, or alpha if it has
-    transparent pixels, or whether a pixel is not black if a palette has colours, as segmentation tools write
-    labels; and white, the smallest of 1, 255 and 65535 that no number exceeds: a mask may contain labels."""
+    """Brightness (H, W) of a PNG or JPEG, of colours that of the brightest channel as a share of the largest,
+    or alpha if it has transparent pixels, or whether a pixel is not black if a palette has colours, as
+    segmentation tools write labels; and white, the smallest of 1, 255 and 65535 that no number exceeds: a
+    mask may contain labels."""
     path = Path(path)
     with open_image(path) as image:
         if image.mode.startswith("I"):
@@ -128,7 +129,7 @@ def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
             if not (alpha == 255).all():
                 grey = alpha
             elif np.ptp(colours := np.asarray(image.convert("RGB")), axis=-1).any():
-                grey = colours.max(axis=-1)
+                grey = colours.max(axis=-1) / colours.max()
                 grey = grey > 0 if image.mode == "P" else grey
     return grey, next((white for white in (1, 255) if grey.max() <= white), 65535)
 

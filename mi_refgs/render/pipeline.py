@@ -275,7 +275,8 @@ def _shade_at_pixels(view: _View) -> Frame:
     else:
         shaded = shaded_at(points)
     found = {name: term * shown.opacity for name, term in shaded.known().items()}
-    seen = {name: x for name, x in points.attributes.items() if name == "visibility"}
+    there = dr.detach(shown.opacity) > 0
+    seen = {n: dr.select(there, x, 0) for n, x in points.attributes.items() if n == "visibility"}
     found, seen = shown.placed((found, seen))
     terms = RadianceTerms(**found).filled()
     radiance = terms.total() + buffer.slots[SURROUNDINGS] if view.others else terms.total()

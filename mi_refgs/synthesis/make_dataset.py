@@ -123,7 +123,7 @@ def write_views(out: Path, splits: Sequence[str], tracer: Tracer, maps: dict[str
     if height and cameras.objects and not light.exists():
         write_exr(light, incident(without(tracer.scene, cameras.objects), cameras.centre, cameras.options))
     elif height and tracer.scene.environment() is not None and not light.exists():
-        if len(tracer.scene.emitters()) == 1:
+        if not maps or len(tracer.scene.emitters()) == 1:  # a relit scene is lit by its map
             write_exr(light, environment_image(tracer.scene, height))
         elif tell:
             say(f"{light}: not written, since the scene has lamps beside its map: no light is scored")

@@ -50,9 +50,9 @@ def load_scene(scene: Path, define: Sequence[str] = ()) -> Any:
 
 
 def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
-    """The scene with a lat-long map (EXR, HDR) in place of all of its emitters. `objects`: shapes that are
-    lit alone, without the other shapes. The map is rotated as the scene's own `envmap` is; without one, its
-    y becomes z, which is up."""
+    """The scene with a lat-long map (EXR, HDR) in place of its emitters. `objects`: shapes that are lit
+    alone, without the others; they may glow. The map is rotated as the scene's own `envmap` is; without one,
+    its y becomes z, which is up."""
     turned: Any = mi.ScalarTransform4f().rotate(*Z_UP)
     environment = scene.environment()
     if environment is not None:

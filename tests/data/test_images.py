@@ -119,7 +119,7 @@ def test_mask_formats(tmp_path: Path) -> None:
         "deep labels": ((bits == 255).astype(np.uint16), [0, 1, 0]),
         "shallow": (bits.astype(np.uint16), [0, 1, 128 / 255]),
         "black": (0 * bits, [0, 0, 0]),
-        "green": (np.dstack([0 * bits, bits, 0 * bits]), [0, 1, 128 / 255]),
+        "green": (np.dstack([0 * bits, bits // 2, 0 * bits]), [0, 1, 64 / 127]),
     }
     for name, (pixels, expected) in files.items():
         Image.fromarray(pixels).save(tmp_path / f"{name}.png")

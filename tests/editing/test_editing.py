@@ -137,6 +137,8 @@ def test_a_new_colour_scales_all_sh_degrees(scene: TrainedScene) -> None:
     # Harmonics that exceed a dark colour do not outshine the new one.
     black = {"radiance_sh": np.concatenate([0 * before[:, :3] - 1.7, 50 * before[:, 3:]], axis=1)}
     dark = replace(plain, surfels=Surfels.from_numpy(plain.surfels.to_numpy() | black))
+    same = edit(dark, set=["colour*=1"])[0].surfels.to_numpy()["radiance_sh"]
+    np.testing.assert_allclose(same, dark.surfels.to_numpy()["radiance_sh"], atol=1e-5)
     after = edit(dark, set=["colour=0.5"])[0].surfels.to_numpy()["radiance_sh"][:, 3:].reshape(-1, 8, 3)
     assert 0.4 < SH_DC * np.linalg.norm(after, axis=1).max() < 0.501
 

@@ -231,4 +231,4 @@ def test_cameras_of_a_file_do_not_clip_scenes_of_any_size(
     assert seen.shape == (12, 16) and seen[5:7, 7:9].max() == 0 and seen[0, 0] == pytest.approx(1)
     file.write_text(json.dumps({"w": 16, "h": 12, "fl_x": 20, "fl_y": 25, "frames": [frame]}))
     assert main([*command, "--camera", str(file)]) == 0
-    assert "20 × 12 pixels, not 16 × 12: fx and fy differ" in capsys.readouterr().err
+    assert "Mitsuba's pixels are square: 20 × 12 of them for 16 × 12" in capsys.readouterr().err
