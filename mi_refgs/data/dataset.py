@@ -234,10 +234,9 @@ class Dataset:
         kept = tuple(view for i, view in enumerate(self.views) if i % every)
         return replace(self, views=kept), replace(self, views=self.views[::every])
 
-    def relative_to(self, offset: Sequence[float]) -> "Dataset":
-        """The same data set with positions relative to another `offset`, such as that of a run."""
-        shift = np.subtract(offset, self.offset)
-        if not shift.any():
+    def relative_to(self, offset: Sequence[float] | None) -> "Dataset":
+        """The same data set with positions relative to another `offset`, that of a run if it is known."""
+        if offset is None or not (shift := np.subtract(offset, self.offset)).any():
             return self
         points = self.points and replace(self.points, position=self.points.position - shift)
         views, region = tuple(_moved(view, shift) for view in self.views), self.region

@@ -128,7 +128,7 @@ def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
             grey, alpha = np.moveaxis(np.asarray(image.convert("LA")), -1, 0)
             if not (alpha == 255).all():
                 grey = alpha
-            elif np.ptp(colours := np.asarray(image.convert("RGB")), axis=-1).any():
+            elif ((colours := np.asarray(image.convert("RGB"))) != colours[..., :1]).any():
                 grey = colours.max(axis=-1) / colours.max()
                 grey = grey > 0 if image.mode == "P" else grey
     return grey, next((white for white in (1, 255) if grey.max() <= white), 65535)

@@ -59,7 +59,7 @@ class Provenance:
             raise InputError(gone, "views", split, "use cameras(), or restore the data set")
         views = read_views(self.method, self.data, split, truth)
         warn_of_changes(views, self.method, self.images)
-        views = views.relative_to(self.offset or views.offset)
+        views = views.relative_to(self.offset)
         return with_poses(with_region(views, self.region), self.records.get(CAMERAS, {}))
 
     def shots(self, trained: TrainedScene, *splits: str) -> list[Shot]:
@@ -78,7 +78,7 @@ class Provenance:
                 continue
             if split == "train":
                 warn_of_changes(data, self.method, self.images)
-            data = data.relative_to(self.offset or data.offset)
+            data = data.relative_to(self.offset)
             for view in with_poses(data, self.records.get(CAMERAS, {})).views:
                 if (file := view.file) is not None:  # paths are relative to the data set
                     mask = file.mask and replace(file.mask, path=relative(file.mask.path))

@@ -77,7 +77,7 @@ def views_of_run(
             raise InputError(f"{path} is gone", record, "path", "name the data set's folder with --data")
     views = measured_views(method, path) if measured else read_views(method, path, split)
     warn_of_changes(views, method, known)
-    return with_region(views.relative_to(run.offset() or views.offset), run.region())
+    return with_region(views.relative_to(run.offset()), run.region())
 
 
 @lru_cache(maxsize=1 << 14)

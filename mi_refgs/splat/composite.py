@@ -92,10 +92,8 @@ def _inside(sample: Any) -> list[Float]:
     return [dr.select(sample.low_pass, 0, x) for x in (sample.u, sample.v)]
 
 
-def _forward(
-    lists: TileLists, lanes: Lanes, features: int, maps: int
-) -> tuple[list[Float], list[list[Float]]]:
-    """Transmittance and the first `maps` of so many features, depth and alpha, per pixel of the lanes."""
+def _forward(lists: TileLists, lanes: Lanes, features: int) -> list[list[Float]]:
+    """The maps of so many features, of depth and of alpha, per pixel of the lanes."""
 
     def step(surfel: UInt32, some: Bool, active: list[Bool], *state: list[Any]) -> Any:
         row = lists.rows.fetch(surfel, some)
@@ -103,14 +101,14 @@ def _forward(
         for pixel, _, _, active_here, transmittance, out in lanes.each(active, *state):
             sample = lists.primitive.evaluate(row, pixel, lists.camera.near)
             weight, transmittance_after, goes_on = advance(sample, active_here, transmittance)
-            values = _values(lists, row, sample, features)[:maps]
+            values = _values(lists, row, sample, features)
             out = [dr.fma(weight, value, total) for value, total in zip(values, out, strict=True)]
             after.append((goes_on, transmittance_after, out))
         return after
 
-    start = [(mi.Bool(inside), mi.Float(1), [mi.Float(0)] * maps) for inside in lanes.inside]
-    _, transmittance, out = walk(lists, lanes, step, start, "composite")
-    return transmittance, out
+    start = [(mi.Bool(inside), mi.Float(1), [mi.Float(0)] * (features + 2)) for inside in lanes.inside]
+    *_, out = walk(lists, lanes, step, start, "composite")
+    return out
 
 
 def _backward(
@@ -197,7 +195,7 @@ class _Composite(dr.CustomOp):
         self.out = _blank(lists.features + 2, lists.camera)
         self.parts = Lanes.parts(lists) if lists.pairs else []  # Dr.Jit refuses to gather from an empty list
         for lanes, count in self.parts:
-            values = _forward(lists, lanes, count, count + 2)[1]
+            values = _forward(lists, lanes, count)
             lanes.to_raster(_maps(self.out, count), values)
         return self.out
 

@@ -65,15 +65,10 @@ def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
 
 
 def without(scene: Scene, objects: Sequence[Any]) -> Any:
-    environment = scene.environment()
-    return scene_of([*_parts_but(scene, objects), *([] if environment is None else [environment])])
-
-
-def _parts_but(scene: Scene, objects: Sequence[Any]) -> list[Any]:
-    """The shapes of a scene without some, and its emitters that are neither shapes nor the environment."""
-    shapes = all_but(scene.shapes(), objects)
-    lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
-    return [*shapes, *(lamp for lamp in lamps if not mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface))]
+    """The scene without some shapes, with all emitters that are none, the environment last."""
+    emitters = sorted(scene.emitters(), key=lambda one: one.is_environment())
+    own = [one for one in emitters if not mi.has_flag(one.flags(), mi.EmitterFlags.Surface)]
+    return scene_of([*all_but(scene.shapes(), objects), *own])
 
 
 def scene_of(parts: Sequence[Any]) -> Any:
