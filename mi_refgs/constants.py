@@ -33,7 +33,7 @@ GAUSSIAN_LOW_PASS = 0.3  # pixel²: added to a 3D Gaussian's screen covariance, 
 GAUSSIAN_SLOPE_MARGIN = 0.15
 """Part of the image around it beyond which a Gaussian is linearised at the border. [3DGS, released code]"""
 
-TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
+TILE_SIZES = ((512.0, (4, 2)), (1024.0, (8, 4)), (math.inf, (8, 8)))
 """Tile width and height up to each focal length, pixels. [docs/decisions.md]"""
 
 PATCH_EDGE = 8  # pixels: width and height of what one SIMD vector works on, one tile or several
