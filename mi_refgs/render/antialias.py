@@ -9,10 +9,11 @@ import mitsuba as mi
 from mi_refgs.render.stencil import ChosenPixels, neighbours
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.splat import Camera
-from mi_refgs.types import Float, UInt32, Vector3f
+from mi_refgs.types import Bool, Float, UInt32, Vector3f
 
 NODE = 0.5 / math.sqrt(3)  # pixels from the centre, per axis: Gauss-Legendre, exact for cubic radiance
 NODES = [(x, y) for y in (-1, 1) for x in (-1, 1)]  # quadrant of each point
+ONE_RAY = 0.015  # rad, across a pixel: where normals turn by less, one ray serves it inside what is blocked
 STEPS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # steps to the neighbours
 
 Trace = Callable[[ShadingPoints, UInt32], ShadingPoints]  # points of the pixels of these places
@@ -26,7 +27,8 @@ def averaged(
     trace: Trace | None = None,
 ) -> RadianceTerms:
     """Mean over each pixel of the radiance at NODES, under AD. Normals and visibility are interpolated, or
-    beside blocked rays those of NODES found by `trace`; materials are the centre's: textures stay sharp."""
+    beside blocked rays those of NODES found by `trace`, or of the centre where all around are blocked and
+    normals hardly turn; materials are the centre's: textures stay sharp."""
     ray = None if pixels is None else pixels.raster
     normals = [_interpolated(plane, camera, pixels) for plane in points.normal]
     nodes = []
@@ -38,37 +40,47 @@ def averaged(
         free = (1 - x for x in _interpolated(blocked, camera, pixels))
         nodes = [node.replaced(visibility=x) for node, x in zip(nodes, free, strict=True)]
         if trace is not None:
-            near = sum(neighbours(blocked, camera.width, camera.height, STEPS, pixels), blocked) > 0
-            nodes = _traced(nodes, trace, dr.compress(near))
+            around = sum(neighbours(blocked, camera.width, camera.height, STEPS, pixels), blocked)
+            each = (around < len(STEPS) + 1) | _turned([dr.detach(node.normal) for node in nodes])
+            nodes = _traced([*nodes, points], trace, around > 0, each)
     found = [shade(node).known() for node in nodes]
     return RadianceTerms(**{name: sum(terms[name] for terms in found) / len(found) for name in found[0]})
 
 
-def _traced(nodes: list[ShadingPoints], trace: Trace, chosen: UInt32) -> list[ShadingPoints]:
-    """The nodes with what the rays of the chosen pixels find, all traced together."""
-    if not (count := dr.width(chosen)):
-        return nodes
-    dr.eval(nodes)  # in one kernel, not in each gather's
+def _turned(normals: list[Vector3f]) -> Bool:
+    """Whether the normals of nodes turn by more than ONE_RAY across the pixel."""
+    across = (dr.squared_norm(a - b) for a, b in (normals[::3], normals[1:3]))
+    return dr.maximum(*across) > ONE_RAY**2 * dr.squared_norm(normals[0])
+
+
+def _traced(points: list[ShadingPoints], trace: Trace, active: Bool, each: Bool) -> list[ShadingPoints]:
+    """The nodes with what rays of active pixels find, all traced together: `points` are those of NODES and
+    the centre. In pixels `each` (P,) every node has a ray, in the others the centre, for all nodes."""
+    *nodes, centre = points
     # Literal sizes, also those of expanded adjoints, would be other kernels in each step of a fit.
-    lane, size = dr.arange(mi.UInt32, len(nodes) * count), dr.opaque(mi.UInt32, count)
-    every = dr.gather(mi.UInt32, chosen, lane % size)
+    lane, count = dr.arange(mi.UInt32, len(points) * dr.width(each)), dr.opaque(mi.UInt32, dr.width(each))
+    kind = dr.select(active, dr.select(each, mi.UInt32(1), 2), 0)
+    own = dr.select(lane < len(nodes) * count, mi.UInt32(1), 2)
+    dr.eval(kind, points)  # in one kernel, not in each gather's
+    chosen = dr.compress(dr.gather(mi.UInt32, kind, lane % count) == own)
+    if not dr.width(chosen):
+        return nodes
+    pixel, node = chosen % count, chosen // count
+    dr.eval(pixel, node)
 
     def joined(vectors: Iterable[Vector3f]) -> Vector3f:
         return sum(
-            dr.gather(type(v), v, every, lane // size == i, dr.ReduceMode.NoConflicts)
-            for i, v in enumerate(vectors)
+            dr.gather(type(v), v, pixel, node == i, dr.ReduceMode.NoConflicts) for i, v in enumerate(vectors)
         )
 
-    normal, view = joined(node.normal for node in nodes), joined(node.view for node in nodes)
-    attributes = {name: dr.gather(type(x), x, every) for name, x in nodes[0].attributes.items()}
-    found = trace(ShadingPoints(normal, view, attributes), every)
-    for i, node in enumerate(nodes):
-        own = dr.arange(mi.UInt32, count) + i * size
+    normal, view = joined(at.normal for at in points), joined(at.view for at in points)
+    attributes = {name: dr.gather(type(x), x, pixel) for name, x in centre.attributes.items()}
+    found = trace(ShadingPoints(normal, view, attributes), pixel)
+    for i in range(len(nodes)):
         for name, elsewhere in (("visibility", 1), ("indirect", 0)):
             if (values := found.get(name)) is not None:
-                whole = dr.full(type(values), elsewhere, dr.width(node.view))
-                values = dr.gather(type(values), values, own, mode=dr.ReduceMode.NoConflicts)
-                dr.scatter(whole, values, chosen)
+                whole = dr.full(type(values), elsewhere, dr.width(each))
+                dr.scatter(whole, values, pixel, (node == i) | (node == len(nodes)))
                 nodes[i] = nodes[i].replaced(**{name: whole})
     return nodes
 

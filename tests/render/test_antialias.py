@@ -7,7 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import minimum_filter
+import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from mi_refgs.kernels.device import upload
 from mi_refgs.reference.image import bilinear_map
@@ -28,13 +29,15 @@ NODES = np.polynomial.legendre.leggauss(2)[0] / 2  # the Gauss-Legendre rule's t
 
 def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
     """Normals and visibility are interpolated, also beside holes and at the border; or rays are traced in and
-    beside pixels whose ray is blocked, also partly. Elsewhere all light is visible."""
+    beside pixels whose ray is blocked, also partly, one of the centre where all around are blocked and
+    normals are equal. Elsewhere all light is visible."""
     alpha = rng.uniform(0.2, 1, (HEIGHT, WIDTH, 1))
     alpha[[0, 2, 5, 6], [3, 2, 8, 0]] = 0
     alpha[3:6, 3:6] = 0  # a pixel whose neighbours are empty, too
     normals, tint = rng.normal(size=(HEIGHT, WIDTH, 3)) * alpha, rng.random(HEIGHT * WIDTH)
     visibility = np.where(rng.random((HEIGHT, WIDTH)) < 0.1, rng.choice([0, 0.99], (HEIGHT, WIDTH)), 1)
     visibility[0, 0] = 0.5
+    visibility[4:, 6:], normals[3:, 5:] = 0, [0.3, 0.2, 0.9]
     view = replace(seen_from(0.0, 0.3, 3.0, size=WIDTH), height=HEIGHT)
     normal = mi.Vector3f(*(upload(np.ascontiguousarray(plane)) for plane in np.moveaxis(normals, -1, 0)))
     given = {"visibility": upload(visibility.ravel()), "tint": upload(tint)}
@@ -43,22 +46,22 @@ def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
         return at.replaced(visibility=at.view.x, indirect=mi.Color3f(at.tint, mi.Float(of), at.normal.z))
 
     def radiance(at: ShadingPoints) -> RadianceTerms:
-        n = at.normal
-        return RadianceTerms(
-            mi.Color3f(n.x * n.y, n.z, n.z**3), mi.Color3f(at.visibility), at.get("indirect")
-        )
+        n, seen = at.normal, mi.Color3f(at.visibility)
+        return RadianceTerms(mi.Color3f(n.x * n.y, n.z, n.z**3), seen, at.get("indirect"))
 
     points = ShadingPoints(normal, -dr.normalize(view.rays()), given)
     near = (minimum_filter(visibility, 3) < 1).ravel()
-    assert near.any() and not near.all()
+    once = (maximum_filter(visibility, 3) == 0).ravel()
+    assert near.any() and not near.all() and once.sum() == 4
     y, x = (axis.ravel() + 0.5 for axis in np.mgrid[:HEIGHT, :WIDTH])
     expected = np.zeros((2, 3, 3, len(tint)))
     for dx, dy in itertools.product(NODES, NODES):
         n = bilinear_map(normals, x + dx, y + dy).T
         diffuse, nothing = [n[0] * n[1], n[2], n[2] ** 3], np.zeros((3, len(tint)))
         free = bilinear_map(visibility[..., None], x + dx, y + dy)[:, 0]
-        seen = np.where(near, -dr.normalize(view.rays(None, (float(dx), float(dy)))).x.numpy(), 1)
-        beyond = np.where(near, [tint, np.arange(len(tint)), n[2]], 0)
+        own = -dr.normalize(view.rays(None, (float(dx), float(dy))))
+        seen = np.where(near, np.where(once, points.view.x, own.x), 1)
+        beyond = np.where(near, [tint, np.arange(len(tint)), np.where(once, 0.9, n[2])], 0)
         expected += np.array([[diffuse, [free] * 3, nothing], [diffuse, [seen] * 3, beyond]]) / 4
     for own, values in zip((None, trace), expected, strict=True):
         found = averaged(radiance, points, view, None, own)
@@ -79,8 +82,9 @@ def mirror_before_wall(dx: float = 0, dy: float = 0, more: Any = (), **options: 
     return render(scene, replace(view, cx=view.cx - dx, cy=view.cy - dy), Request(("indirect",)))
 
 
-def test_rays_of_nodes_leave_from_their_own_places() -> None:
-    """Traced radiance is the mean of images whose pixels are moved."""
+def test_rays_of_nodes_leave_from_their_own_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Traced radiance is the mean of images whose pixels are moved, where normals turn."""
+    monkeypatch.setattr("mi_refgs.render.antialias._turned", lambda normals: True)
     steps = itertools.product(NODES.tolist(), repeat=2)
     expected = sum(mirror_before_wall(*step, traced_bounces=1).radiance.numpy() / 4 for step in steps)
     found, centre = (mirror_before_wall(traced_bounces=1, antialias=each).radiance for each in (True, False))
