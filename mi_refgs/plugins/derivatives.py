@@ -5,8 +5,8 @@ All parameters of the integrator have, SENSOR of the sensor that is rendered, an
 derivative is 0 only by parameters that the shading does not use, and by those of other sensors.
 
 No derivative, on purpose: scale and shear of `to_world`; a background colour; the mesh; the visibility that
-rays find with it, where they start, and where they hit it after the first time; the side to which a normal is
-turned; what `splat.composite` lists (sort order, tile lists, cuts, clamps)."""
+rays find with it, their number, where they start, and where they hit it after the first time; the side to
+which a normal is turned; what `splat.composite` lists (sort order, tile lists, cuts, clamps)."""
 
 from typing import Any
 

@@ -13,7 +13,9 @@ from mi_refgs.types import Bool, Float, UInt32, Vector3f
 
 NODE = 0.5 / math.sqrt(3)  # pixels from the centre, per axis: Gauss-Legendre, exact for cubic radiance
 NODES = [(x, y) for y in (-1, 1) for x in (-1, 1)]  # quadrant of each point
-ONE_RAY = 0.015  # rad, across a pixel: where normals turn by less, one ray serves it inside what is blocked
+ONE_RAY = (
+    0.015  # rad, between normals of opposite nodes: below, one ray serves a pixel inside what is blocked
+)
 STEPS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # steps to the neighbours
 
 Trace = Callable[[ShadingPoints, UInt32], ShadingPoints]  # points of the pixels of these places
@@ -41,38 +43,40 @@ def averaged(
         nodes = [node.replaced(visibility=x) for node, x in zip(nodes, free, strict=True)]
         if trace is not None:
             around = sum(neighbours(blocked, camera.width, camera.height, STEPS, pixels), blocked)
-            each = (around < len(STEPS) + 1) | _turned([dr.detach(node.normal) for node in nodes])
-            nodes = _traced([*nodes, points], trace, around > 0, each)
+            nodes = _traced(nodes, points, trace, around > 0, (around < len(STEPS) + 1) | _turned(nodes))
     found = [shade(node).known() for node in nodes]
     return RadianceTerms(**{name: sum(terms[name] for terms in found) / len(found) for name in found[0]})
 
 
-def _turned(normals: list[Vector3f]) -> Bool:
-    """Whether the normals of nodes turn by more than ONE_RAY across the pixel."""
-    across = (dr.squared_norm(a - b) for a, b in (normals[::3], normals[1:3]))
-    return dr.maximum(*across) > ONE_RAY**2 * dr.squared_norm(normals[0])
+def _turned(nodes: list[ShadingPoints]) -> Bool:
+    """Whether normals, which are as long as the pixels are opaque, differ by more than ONE_RAY."""
+    first, second, third, fourth = (node.normal for node in nodes)
+    across = dr.maximum(dr.squared_norm(first - fourth), dr.squared_norm(second - third))
+    return across > ONE_RAY**2 * dr.squared_norm(first)
 
 
-def _traced(points: list[ShadingPoints], trace: Trace, active: Bool, each: Bool) -> list[ShadingPoints]:
-    """The nodes with what rays of active pixels find, all traced together: `points` are those of NODES and
-    the centre. In pixels `each` (P,) every node has a ray, in the others the centre, for all nodes."""
-    *nodes, centre = points
+def _traced(
+    nodes: list[ShadingPoints], centre: ShadingPoints, trace: Trace, active: Bool, each: Bool
+) -> list[ShadingPoints]:
+    """The nodes with what rays of active pixels find, all traced together: in pixels `each` (P,) a ray of
+    every node, in the others one of the centre, whose visibility and indirect light all nodes have."""
     # Literal sizes, also those of expanded adjoints, would be other kernels in each step of a fit.
-    lane, count = dr.arange(mi.UInt32, len(points) * dr.width(each)), dr.opaque(mi.UInt32, dr.width(each))
-    kind = dr.select(active, dr.select(each, mi.UInt32(1), 2), 0)
-    own = dr.select(lane < len(nodes) * count, mi.UInt32(1), 2)
-    dr.eval(kind, points)  # in one kernel, not in each gather's
-    chosen = dr.compress(dr.gather(mi.UInt32, kind, lane % count) == own)
+    size = dr.opaque(mi.UInt32, dr.width(each))
+    lane = dr.arange(mi.UInt32, (len(nodes) + 1) * dr.width(each))  # every node, then the centre
+    dr.eval(active, each, nodes, centre)  # in one kernel, not in each gather's
+    pixel, node = lane % size, lane // size
+    wanted = dr.gather(mi.Bool, each, pixel) == (node < len(nodes))
+    chosen = dr.compress(dr.gather(mi.Bool, active, pixel) & wanted)
     if not dr.width(chosen):
         return nodes
-    pixel, node = chosen % count, chosen // count
-    dr.eval(pixel, node)
+    pixel, node = chosen % size, chosen // size
 
     def joined(vectors: Iterable[Vector3f]) -> Vector3f:
         return sum(
             dr.gather(type(v), v, pixel, node == i, dr.ReduceMode.NoConflicts) for i, v in enumerate(vectors)
         )
 
+    points = [*nodes, centre]
     normal, view = joined(at.normal for at in points), joined(at.view for at in points)
     attributes = {name: dr.gather(type(x), x, pixel) for name, x in centre.attributes.items()}
     found = trace(ShadingPoints(normal, view, attributes), pixel)

@@ -84,7 +84,7 @@ def mirror_before_wall(dx: float = 0, dy: float = 0, more: Any = (), **options: 
 
 def test_rays_of_nodes_leave_from_their_own_places(monkeypatch: pytest.MonkeyPatch) -> None:
     """Traced radiance is the mean of images whose pixels are moved, where normals turn."""
-    monkeypatch.setattr("mi_refgs.render.antialias._turned", lambda normals: True)
+    monkeypatch.setattr("mi_refgs.render.antialias._turned", lambda nodes: True)
     steps = itertools.product(NODES.tolist(), repeat=2)
     expected = sum(mirror_before_wall(*step, traced_bounces=1).radiance.numpy() / 4 for step in steps)
     found, centre = (mirror_before_wall(traced_bounces=1, antialias=each).radiance for each in (True, False))
