@@ -62,8 +62,7 @@ def test_region_of_cameras_is_what_they_show_entirely() -> None:
 def test_outward_or_coincident_cameras_have_no_region() -> None:
     refused(lambda: region_of([view_from(np.array([4.0, 0, 0]))]), "do not look at one point")
     origins = np.array([[4, 0, 1], [0, 4, 1], [-4, 0, 1], [0, -4, 1.0]])
-    turn = np.diag([-1.0, 1, -1, 1])
-    outward = [replace(v, to_world=v.to_world @ turn) for v in map(view_from, origins)]
+    outward = [replace(v, to_world=v.to_world @ np.diag([-1.0, 1, -1, 1])) for v in map(view_from, origins)]
     refused(lambda: region_of(outward), "in front of them")
     inward = [view_from(origin) for origin in origins]
     assert region_of([*inward, view_from(np.array([4.0, 4, 1])), *outward[:2]]).radius > 0

@@ -151,8 +151,7 @@ def test_what_comes_too_late_holds_no_views_out(
     trainer = begin(methods.load(file, "quick", [*SETTINGS, "iterations=5"]), views, run, warn=warn)
     trainer.train()
     assert summary(trainer) == [("colour_alone", 2, False)] and len(trainer.data.views) == 9
-    told = [call.args[0].partition(":")[0] for call in warn.mock_calls]
-    assert told[-2:] == ["surfels_2x", "surfels_4x"]
+    assert [call.args[0].partition(":")[0] for call in warn.mock_calls][-2:] == ["surfels_2x", "surfels_4x"]
 
 
 @pytest.mark.parametrize("given", [{"data": {"downscale": 2}}, [" data.downscale=2"], ["data={downscale=2}"]])

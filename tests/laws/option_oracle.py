@@ -184,6 +184,5 @@ def _free(position: Array, normal: Array, count: int) -> Array:
     for place, about in zip(position, normal, strict=True):
         rays = hemisphere(count, about)
         start = place + occlusion.beyond(about, rays, OFFSET_VOXELS * found.voxel, ALONG)
-        distance = occlusion.mesh_distance(found.vertices, found.faces, start, rays)
-        free.append(~np.isfinite(distance))
+        free.append(~np.isfinite(occlusion.mesh_distance(found.vertices, found.faces, start, rays)))
     return np.stack(free)

@@ -127,8 +127,7 @@ class Case:
 
     @property
     def names(self) -> list[str]:
-        channels = self.made.trained.surfels.raw
-        return [name for name in suffixes() if name in channels or name in GEOMETRY]
+        return [name for name in suffixes() if name in self.made.trained.surfels.raw or name in GEOMETRY]
 
     def of_whole(self, whole: Maps) -> Maps:
         """What the crop window leaves of maps of the whole film."""
@@ -171,8 +170,7 @@ def by_viewer_of_a_run(case: Case) -> Maps:
     view, drawable = Camera.from_sensor(sensor()), ReconstructionView(case.made.trained)
     pose = Pose(view.pose(), 2 * np.arctan(HEIGHT / 2 / -view.fy[0]), WIDTH / HEIGHT, NEAR)
     camera = pose.camera(WIDTH, HEIGHT)
-    around = not case.alone and case.made.trained.surroundings is not None
-    backdrop = BACKGROUND if around else "white"
+    backdrop = BACKGROUND if not case.alone and case.made.trained.surroundings is not None else "white"
     assert backdrop in drawable.backdrops
     found = {}
     for what in [IMAGE, *drawable.variables[1 + case.part :: 3]]:

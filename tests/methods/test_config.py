@@ -132,8 +132,7 @@ def test_a_scaled_window_keeps_its_events(start: int, length: int, every: int, f
     due = [i for i in range(last + 1) if window.due(i)]
     if factor * every >= 1:
         np.testing.assert_allclose(due, [factor * every * k for k in events], atol=0.5 + 1e-6)
-        expected = [None, *np.diff(due).tolist()]
-        assert [window.since(i) for i in due] == expected[: len(due)]
+        assert [window.since(i) for i in due] == [None, *np.diff(due).tolist()][: len(due)]
 
 
 MANY_EVENTS = """

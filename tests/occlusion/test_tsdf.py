@@ -51,8 +51,7 @@ def test_surface_is_closed_outward_and_within_a_voxel(name: str) -> None:
     """Both directions of the Hausdorff distance, so that neither extra nor missing surface passes."""
     shape = SHAPES[name]
     poses = ring_of_views(12)
-    depths = [ref.depth_map(shape, p, FOCAL, SIZE) for p in poses]
-    mesh = meshes.extract_mesh(fuse(depths, poses))
+    mesh = meshes.extract_mesh(fuse([ref.depth_map(shape, p, FOCAL, SIZE) for p in poses], poses))
     error = np.abs(shape(mesh.vertices.astype(np.float64))) / mesh.voxel
     solid = as_trimesh(mesh)
     assert error.max() < 1 and np.sqrt(np.mean(error**2)) < 0.2, (error.max(), np.sqrt(np.mean(error**2)))

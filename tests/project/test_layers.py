@@ -41,8 +41,7 @@ def imports(tree: ast.Module) -> Iterator[str]:
 
 def test_imports_point_down() -> None:
     floor = {folder: level for level, folders in enumerate(FLOORS) for folder in folders}
-    folders = {module.partition(".")[0] for module in TREES}
-    assert folders == {*floor, "reference", "__init__"}
+    assert {module.partition(".")[0] for module in TREES} == {*floor, "reference", "__init__"}
     for module, tree in TREES.items():
         folder = module.partition(".")[0]
         for name in imports(tree):

@@ -104,8 +104,7 @@ def test_other_states_are_refused(balls: Reconstruction) -> None:
     refused(lambda: make({name: x for name, x in arrays.items() if name != "scale"}), "scale")
     refused(lambda: make(arrays), "shading: light: reflectance = split_sum needs one")
     traced = ShadingOptions(occlusion=True, traced_bounces=2, diffuse="irradiance")
-    lit = arrays | {"light": sky(16)}
-    refused(lambda: make(lit, shading=traced), "occlusion: there is no mesh to trace")
+    refused(lambda: make(arrays | {"light": sky(16)}, shading=traced), "occlusion: there is no mesh to trace")
     refused(lambda: make(arrays | {"opacity": np.full_like(arrays["opacity"], np.nan)}), "NaN")
     refused(lambda: make(arrays | {"light": np.full((8, 16, 3), np.nan)}), "NaN")
     white = {"type": "refgs", **balls.trained.surfels.raw, "background": mi.Color3f(np.nan)}

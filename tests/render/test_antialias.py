@@ -39,8 +39,10 @@ def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
     visibility[0, 0] = 0.5
     visibility[4:, 6:], normals[3:, 5:] = 0, [0.3, 0.2, 0.9]
     view = replace(seen_from(0.0, 0.3, 3.0, size=WIDTH), height=HEIGHT)
-    normal = mi.Vector3f(*(upload(np.ascontiguousarray(plane)) for plane in np.moveaxis(normals, -1, 0)))
     given = {"visibility": upload(visibility.ravel()), "tint": upload(tint)}
+
+    def vectors(planes: np.ndarray) -> mi.Vector3f:
+        return mi.Vector3f(np.reshape(planes, (-1, 3)).T.astype(np.float32))
 
     def trace(at: ShadingPoints, of: mi.UInt32) -> ShadingPoints:
         return at.replaced(visibility=at.view.x, indirect=mi.Color3f(at.tint, mi.Float(of), at.normal.z))
@@ -49,24 +51,33 @@ def test_nodes_against_the_reference(rng: np.random.Generator) -> None:
         n, seen = at.normal, mi.Color3f(at.visibility)
         return RadianceTerms(mi.Color3f(n.x * n.y, n.z, n.z**3), seen, at.get("indirect"))
 
-    points = ShadingPoints(normal, -dr.normalize(view.rays()), given)
-    near = (minimum_filter(visibility, 3) < 1).ravel()
-    once = (maximum_filter(visibility, 3) == 0).ravel()
+    points = ShadingPoints(vectors(normals), -dr.normalize(view.rays()), given)
+    near, once = (minimum_filter(visibility, 3) < 1).ravel(), (maximum_filter(visibility, 3) == 0).ravel()
     assert near.any() and not near.all() and once.sum() == 4
     y, x = (axis.ravel() + 0.5 for axis in np.mgrid[:HEIGHT, :WIDTH])
-    expected = np.zeros((2, 3, 3, len(tint)))
-    for dx, dy in itertools.product(NODES, NODES):
-        n = bilinear_map(normals, x + dx, y + dy).T
-        diffuse, nothing = [n[0] * n[1], n[2], n[2] ** 3], np.zeros((3, len(tint)))
-        free = bilinear_map(visibility[..., None], x + dx, y + dy)[:, 0]
-        own = -dr.normalize(view.rays(None, (float(dx), float(dy))))
-        seen = np.where(near, np.where(once, points.view.x, own.x), 1)
-        beyond = np.where(near, [tint, np.arange(len(tint)), np.where(once, 0.9, n[2])], 0)
-        expected += np.array([[diffuse, [free] * 3, nothing], [diffuse, [seen] * 3, beyond]]) / 4
-    for own, values in zip((None, trace), expected, strict=True):
-        found = averaged(radiance, points, view, None, own)
-        for term, wanted in zip((found.diffuse, found.specular, found.indirect), values, strict=True):
-            np.testing.assert_allclose(0 * wanted if term is None else term.numpy(), wanted, atol=1e-5)
+
+    def expected(normals: np.ndarray) -> np.ndarray:
+        total, centre = np.zeros((2, 3, 3, len(tint))), normals[..., 2].ravel()
+        for dx, dy in itertools.product(NODES, NODES):
+            n = bilinear_map(normals, x + dx, y + dy).T
+            diffuse, nothing = [n[0] * n[1], n[2], n[2] ** 3], np.zeros((3, len(tint)))
+            free = bilinear_map(visibility[..., None], x + dx, y + dy)[:, 0]
+            own = -dr.normalize(view.rays(None, (float(dx), float(dy))))
+            seen = np.where(near, np.where(once, points.view.x, own.x), 1)
+            beyond = np.where(near, [tint, np.arange(len(tint)), np.where(once, centre, n[2])], 0)
+            total += np.array([[diffuse, [free] * 3, nothing], [diffuse, [seen] * 3, beyond]]) / 4
+        return total
+
+    turn = rng.normal(size=normals.shape)
+    slopes = (expected(normals + 1e-3 * turn) - expected(normals - 1e-3 * turn)) / 2e-3
+    for own, *values in zip((None, trace), expected(normals), slopes, strict=True):
+        dr.enable_grad(points.normal)
+        dr.set_grad(points.normal, vectors(turn))
+        found = averaged(radiance, points, view, None, own).filled()
+        terms = found.diffuse, found.specular, found.indirect
+        np.testing.assert_allclose([term.numpy() + 0 * tint for term in terms], values[0], atol=1e-5)
+        moved = dr.forward_to(*terms)
+        np.testing.assert_allclose([term.numpy() + 0 * tint for term in moved], values[1], atol=1e-4)
 
 
 def mirror_before_wall(dx: float = 0, dy: float = 0, more: Any = (), **options: Any) -> Any:

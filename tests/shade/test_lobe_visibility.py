@@ -30,8 +30,7 @@ def test_points_repeat_differ_between_pixels_and_are_even() -> None:
     for count, bound in ((4, 0.3), (16, 0.08), (64, 0.02), (256, 0.005)):
         u, v = points(count)
         assert min(u.min(), v.min()) >= 0 and max(u.max(), v.max()) < 1
-        error = (u * np.cos(2 * np.pi * v) ** 2).mean(1) - 0.25
-        assert np.abs(error).max() < bound, count
+        assert np.abs((u * np.cos(2 * np.pi * v) ** 2).mean(1) - 0.25).max() < bound, count
 
 
 @pytest.mark.parametrize("roughness", [0.05, 0.6, slow(0.3), slow(1.0)])

@@ -326,5 +326,4 @@ def test_the_cut_biases_gradients_by_what_is_documented(opacity: float) -> None:
     assert mass == pytest.approx(area * (opacity - ALPHA_MIN), rel=5e-3)
     bias = ALPHA_MIN * np.log(opacity / ALPHA_MIN) / (opacity - ALPHA_MIN)
     assert by_size / (2 * area * (opacity - ALPHA_MIN)) - 1 == pytest.approx(-bias, abs=5e-3)
-    slope = area * opacity * (1 - opacity)
-    assert by_opacity / slope - 1 == pytest.approx(-ALPHA_MIN / opacity, abs=5e-3)
+    assert by_opacity / (area * opacity * (1 - opacity)) - 1 == pytest.approx(-ALPHA_MIN / opacity, abs=5e-3)

@@ -115,8 +115,7 @@ def test_oblong_pixels_cover_the_field_of_view_of_square_ones_and_samples_are_of
         camera = Pose(np.eye(4), 0.8, 2.0).camera(width, height, offset)
         assert height / 2 / abs(camera.fy[0]) == pytest.approx(math.tan(0.4))
         assert width / 2 / abs(camera.fx[0]) == pytest.approx(2 * math.tan(0.4))
-        shift = width / 2 - camera.cx[0], height / 2 - camera.cy[0]
-        assert shift == pytest.approx(offset, abs=1e-5)
+        assert (width / 2 - camera.cx[0], height / 2 - camera.cy[0]) == pytest.approx(offset, abs=1e-5)
 
 
 class Plain(ReconstructionView):
