@@ -58,23 +58,21 @@ def _traced(
 ) -> list[ShadingPoints]:
     """The nodes with what rays of active pixels find, all traced together: in pixels `each` (P,) a ray of
     every node, in the others one of the centre, whose visibility and indirect light all nodes have."""
-    # Literal sizes, also those of expanded adjoints, would be other kernels in each step of a fit.
-    size = dr.opaque(mi.UInt32, dr.width(each))
-    lane = dr.arange(mi.UInt32, (len(nodes) + 1) * dr.width(each))  # every node, then the centre
+    points = [*nodes, centre]
+    lane = dr.arange(mi.UInt32, len(points) * dr.width(each))
     dr.eval(active, each, nodes, centre)  # in one kernel, not in each gather's
-    pixel, node = lane % size, lane // size
+    pixel, node = lane // len(points), lane % len(points)
     wanted = dr.gather(mi.Bool, each, pixel) == (node < len(nodes))
     chosen = dr.compress(dr.gather(mi.Bool, active, pixel) & wanted)
     if not dr.width(chosen):
         return nodes
-    pixel, node = chosen % size, chosen // size
+    pixel, node = chosen // len(points), chosen % len(points)
 
     def joined(vectors: Iterable[Vector3f]) -> Vector3f:
         return sum(
             dr.gather(type(v), v, pixel, node == i, dr.ReduceMode.NoConflicts) for i, v in enumerate(vectors)
         )
 
-    points = [*nodes, centre]
     normal, view = joined(at.normal for at in points), joined(at.view for at in points)
     attributes = {name: dr.gather(type(x), x, pixel) for name, x in centre.attributes.items()}
     found = trace(ShadingPoints(normal, view, attributes), pixel)
