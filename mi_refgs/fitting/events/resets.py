@@ -62,9 +62,9 @@ class Restart(Event[Trainer]):
     always: ClassVar[bool] = True
 
     def due(self, trainer: Trainer) -> bool:
-        before, _ = trainer.method.stage_at(max(trainer.iteration, 1))
-        name, stage = trainer.method.stage_at(trainer.iteration + 1)
-        return bool(stage.restart) and name != before
+        method, after = trainer.method, trainer.iteration
+        before, (name, stage) = method.stage_at(max(after, 1))[0], method.stage_at(after + 1)
+        return bool(stage.restart) and name != before and after < method.iterations
 
     def apply(self, trainer: Trainer) -> None:
         fit, method, raw = trainer.fit, trainer.method, trainer.surfels.to_numpy()

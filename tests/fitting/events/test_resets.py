@@ -1,5 +1,6 @@
 """Resets of opacity and restarts of materials: what changes, and what must not."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,3 +52,6 @@ def test_restart_of_materials_leaves_geometry(trainer: Trainer) -> None:
     np.testing.assert_allclose(found["metallic"], 0.3, rtol=1e-5)
     np.testing.assert_allclose(found["roughness"], 0.3, rtol=1e-5)
     assert np.abs(found["albedo"] - 0.5).max() <= 0.025 + 1e-6
+    ended = Trainer(replace(trainer.method, iterations=8), ball())  # no stage begins after it
+    ended.fit.iteration = 8
+    assert not any(event.due(ended) for event in ended.setup.events if event.name == "restart")
