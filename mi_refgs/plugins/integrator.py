@@ -51,7 +51,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
        then blend radiance). (Default: the first that the reflectance model has)
      * reflectance (string): ``split_sum`` (diffuse and GGX specular), ``radiance`` (SH colour, needs no
        light), ``mirror`` (3DGS-DR), ``gaussian_shader``, ``monte_carlo`` (R3DG), ``displayed`` (encoded SH
-       colours of a splat), or a registered model. (Default: the first whose attributes the surfels have)
+       colours of a splat), or a registered model. (Default: the first that uses all attributes, else some)
      * diffuse (string): ``sh`` (view-dependent SH colour) or ``irradiance`` (albedo times the light that the
        specular term leaves). (Default: ``sh`` if there is one)
      * dominant, antialias (bool): Slower and more accurate: look the light up along the GGX lobe's dominant
@@ -158,8 +158,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.changed = True
         self.filtered_light = None
         # Cached materials depend on geometry, ambient ratios on everything. No keys: all may have changed.
-        geometry_changed = not keys or not {*keys}.isdisjoint(self.surfels.primitive.widths)
-        if geometry_changed or self.shading.ambient_rays:
+        geometry = {*self.surfels.primitive.widths, *self.surfels.primitive.optional}
+        if not keys or not geometry.isdisjoint(keys) or self.shading.ambient_rays:
             self.caches_valid = False
 
     def aov_names(self) -> list[str]:
