@@ -16,7 +16,10 @@ from mi_refgs.errors import InputError
 
 PROBE_TIMEOUT = 60.0  # time limit of the trial kernel in seconds; it usually takes half a second
 
-EXTRAS = {"lpips": "lpips", "capture": "pycolmap", "view": "viser", "export": "xatlas"}
+EXTRAS = {
+    "lpips": "lpips", "capture": "pycolmap", "view": "viser", "export": "xatlas", "splats": "gaussforge",
+    "cluster": "dask",
+}  # fmt: skip
 """Extra of pyproject.toml that a command requires → a distribution that it installs."""
 
 # Runs in a separate process, because an LLVM that cannot compile this kernel aborts instead of raising.

@@ -101,7 +101,7 @@ def _look(view: View) -> _Look:
     grey = np.clip(image[..., 1], 0, 1)
     bend = grey[1:-1, 1:-1] * 4 - grey[1:-1, :-2] - grey[1:-1, 2:] - grey[:-2, 1:-1] - grey[2:, 1:-1]
     colour = linear_from_srgb(np.clip(image[::step, ::step], 0, 1)).mean(axis=-1)
-    sharp = bend.var() / max(grey.mean() ** 2, 1e-6) if weight.any() else np.nan
+    sharp = bend.var() / max(grey.mean() ** 2, 1e-6) if bend.size and weight.any() else np.nan
     bright = np.average(colour, weights=weight) if weight.any() else np.nan
     off = np.inf if view.has_alpha else border_of(off_backdrop(image[::step, ::step]))
     sharpness, brightness = float(np.log2(sharp + 1e-12)), float(np.log2(bright + 1e-6))

@@ -148,8 +148,9 @@ class Frame:
             focal.append(pixels)
         if focal[0] is None:
             raise InputError("missing", self.file, "camera_angle_x", "give radians, or fl_x in pixels")
-        cx, cy = self.number("cx", positive=True), self.number("cy", positive=True)
-        return focal[0], focal[1] or focal[0], cx or width / 2, cy or height / 2
+        cx, cy = self.number("cx"), self.number("cy")
+        middle = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+        return focal[0], focal[1] or focal[0], *middle
 
 
 def _frames(folder: Path, split: str) -> list[Frame]:

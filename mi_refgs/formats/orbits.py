@@ -12,6 +12,7 @@ from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
+from mi_refgs.surfels.attributes import sigmoid
 from mi_refgs.surfels.table import Surfels
 
 CAMERAS = {"test": 4, "train": 60}  # cameras around an object without a data set
@@ -84,4 +85,4 @@ def _weighted(surfels: Surfels) -> tuple[np.ndarray, np.ndarray]:
     raw = surfels.to_numpy()
     if not len(raw["position"]):
         raise InputError("there are none", "surfels", remedy="cameras have nothing to look at")
-    return raw["position"].astype(np.float64), 1 / (1 + np.exp(-raw["opacity"][:, 0].astype(np.float64)))
+    return raw["position"].astype(np.float64), sigmoid(raw["opacity"][:, 0].astype(np.float64))

@@ -128,7 +128,7 @@ def relight(
 def _true_views(method: Method, folder: Path, views: Dataset) -> Dataset:
     """Read the test views under a light of the data set; raises InputError unless they have its cameras."""
     options: dict[str, Any] = {"downscale": method.data.downscale or 1, "images": "exr", "truth": False}
-    found = read_dataset(folder, "test", background="black", **options)
+    found = read_dataset(folder, "test", background="black", **options).relative_to(views.offset)
     theirs, ours = ([view.to_world for view in data.views] for data in (found, views))
     if len(theirs) != len(ours) or np.abs(np.subtract(theirs, ours)).max() > 1e-6:
         what = f"not the cameras of {views.path}"

@@ -103,7 +103,7 @@ def _sorted(tile: UInt32, surfel: UInt32, depth: Float, surfels: int, tiles: int
     """Tiles and surfels of pairs, sorted by tile, then by depth: a stable radix sort of one integer of all
     three, in three passes. Bits of positive floats are in their order; the last digits drop if the
     largest depth is more than four times the smallest."""
-    high = (tiles - 1).bit_length()
+    high = max((tiles - 1).bit_length(), 1)
     low = max((surfels - 1).bit_length(), 64 - DEPTH_BITS - high)  # the same for most numbers of surfels
     middle = 64 - low - high
     key = dr.reinterpret_array(mi.UInt32, depth)

@@ -38,7 +38,7 @@ def from_points(
     largest: bound of the scales. attributes: those beside the geometry (default: all). degree: of spherical
     harmonics by attribute, 0 by default. initial: activated values by attribute, such as `roughness=0.3`.
     colours: of the constant coefficient of radiance_sh (grey 0.5 by default). Raises InputError for wrong
-    shapes, NaN, unknown attributes and values out of range.
+    shapes, NaN in points, unknown attributes and values out of range.
     """
     points = _check("points", points, np.shape(points)[:1])
     count = len(points)

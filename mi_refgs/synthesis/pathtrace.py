@@ -159,10 +159,12 @@ class Tracer:
         film: dict[str, Any] = {"type": "hdrfilm", "component_format": "float32", "rfilter": {"type": "box"}}
         film |= {"width": self.width, "height": self.height, "pixel_format": "rgb" if opaque else "rgba"}
         lens: dict[str, Any] = {"type": "perspective", "fov": options.fov, "fov_axis": "smaller"}
-        lens |= {"near_clip": 0.1 * (low - cameras.radius), "far_clip": 10 * (high + cameras.reach)}
+        least = NEAR * cameras.radius
+        near, far = max(0.1 * (low - cameras.radius), least), 10 * (high + cameras.reach)
+        lens |= {"near_clip": near, "far_clip": far}
         if like is not None:
             lens |= {"fov": math.degrees(2 * math.atan(0.5 * like.width / like.focal)), "fov_axis": "x"}
-            lens |= {"near_clip": max(float(like.near[0]), NEAR * cameras.radius), "far_clip": MAX_NUMBER}
+            lens |= {"near_clip": max(float(like.near[0]), least), "far_clip": MAX_NUMBER}
             for axis, centre, size in (("x", like.cx, like.width), ("y", like.cy, like.height)):
                 lens[f"principal_point_offset_{axis}"] = 0.5 - float(centre[0]) / size
         self.sensor = mi.load_dict(lens | {"sampler": {"type": "multijitter"}, "film": film})

@@ -195,7 +195,7 @@ def test_transforms_file_defines_the_cameras_of_an_import(theirs: Path, tmp_path
         ({"frames": []}, "frames: empty"),
         ({"w": None}, "w: 0 × 48 is no size of an image"),
         ({"fl_x": -3}, "fl_x: -3 is not a positive number"),
-        ({"cx": 0}, "cx: 0 is not a positive number"),
+        ({"cx": "0"}, "cx: '0' is not a number"),
         ({"k1": 0.1}, "k1: no pinhole"),
         ({"camera_model": "OPENCV_FISHEYE"}, "camera_model: no pinhole"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model: the lens 'EQUIRECTANGULAR' is not"),
