@@ -13,7 +13,7 @@ from mi_refgs.constants import GOLDEN_ANGLE
 from mi_refgs.fitting.ssim import ssim
 from mi_refgs.io.images import SATURATED
 from mi_refgs.kernels.rows import columns_of
-from mi_refgs.render.stencil import neighbours
+from mi_refgs.render.stencil import STEPS, neighbours
 from mi_refgs.shade.light.light import Light
 from mi_refgs.types import Bool, Color3f, Float, TensorXf, Vector3f
 
@@ -95,8 +95,7 @@ def smoothness(
 
 def sobel(plane: Float, width: int, height: int) -> tuple[Float, Float]:
     """Sobel derivatives (∂x, ∂y) of a plane, divided by 8 (per pixel), the border repeated."""
-    steps = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]
-    at = dict(zip(steps, neighbours(plane, width, height, steps), strict=True))
+    at = dict(zip(STEPS, neighbours(plane, width, height, STEPS), strict=True))
     along_x = at[1, -1] - at[-1, -1] + 2 * (at[1, 0] - at[-1, 0]) + at[1, 1] - at[-1, 1]
     along_y = at[-1, 1] - at[-1, -1] + 2 * (at[0, 1] - at[0, -1]) + at[1, 1] - at[1, -1]
     return along_x / 8, along_y / 8

@@ -14,7 +14,7 @@ from mi_refgs.data.transforms import Frame
 from mi_refgs.data.view import FileCamera
 from mi_refgs.errors import InputError
 from mi_refgs.formats.format import Shot
-from mi_refgs.io.files import make_folder, read_any_json, write_json
+from mi_refgs.io.files import read_any_json, write_json
 from mi_refgs.io.images import ENDINGS
 from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.splat.camera import Camera
@@ -33,7 +33,6 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot]) -> list[Pa
     Paths are relative to the data set, in COLMAP's files to its folder `images` where all images are there.
     """
     sparse = target / "sparse" / "0"
-    make_folder(sparse)
     write_json(target / TRANSFORMS, transforms(shots))
     files = [_file(shot) for shot in shots]
     names = [file.path.as_posix() for file in files]

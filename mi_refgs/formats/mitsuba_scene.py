@@ -10,14 +10,13 @@ import trimesh
 
 from mi_refgs.formats.baking import TexturedMesh, bake
 from mi_refgs.formats.format import Shot
-from mi_refgs.io.files import make_folder, write_bytes
+from mi_refgs.io.files import write_bytes
 from mi_refgs.io.images import srgb_from_linear, write_png
 from mi_refgs.render.scene_xml import add_sensor, put, write_xml
-from mi_refgs.runs.trained_scene import TrainedScene
+from mi_refgs.runs.trained_scene import LIGHT_MAP, MESH, SCENE, TrainedScene
 
 MAX_DEPTH = 6  # edges of a path, as in `refgs dataset`
 SAMPLES = 256  # samples per pixel by default; -D spp=16 on Mitsuba's command line chooses others
-SCENE, MESH, LIGHT = "scene.xml", "mesh.ply", "envmap.exr"
 TEXTURES = {"base_color": "albedo.png", "roughness": "roughness.png", "metallic": "metallic.png"}
 ROUGHNESSES = (0.0, 0.125, 0.1875, 0.25, 0.5, 0.75, 1.0)
 DIFFUSE_RATIO = (0.9594, 0.9471, 0.9431, 0.9410, 0.9391, 0.9330, 0.9210)
@@ -38,7 +37,6 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     Only the base colour of dielectrics is lower by 4 to 8 %, because `principled` has another diffuse base.
     """
     made = bake(trained, tuple(shots), faces, texture)
-    make_folder(target)
     mesh = trimesh.Trimesh(made.vertices, made.faces, vertex_normals=made.normals, process=False)
     mesh.vertex_attributes.update({"s": made.uv[:, 0], "t": 1 - made.uv[:, 1]})  # v: from the first row
     data: Any = mesh.export(file_type="ply", vertex_normal=True)
@@ -46,11 +44,11 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     write_png(target / TEXTURES["base_color"], srgb_from_linear(base_colour(made)))
     for name in ("roughness", "metallic"):
         write_png(target / TEXTURES[name], getattr(made, name))
-    made.light.write(target / LIGHT)
+    made.light.write(target / LIGHT_MAP)
     scene = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(scene, "default", name="spp", value=str(SAMPLES))
     put(ElementTree.SubElement(scene, "integrator", type="path"), max_depth=MAX_DEPTH, hide_emitters=True)
-    put(ElementTree.SubElement(scene, "emitter", type="envmap"), filename=LIGHT)
+    put(ElementTree.SubElement(scene, "emitter", type="envmap"), filename=LIGHT_MAP)
     shape = ElementTree.SubElement(scene, "shape", type="ply", id="object")
     put(shape, filename=MESH)
     bsdf = ElementTree.SubElement(shape, "bsdf", type="principled")
@@ -61,7 +59,7 @@ def write(trained: TrainedScene, target: Path, shots: Sequence[Shot], faces: int
     for index, shot in enumerate(shot for shot in shots if shot.split == shots[0].split):
         add_sensor(scene, shot.camera, f"sensor_{index}")
     write_xml(target / SCENE, scene)
-    return [target / name for name in (SCENE, MESH, *TEXTURES.values(), LIGHT)]
+    return [target / name for name in (SCENE, MESH, *TEXTURES.values(), LIGHT_MAP)]
 
 
 def base_colour(made: TexturedMesh) -> np.ndarray:

@@ -29,7 +29,7 @@ def own_light(emitter: Any) -> tuple[Any, Any]:
     """A trainable copy of an `envmap` or `constant` emitter, and its `to_world`; InputError for any other."""
     params = mi.traverse(emitter)
     if "data" in params:
-        radiance, _ = _map_radiance(params, emitter)
+        radiance, _ = _map_radiance(params)
         turned = mi.Transform4f(params["to_world"])
         rotated(None, turned)  # checks it
         return EnvironmentLight.from_radiance(radiance.numpy()), turned
@@ -48,7 +48,7 @@ def emitter_light(emitter: Any, filtered: bool = True, other: Light | None = Non
         return DirectionalLight(other, dr.normalize(towards), bounded(arriving, arriving))
     if "data" not in params:
         return ConstantLight(_constant_radiance(params, emitter))
-    radiance, resampled = _map_radiance(params, emitter)
+    radiance, resampled = _map_radiance(params)
     if resampled and dr.grad_enabled(params["data"]):
         what = f"has no derivative: a map of {resampled} is resampled"
         remedy = f"use one of h x 2h, h a multiple of 4 from {MIN_HEIGHT} to {MAX_HEIGHT}"
@@ -137,7 +137,7 @@ def rotated(light: Any, to_world: Any) -> Any:
     return RotatedLight(light, mi.Matrix3f(np.linalg.inv(value).astype(np.float32)), motion)
 
 
-def _map_radiance(params: Any, emitter: Any) -> tuple[Any, str]:
+def _map_radiance(params: Any) -> tuple[Any, str]:
     """Radiance (h, 2h, 3) of an `envmap` times its scale, and the size of the map if it was resampled."""
     data = params["data"]
     rows, columns, channels = (int(x) for x in data.shape)

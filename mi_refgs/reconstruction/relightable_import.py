@@ -8,6 +8,7 @@ import numpy as np
 
 from mi_refgs import methods
 from mi_refgs.constants import DEFAULT_PRESET
+from mi_refgs.data.checks import border_of
 from mi_refgs.data.dataset import held_out
 from mi_refgs.errors import InputError
 from mi_refgs.fitting import runner
@@ -80,7 +81,7 @@ def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> 
     seen = [made.render(camera, size=64)[..., 3] for camera in cameras]
     if max(alpha.max() for alpha in seen) < OPAQUE_BORDER:
         raise InputError("views of the surfels show nothing", path, "opacity", "export the file again")
-    border = [np.concatenate([x[0], x[-1], x[:, 0], x[:, -1]]).mean() for x in seen]
+    border = [border_of(alpha).mean() for alpha in seen]
     if np.mean(border) > OPAQUE_BORDER:
         what = "views are opaque up to the border, so this is a scene, not a free object"
         raise InputError(what, path, "surfels", "crop the object with --box")

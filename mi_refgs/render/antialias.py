@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 import drjit as dr
 import mitsuba as mi
 
-from mi_refgs.render.stencil import ChosenPixels, neighbours
+from mi_refgs.render.stencil import STEPS, ChosenPixels, neighbours
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints
 from mi_refgs.splat import Camera
 from mi_refgs.types import Bool, Float, UInt32, Vector3f
@@ -14,7 +14,6 @@ from mi_refgs.types import Bool, Float, UInt32, Vector3f
 NODE = 0.5 / math.sqrt(3)  # pixels from the centre, per axis: Gauss-Legendre, exact for cubic radiance
 NODES = [(x, y) for y in (-1, 1) for x in (-1, 1)]  # quadrant of each point
 ONE_RAY = 0.015  # rad, between normals of opposite nodes: below, one ray serves a pixel among blocked ones
-STEPS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # steps to the neighbours
 
 Trace = Callable[[ShadingPoints, UInt32], ShadingPoints]  # points of the pixels of these places
 

@@ -13,6 +13,7 @@ from mi_refgs.types import Array, Arrays, Bool, Float, UInt32
 
 # A step (dx, dy) in pixels, each -1, 0 or 1.
 Step = tuple[int, int]
+STEPS: list[Step] = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1) if (x, y) != (0, 0)]  # to the neighbours
 NOWHERE = 0xFFFFFFFF  # place of a pixel that was not chosen
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import make_folder, read_json, write_json
+from mi_refgs.io.files import read_json, write_json
 from mi_refgs.io.ownership import RUN, own_folder
 from mi_refgs.methods.method import Method
 from mi_refgs.occlusion.mesh import write_mesh
@@ -41,7 +41,6 @@ def export(fitted: TrainedScene, folder: Path, camera: Camera, more: Sequence[Ca
     light, near, around, behind = (name if name in write else None for name in names.OPTIONAL)
     mesh = names.MESH if names.MESH in write else None
     with Run(folder).alone():
-        make_folder(folder)
         for name in {*names.ARTEFACTS} - {*written}:
             (folder / name).unlink(missing_ok=True)
         for name, write_file in write.items():

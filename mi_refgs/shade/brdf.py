@@ -69,7 +69,6 @@ def table() -> np.ndarray:
     computed = compute_table()
     with suppress(OSError, InputError):
         if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, lambda temporary: np.save(temporary, computed))
     return computed
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mi_refgs.data.region import REGION_FILE
 from mi_refgs.errors import InputError
-from mi_refgs.io.files import make_folder, read_json, write_json
+from mi_refgs.io.files import read_json, write_json
 from mi_refgs.render import load_scene as scenes
 from mi_refgs.shade.light.latlong import Z_UP
 from mi_refgs.shade.light.light_file import read_radiance
@@ -107,8 +107,6 @@ def prepare_folder(out: Path, wanted: dict[str, Any], overwrite: bool, relight: 
     lights |= {light.name: light.sha256 for light in relight}
     for file in (path for pattern in stale for path in out.glob(pattern)):
         file.unlink()
-    for folder in (out / "train", out / "test", *(out / RELIGHT / name / "test" for name in lights)):
-        make_folder(folder)
     write_json(record, wanted | {RELIGHT: lights})
 
 

@@ -13,7 +13,7 @@ from mi_refgs.editing.options import Selection
 from mi_refgs.editing.selection import select
 from mi_refgs.errors import InputError
 from mi_refgs.io.exr import write_exr
-from mi_refgs.io.files import make_folder, write_json
+from mi_refgs.io.files import write_json
 from mi_refgs.io.images import straight_srgb, write_png
 from mi_refgs.plugins.aovs import values_of_planes
 from mi_refgs.reconstruction.new_light import NewLight
@@ -194,7 +194,6 @@ def write_view(
     else:
         shown = image_array(displayed_planes(planes, look, scene.depths(pose)), height, width)
         values = np.concatenate([values, image_array(planes[-1], height, width)[..., None]], axis=-1)
-    make_folder(folder)
     stems = (f"view_{number:03d}" for number in itertools.count())
     stem = next(stem for stem in stems if not any(folder.glob(f"{stem}.*")))
     png = folder / f"{stem}.png"

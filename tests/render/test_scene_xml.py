@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refgs.errors import InputError
 from mi_refgs.occlusion.mesh import read_mesh
 from mi_refgs.occlusion.visibility import Occluder
 from mi_refgs.render.scene_xml import write_scene_xml
@@ -23,6 +22,7 @@ from mi_refgs.shade.reflectance import MODELS
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat.camera import Camera
 from mi_refgs.surfels.table import Surfels
+from tests.helpers import refused
 from tests.scenes import integrator as scenes
 from tests.scenes.integrator import HEIGHT, WIDTH
 
@@ -93,13 +93,11 @@ def pixels(camera: Camera, point: Any) -> np.ndarray:
 
 def test_what_no_scene_can_say_is_refused(tmp_path: Path) -> None:
     camera = Camera.from_pose(8, 8, 10, -10, 4, 4, np.eye(4))
-    with pytest.raises(InputError, match="fx, fy: 10 and -10 pixels mirror"):
-        write_scene_xml(tmp_path / "scene.xml", Shading(), [camera], "a.ply")
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot be created"):
-        write_scene_xml(tmp_path / "file" / "scene.xml", Shading(), [view()], "a.ply")
-    with pytest.raises(InputError, match="mesh: there is none"):
-        write_scene_xml(tmp_path / "s.xml", Shading(occlusion=True), [view()], "a.ply")
+    path, shading = tmp_path / "file", Shading(occlusion=True)
+    refused(lambda: write_scene_xml(path, Shading(), [camera], "a.ply"), "fx, fy: 10 and -10 pixels mirror")
+    path.touch()
+    refused(lambda: write_scene_xml(path / "a.xml", Shading(), [view()], "a.ply"), "cannot be created")
+    refused(lambda: write_scene_xml(tmp_path / "s.xml", shading, [view()], "a.ply"), "mesh: there is none")
 
 
 @pytest.mark.parametrize("options", [{}, {"visibility_rays": 2}, {"traced_bounces": 1}])

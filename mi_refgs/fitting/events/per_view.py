@@ -24,7 +24,7 @@ from mi_refgs.methods.method import GAIN, POSE
 
 DEAD_ZONE = 0.05  # log gain that counts as none: that of a render in the first fifth of a fit
 ALIGNED = 8  # training views whose cameras are compared with their images
-EXACT = 0.5  # pixels that they move by, in the median, if they are exact: 0.1 to 0.4, after a fifth of a fit
+EXACT = 0.5  # pixels that they move by, in the median, if they are exact: 0.1 to 0.4, after three tenths
 
 
 @dataclass(frozen=True)

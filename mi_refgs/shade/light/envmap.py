@@ -8,7 +8,6 @@ optimiser's step bounds the change of radiance."""
 
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -219,10 +218,7 @@ class EnvironmentLight(FittedLight):
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the radiance as a float32 EXR, atomically; InputError when the path cannot be written."""
-        path = Path(path)
-        with suppress(OSError):  # a folder that cannot be made cannot be written to either
-            path.parent.mkdir(parents=True, exist_ok=True)
-        write_exr(path, self.radiance().numpy())
+        write_exr(Path(path), self.radiance().numpy())
 
     def environment(self) -> "EnvironmentLight":
         return self

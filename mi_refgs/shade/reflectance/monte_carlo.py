@@ -15,10 +15,10 @@ from mi_refgs.shade.light.near_field import LocalLight
 from mi_refgs.shade.options import ShadingOptions
 from mi_refgs.shade.points import RadianceTerms, ShadingPoints, safe_normalize
 from mi_refgs.shade.reflectance.model import Reflectance, SurfelView, TraceContext
+from mi_refgs.shade.reflectance.split_sum import DIELECTRIC_F0
 from mi_refgs.shade.sh import clamp_positive, eval_sh
 from mi_refgs.surfels.table import Surfels
 
-DIELECTRIC_F0 = 0.04  # reflectance at normal incidence; the model has no metals
 # As in R3DG's code: directions lie at least 10° above the horizon; (least, what the attribute adds at most).
 LEAST_COSINE = math.sin(math.radians(10))
 BASE_RANGE, ROUGHNESS_RANGE = (0.03, 0.77), (0.09, 0.9)
