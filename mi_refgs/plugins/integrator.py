@@ -157,10 +157,12 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         self.check()
         self.changed = True
         self.filtered_light = None
-        # Cached materials depend on geometry, ambient ratios on everything. No keys: all may have changed.
+        # Cached materials depend on geometry and what is usable, ambient ratios on everything; no keys: all.
         geometry = {*self.surfels.primitive.widths, *self.surfels.primitive.optional}
         if not keys or not geometry.isdisjoint(keys) or self.shading.ambient_rays:
             self.caches_valid = False
+        elif self.caches_valid and self.occluder is not None and self.shading.traced_bounces:
+            self.caches_valid = bool(dr.all(self.usable == self.surfels.detach().usable()))
 
     def aov_names(self) -> list[str]:
         return [f"{name}.{suffix}" for name, kind in self.aovs.items() for suffix in suffixes()[kind]]
@@ -175,7 +177,8 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor."""
-        if self.changed and (now := time.monotonic()) >= self.next_check:
+        recorded = dr.flag(dr.JitFlag.FreezingScope)  # is refused below
+        if self.changed and not recorded and (now := time.monotonic()) >= self.next_check:
             self.changed, self.next_check = False, now + CHECK_SECONDS
             self._warn_of_unusable()
         with dr.suspend_grad():
@@ -226,6 +229,7 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         light = self._light(scene, request.forward_only)
         if self.occluder is not None and not self.caches_valid:
             update_occluder_caches(self.occluder, self.surfels.detach(), light, self.shading)
+            self.usable = self.surfels.detach().usable()
             # Mitsuba does not announce changes of the scene's light, on which ambient ratios depend.
             self.caches_valid = self.light is not None or not self.shading.ambient_rays
         surfels = Surfels(self.surfels.raw, screened=True)
