@@ -33,17 +33,19 @@ GAUSSIAN_LOW_PASS = 0.3  # pixel²: added to a 3D Gaussian's screen covariance, 
 GAUSSIAN_SLOPE_MARGIN = 0.15
 """Part of the image around it beyond which a Gaussian is linearised at the border. [3DGS, released code]"""
 
-TILE_SIZES = ((512.0, (4, 2)), (1024.0, (8, 4)), (math.inf, (8, 8)))
+TILE_SIZES = ((512.0, (4, 4)), (1024.0, (8, 4)), (math.inf, (8, 8)))
 """Tile width and height up to each focal length, pixels. [docs/decisions.md]"""
+FINE_TILE = 512.0, (4, 2)  # instead, where normals vary over surfels: a tile's order shows in them
 
 PATCH_EDGE = 8  # pixels: width and height of what one SIMD vector works on, one tile or several
 LANE_PIXELS_PER_AXIS = 2  # pixels: edge of the square that a lane composites, reading each surfel once
 FOCAL_TOLERANCE = 1e-5  # relative error that changes no tiles: rays of a Mitsuba sensor give 5e-7
 
 
-def tile_size(focal: float) -> tuple[int, int]:
-    """Width and height in pixels of the tiles of a camera of this focal length (pixels)."""
-    return next(size for limit, size in TILE_SIZES if focal < limit * (1 - FOCAL_TOLERANCE))
+def tile_size(focal: float, fine: bool = False) -> tuple[int, int]:
+    """Tile width and height for a focal length, pixels; `fine`: where normals vary over surfels."""
+    sizes = (FINE_TILE, *TILE_SIZES) if fine else TILE_SIZES
+    return next(size for limit, size in sizes if focal < limit * (1 - FOCAL_TOLERANCE))
 
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # between neighbours of a spherical Fibonacci lattice, radians

@@ -21,6 +21,7 @@ class PinholeCamera:
     to_world: Array  # (4, 4)
     near: float = 0.01
     film: tuple[tuple[float, float], tuple[float, float]] | None = None  # borders along x and y; None: all
+    fine: bool = False
 
     @property
     def borders(self) -> tuple[tuple[float, float], tuple[float, float]]:

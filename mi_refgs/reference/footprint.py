@@ -107,7 +107,7 @@ class Surfel:
         """The depth of the plane at the tiles' centres, SORT_REACH σ from its own at most."""
         p, axes = camera_frame(raw, camera)
         σ = np.exp(raw["scale"])
-        width, height = c.tile_size(abs(camera.fx))
+        width, height = c.tile_size(abs(camera.fx), camera.fine)
         x = (pixels % camera.width + corner[0]) // width * width + width / 2 - corner[0]
         y = (pixels // camera.width + corner[1]) // height * height + height / 2 - corner[1]
         ray = ray_slopes(camera, x, y)

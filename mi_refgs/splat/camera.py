@@ -37,13 +37,14 @@ class Camera:
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film; tiles are those of the film
     film: tuple[int, int] | None = None  # pixels, size of the film; None: the camera has all of it
     mirrored: bool = False  # whether the pose is a reflection
+    fine: bool = False  # whether it shows surfels whose normals vary, in smaller tiles
     motion: Float | None = None
     """(6,) of `kernels.motion`: rotation about the origin, translation (scene units)."""
 
     @property
     def tile(self) -> tuple[int, int]:
         """Width and height of a tile, pixels."""
-        return tile_size(self.focal)
+        return tile_size(self.focal, self.fine)
 
     @property
     def centre(self) -> tuple[Float, Float]:

@@ -57,6 +57,7 @@ def list_by_tile(
     """List every surfel, stably, in each tile that its footprint may touch, and pack footprints, features and
     turns (N,). `few`: a row from which on only so many features are not zero. Raises InputError for more than
     2^MAX_PAIR_BITS pairs."""
+    camera = replace(camera, fine=footprints.fine)
     tiles = camera.tiles[0] * camera.tiles[1]
     dr.eval(footprints.columns, footprints.first, footprints.last)  # else each kernel below projects anew
     rows, turned = PackedRows.pack([*footprints.columns, *features, *turns]), len(turns) // 2

@@ -34,7 +34,7 @@ def camera_of(case: Case) -> tuple[PinholeCamera, tuple[int, int], int]:
     focal = -WIDTH / 2 / math.tan(math.radians(FOV) / 2) * k
     pose = look_at(np.array([3.0, 1, 2]), np.zeros(3), (0, 0, 1))
     centre = (WIDTH / 2 - x) * k, (HEIGHT / 2 - y) * k
-    tile = c.tile_size(abs(focal))
+    tile = c.tile_size(abs(focal), fine=case["primitive"] == "surfel")
     corner = x * k % tile[0], y * k % tile[1]
     film = (-x * k, (WIDTH - x) * k), (-y * k, (HEIGHT - y) * k)
     return PinholeCamera(width * k, height * k, focal, focal, *centre, pose, NEAR, film), corner, k

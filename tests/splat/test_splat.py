@@ -293,14 +293,14 @@ def test_candidates_in_parts_give_the_same_lists(chunk: int, monkeypatch: pytest
 
 
 def test_more_pairs_than_32_bits_count_are_refused_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """2¹⁶ surfels on 2¹⁷ tiles: counted in 32 bits there are none, and the image is blank."""
+    """2¹⁶ surfels on 2¹⁶ tiles: counted in 32 bits there are none, and the image is blank."""
     monkeypatch.setattr(tiles, "CHUNK", 1 << 20)
     monkeypatch.setattr(tiles, "MAX_PAIR_BITS", 22)
     count = 1 << 16  # large discs, parallel to the image
     position = np.stack([np.zeros(count), np.zeros(count), np.linspace(2, 3, count)], axis=1)
     raw = scenes.discs(position=position, scale=np.full((count, 2), 4.0))
     camera = Camera.from_pose(1024, 1024, -500, -500, 512, 512, np.eye(4))
-    with pytest.raises(InputError, match=r"131,072 tiles of 1024 × 1024 pixels; render fewer pixels"):
+    with pytest.raises(InputError, match=r"65,536 tiles of 1024 × 1024 pixels; render fewer pixels"):
         splat([Surfels.from_numpy(raw)], [], camera)
 
 

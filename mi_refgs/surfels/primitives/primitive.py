@@ -32,6 +32,7 @@ class Footprints:
     first: tuple[Int32, Int32]  # (N,): first covered pixel column and row
     last: tuple[Int32, Int32]  # (N,): last covered column and row, below `first` if there is none
     primitive: Primitive
+    fine: bool = False  # whether normals vary over them: errors of the order show
 
     def followed_by(self, other: Footprints) -> Footprints:
         """These footprints, then others, under AD; raises InputError as `evaluating_both` does."""
@@ -44,7 +45,8 @@ class Footprints:
             tuple(dr.concat([a, b]) for a, b in zip(mine, theirs, strict=True))
             for mine, theirs in ((self.first, other.first), (self.last, other.last))
         )
-        return Footprints(joined(*rows), (left, top), (right, bottom), primitive)
+        fine = self.fine or other.fine
+        return Footprints(joined(*rows), (left, top), (right, bottom), primitive, fine)
 
 
 @dataclass(frozen=True)

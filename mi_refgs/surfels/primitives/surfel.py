@@ -130,7 +130,8 @@ class Surfel(base.Oriented):
         with dr.suspend_grad():
             deviations = along_u * s.x * focal, along_v * s.y * focal
             low, high = _extent(t_u.z * s.x, t_v.z * s.y, *deviations, opacity)
-            return base.Footprints(columns, *base.rectangle(centre, low, high, visible, camera), self)
+            covered, fine = base.rectangle(centre, low, high, visible, camera), surfels.has("curvature")
+            return base.Footprints(columns, *covered, self, fine)
 
     def evaluate(self, row: list[Float], pixel: Point2f, near: Float) -> SurfelSample:
         delta = mi.Vector2f(pixel.x - row[7], pixel.y - row[8])
