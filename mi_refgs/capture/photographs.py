@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.dataset import MAX_SIZES, require_few_sizes
-from mi_refgs.data.exposure import EXPOSURE
+from mi_refgs.data.exposure import EXIF_EXPOSURE
 from mi_refgs.data.images import MASK, image_files, is_copy, mask_in
 from mi_refgs.errors import InputError, counted
 from mi_refgs.io.images import exif_tags, image_header, open_image, positive, read_mask, to_8_bits
@@ -131,7 +131,7 @@ def _photograph(path: Path) -> Photograph:
     device = f"{exif.get(MAKE, '')} {exif.get(MODEL, '')} {own or equivalent or ''}"
     focal = None if equivalent is None else equivalent / 43.2666  # mm, diagonal of 36 mm × 24 mm
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    exposure = {tag: detail[tag] for tag in EXPOSURE if positive(detail.get(tag)) is not None}
+    exposure = {tag: detail[tag] for tag in EXIF_EXPOSURE if positive(detail.get(tag)) is not None}
     return Photograph(path, path.name, digest, size, focal, device, exposure, plain, cut_out, orientation)
 
 

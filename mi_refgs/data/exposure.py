@@ -9,7 +9,7 @@ from scipy.sparse.linalg import lsqr
 from mi_refgs.data.view import View
 from mi_refgs.io.images import SATURATED, SRGB_LINEAR_LIMIT, exif_tags, linear_from_srgb, open_image, positive
 
-EXPOSURE = {0x829A: 1, 0x8827: 1, 0x829D: -2}  # EXIF: exposure time, sensitivity, f-number; powers in a gain
+EXIF_EXPOSURE = {0x829A: 1, 0x8827: 1, 0x829D: -2}  # time, sensitivity, f-number; powers in a gain
 SET, SEEN = 0.05, 0.15  # least log gain in EXIF; least deviation of those of points: gloss feigns up to 0.1
 KEYPOINTS = 20  # of a view that are neither dark nor clipped, from which its gain is more than chance
 DARK, BRIGHT = 0.05, 0.95  # encoded values between which noise and clipping do not matter
@@ -29,16 +29,16 @@ def told_gains(views: Sequence[View]) -> np.ndarray | None:
 
 
 def _of_settings(views: Sequence[View]) -> np.ndarray | None:
-    settings = np.full((len(views), len(EXPOSURE)), np.nan)
+    settings = np.full((len(views), len(EXIF_EXPOSURE)), np.nan)
     for i, view in enumerate(views):
         if view.file is None or view.is_linear_radiance:
             return None
         with open_image(view.file.path) as image:
             found = exif_tags(image)[1]
-        settings[i] = [positive(found.get(tag)) or np.nan for tag in EXPOSURE]
+        settings[i] = [positive(found.get(tag)) or np.nan for tag in EXIF_EXPOSURE]
     if np.isnan(settings[:, 2]).all():  # a lens without contacts; its aperture seldom changes
         settings[:, 2] = 1
-    log = np.log(settings) @ list(EXPOSURE.values())
+    log = np.log(settings) @ list(EXIF_EXPOSURE.values())
     return None if np.isnan(log).any() else np.repeat(log[:, None] - log.mean(), 3, axis=1)
 
 

@@ -14,7 +14,7 @@ from mi_refgs.io.images import box_downscale, linear_from_srgb, srgb_from_linear
 if TYPE_CHECKING:
     from mi_refgs.splat.camera import Camera
 
-ALPHA_FLOOR = 1e-3  # by which colour is divided at least: 8 bits do not resolve fainter pixels
+FAINTEST = 1e-3  # by which colour is divided at least: 8 bits do not resolve fainter pixels
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class View:
     def colour(self, background: np.ndarray) -> np.ndarray:
         """Linear colour (H, W, 3) of the object, not premultiplied; `background` (3,) as in `image`."""
         alpha = np.float32(1) if self.alpha is None else self.alpha[..., None]
-        colour = np.clip((self.image - (1 - alpha) * background) / np.maximum(alpha, ALPHA_FLOOR), 0, None)
+        colour = np.clip((self.image - (1 - alpha) * background) / np.maximum(alpha, FAINTEST), 0, None)
         return colour if self.is_linear_radiance else linear_from_srgb(np.clip(colour, 0, 1))
 
     def depth_of(self, points: np.ndarray) -> np.ndarray:

@@ -89,10 +89,10 @@ class Decision(Event[Trainer]):
             rival = fork(trainer, self.chosen(trainer.method, component))
             if reason := self.begin(rival):
                 return Row(component, begin, False, reason)
-            better = validation_psnr(run(rival, steps, trainer))
+            better = validation_psnr(continued(rival, steps, trainer))
         except InputError as error:
             return Row(component, begin, False, f"cannot be tried: {error}")
-        plain = run(fork(trainer, trainer.method), steps, trainer)
+        plain = continued(fork(trainer, trainer.method), steps, trainer)
         psnr = validation_psnr(plain)
         gained = better - psnr
         chosen = rival if gained >= self.gain else plain
@@ -181,7 +181,7 @@ def fork(trainer: Trainer, method: Method) -> Trainer:
     return made
 
 
-def run(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
+def continued(trainer: Trainer, steps: int, of: Trainer) -> Trainer:
     """Take some steps in a trial of another fit, between which a pending interrupt is raised."""
     for _ in range(steps):
         trainer.step()

@@ -14,7 +14,7 @@ from mi_refgs.data.region import Region
 from mi_refgs.data.view import View
 from mi_refgs.fitting.losses import light_difference
 from mi_refgs.kernels.device import upload
-from mi_refgs.render.panorama import SURFACE, Panorama, panorama
+from mi_refgs.render.panorama import OPAQUE, Panorama, panorama
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.render.surroundings import Surroundings
 from mi_refgs.shade.light.light import Light
@@ -89,5 +89,5 @@ def _shown(points: np.ndarray, view: View, depth: np.ndarray, alpha: np.ndarray)
     """Whether points (N, 3) are visible in a view, not hidden by what is in front of them: (N,) bool."""
     row, column, inside = view.project(points)
     pixel = (np.clip(np.rint(x), 0, n - 1).astype(int) for x, n in ((row, view.height), (column, view.width)))
-    surface = np.where(alpha > SURFACE, depth, np.inf).reshape(view.height, view.width)
+    surface = np.where(alpha > OPAQUE, depth, np.inf).reshape(view.height, view.width)
     return inside & (view.depth_of(points) <= BEHIND * surface[tuple(pixel)])

@@ -15,7 +15,7 @@ from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
 
 MARGIN = 2  # pixels of a cube face beyond its edges, so that interpolation never leaves an image
-SURFACE = 0.5  # opacity from which a pixel shows a surface
+OPAQUE = 0.5  # opacity from which a pixel shows a surface
 LARGEST = 0.2  # deviation over distance above which a Gaussian is left out: it would cover cube faces
 
 
@@ -64,6 +64,6 @@ def panorama(surroundings: Surroundings, centre: np.ndarray, height: int, near: 
         radiance[own] = np.stack(planes, axis=-1)
         # Distances jump at outlines: no mean of near and far.
         at = np.rint(row).astype(int), np.rint(column).astype(int)
-        depth = np.where(alpha > SURFACE, frame.depth.numpy(), np.inf).reshape(size, size)[at]
+        depth = np.where(alpha > OPAQUE, frame.depth.numpy(), np.inf).reshape(size, size)[at]
         nearness[own] = along[own] / depth
     return Panorama(np.asarray(centre, np.float64), radiance, nearness)

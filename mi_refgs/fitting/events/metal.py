@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mi_refgs.data.view import View, evenly_spread
-from mi_refgs.fitting.decide import Row, conclude, run
+from mi_refgs.fitting.decide import Row, conclude, continued
 from mi_refgs.fitting.image_error import displayed_image, squared_error
 from mi_refgs.fitting.per_view import gains_of
 from mi_refgs.fitting.train import Trainer
@@ -78,7 +78,7 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
     surfels = replace(surfels, initial={**surfels.initial, "metallic": metallic})
     copy = Trainer(replace(trainer.method, surfels=surfels), trainer.data, targets=trainer.targets)
     copy.fit.optimiser.factors["metallic"] = 0.0
-    return run(copy, steps, trainer)
+    return continued(copy, steps, trainer)
 
 
 def _squared_error(trainer: Trainer, index: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.train import FEW_VIEWS, Trainer
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import Window
-from mi_refgs.render.panorama import SURFACE
+from mi_refgs.render.panorama import OPAQUE
 from mi_refgs.render.pipeline import render_depth
 from mi_refgs.types import Float
 
@@ -83,5 +83,5 @@ def surface_points(view: View, depth: Float, alpha: Float, radius: float) -> np.
     shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
     beside = np.stack([around[r : r + view.height, c : c + view.width] for r, c in shifts])
     level = np.count_nonzero(abs(beside - z) < LEVEL * radius, axis=0) >= LEVEL_COUNT
-    row, column = np.nonzero((opaque > SURFACE) & level)
+    row, column = np.nonzero((opaque > OPAQUE) & level)
     return np.asarray(view.to_world[:3, 3] + view.rays(row, column) * z[row, column, None])
