@@ -37,7 +37,7 @@ class Camera:
     offset: tuple[int, int] = (0, 0)  # pixels, of a crop window in its film; tiles are those of the film
     film: tuple[int, int] | None = None  # pixels, size of the film; None: the camera has all of it
     mirrored: bool = False  # whether the pose is a reflection
-    fine: bool = False  # whether it shows surfels whose normals vary, in smaller tiles
+    fine: bool = False  # set by the splatter where normals vary over surfels: tiles are smaller
     motion: Float | None = None
     """(6,) of `kernels.motion`: rotation about the origin, translation (scene units)."""
 
