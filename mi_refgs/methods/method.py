@@ -100,7 +100,6 @@ class SurroundingsOptions:
     max_count: int = field(default=40_000, metadata=at_least(1))
     degree: int = field(default=2, metadata=between(0, MAX_SH_DEGREE))  # of radiance_sh
 
-    start: ClassVar = 0.25  # of the initial number of a preset: the first steps render fog, and it grows
     share: ClassVar = 0.75  # fraction of all surfels that may be the background's: it has most of the pixels
     scattered: ClassVar = 0.5  # fraction of the initial surfels anywhere; the others at sparse points
     opacity: ClassVar = 0.1  # initial, of both: a cloud of 0.3 closes before the object forms

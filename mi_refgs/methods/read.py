@@ -68,8 +68,6 @@ def load(
         table[part] |= {"count": chosen.surfels, "max_count": chosen.max_surfels}
     if (most := method.surfels.preset_limit or chosen.max_surfels) < chosen.max_surfels:
         table["surfels"] |= {"count": round(START_FRACTION * most), "max_count": most}
-    if method.surroundings is not None:
-        table["surroundings"]["count"] = max(round(method.surroundings.start * chosen.surfels), 1)
     assignments = [_placed(assignment) for assignment in assignments or ()]
     for assignment in assignments:
         _assign(table, assignment)

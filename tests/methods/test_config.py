@@ -289,4 +289,4 @@ def test_a_method_limits_what_presets_allow() -> None:
     assert methods.load("auto", "standard", ["surfels.max_count=50000"]).surfels.max_count == 50_000
     assert methods.load("ref_gaussian", "standard").surfels.max_count == 40_000
     few = methods.load("photographs", "quick")
-    assert few.surroundings is not None and few.surfels.count == 4 * few.surroundings.count == 15_000
+    assert few.surroundings is not None and few.surfels.count == few.surroundings.count == 15_000
