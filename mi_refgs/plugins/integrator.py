@@ -177,12 +177,12 @@ class RefGSIntegrator(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """The image (h, w, c) of a sensor."""
-        recorded = dr.flag(dr.JitFlag.FreezingScope)  # is refused below
-        if self.changed and not recorded and (now := time.monotonic()) >= self.next_check:
-            self.changed, self.next_check = False, now + CHECK_SECONDS
-            self._warn_of_unusable()
         with dr.suspend_grad():
-            image = self._image(scene, sensor, spp, forward_only=True).image()
+            film = self._image(scene, sensor, spp, forward_only=True)  # refuses before anything is read
+            if self.changed and (now := time.monotonic()) >= self.next_check:
+                self.changed, self.next_check = False, now + CHECK_SECONDS
+                self._warn_of_unusable()
+            image = film.image()
         if id(scene) != self.seen:
             self.seen = id(scene)
             warn_of_ignored(scene, [] if self.light else used_emitters(self.shading, scene))

@@ -81,9 +81,9 @@ def test_attribute_starts_at_its_activated_value(rng: np.random.Generator) -> No
             raw = declared.start(5, 2, rng, value)
             assert raw.shape == (5, 2)
             np.testing.assert_allclose(function(raw), 0.2 if value is None else value, rtol=1e-6)
-    size = Attribute("width", (2,), "exp", 1e-3, ("w_0", "w_1"))
-    np.testing.assert_allclose(np.exp(size.start(3, 1, rng, np.arange(1.0, 4))), [[1], [2], [3]])
-    refused(partial(size.start, 3, 2, rng, np.arange(1.0, 4)), "width: shape (3,); give one", "array (3, 2)")
+    size, given = Attribute("width", (2,), "exp", 1e-3, ("w_0", "w_1")), np.arange(1.0, 4)
+    np.testing.assert_allclose(np.exp(size.start(3, 1, rng, given)), [[1], [2], [3]])
+    refused(partial(size.start, 3, 2, rng, given), "width: shape (3,); give one number, or an array (3, 2)")
     for value in (0.0, -1.0, np.inf):
         refused(partial(size.start, 1, 1, rng, value), "width: ", " is out of range; start it above 0")
 
