@@ -26,7 +26,8 @@ def page() -> str:
         "## Presets",
         "A preset scales the schedule of any method to its own number of iterations. `--preset "
         "ITERATIONS:SURFELS`, such as `1000:20000`, does so for other numbers, with at most so many surfels, "
-        "three quarters of them at the start, and images of any size.",
+        "three quarters of them at the start, and images of any size. With `data.crop`, images may have four "
+        "times the pixels.",
         table(
             [
                 "preset",

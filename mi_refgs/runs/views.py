@@ -22,6 +22,7 @@ from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.run import DATASET, Run
 
+CROPPED = 4  # times a preset's pixels may have an image of which steps render parts: they take no longer
 MEASURED = 640  # pixels along the longer side of scored photographs: larger ones differ in noise and focus
 
 
@@ -29,6 +30,7 @@ def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> 
     """The method with its image size decided, and training views without ground truth: `data.downscale`, or
     the least for its preset's pixels, which calls `tell`. Raises InputError as `read_dataset` does."""
     pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
+    pixels *= 1 if method.data.crop is None else CROPPED
     views = read_views(method, path, "train", truth=False, pixels=pixels)
     if method.data.downscale is None and views.downscale > 1:
         first = views.views[0]
