@@ -263,7 +263,7 @@ def read_dataset(
     """Read one split ("train" or "test") of the data set in folder `path`.
 
     `downscale`: side of the blocks of pixels that are averaged, by default the smallest whole one for which
-        the first image has at most `pixels`; incomplete blocks are left out.
+        the largest image has at most `pixels`; incomplete blocks are left out.
     `background`: "white" or "black", behind images with alpha.
     `images`: "png" (sRGB-encoded 8-bit files; EXR files if there are no others) or "exr" (linear radiance).
     `truth`: read ground-truth normals, depth and materials where there are any.
@@ -282,7 +282,7 @@ def read_dataset(
     reader = reader_of(path, options)
     found = reader.read(path, split, options)
     if downscale is None:
-        size = found.views[0].file or found.views[0]
+        size = max((v.file or v for v in found.views), key=lambda one: one.width * one.height)
         most = min(size.width, size.height)
         fitting = (k for k in range(1, most) if (size.width // k) * (size.height // k) <= pixels)
         if (factor := next(fitting, most)) > 1:

@@ -197,7 +197,8 @@ def begin(
             what = "images without alpha, whose background does not turn with the object"
             remedy = "give masks: `refgs doctor DATA --masks` writes them before a plain backdrop"
             raise InputError(what, views.path, "--turntable", remedy)
-        found = [one for one in checks.examine(views) if one.name != "turntable" or not turns]
+        heeded = {"turntable": turns, "exposure": "exposure" in method.event}  # by what the method does
+        found = [one for one in checks.examine(views) if not heeded.get(one.name)]
         checks.heed(found, warn, force)
         for note in views.notes:
             tell(f"{views.path}: {note}")

@@ -33,11 +33,11 @@ def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> 
     pixels *= 1 if method.data.crop is None else CROPPED
     views = read_views(method, path, "train", truth=False, pixels=pixels)
     if method.data.downscale is None and views.downscale > 1:
-        first = views.views[0]
-        file = first.file or first
+        large = max(views.views, key=lambda one: one.width * one.height)
+        file = large.file or large
         tell(
-            f"{views.path}: images of {file.width} × {file.height} pixels are read as {first.width} × "
-            f"{first.height}; preset {method.preset} takes {pixels:,} pixels at most, --set "
+            f"{views.path}: images of {file.width} × {file.height} pixels are read as {large.width} × "
+            f"{large.height}; preset {method.preset} takes {pixels:,} pixels at most, --set "
             f"data.downscale=1 reads them whole"
         )
     return method.downscaled(views.downscale), views
