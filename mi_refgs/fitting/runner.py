@@ -197,9 +197,9 @@ def begin(
             what = "images without alpha, whose background does not turn with the object"
             remedy = "give masks: `refgs doctor DATA --masks` writes them before a plain backdrop"
             raise InputError(what, views.path, "--turntable", remedy)
-        heeded = {"turntable": turns, "exposure": "exposure" in method.event}  # by what the method does
-        found = [one for one in checks.examine(views) if not heeded.get(one.name)]
-        checks.heed(found, warn, force)
+        met = {"turntable": turns, "exposure": "exposure" in method.event}  # by what the method does
+        found = checks.examine(views)
+        checks.heed([one for one in found if not met.get(one.name)], warn, force)
         for note in views.notes:
             tell(f"{views.path}: {note}")
         for (_, before), (name, _) in itertools.pairwise(method.stages()):
