@@ -56,7 +56,7 @@ class Scene:
     path: str
     rows: list[Row] = field(default_factory=list)
     image_size: list[int] = field(default_factory=list)
-    downscale: int | None = None  # of the files' pixels; None: not recorded
+    downscale: float | None = None  # of the files' pixels; None: not recorded
     test_views: int = 0
 
 
@@ -159,7 +159,7 @@ def markdown(table: Table) -> str:
             marks = f" [{','.join(map(str, row.footnotes))}]" if row.footnotes else ""
             seeds = f" ({len(row.seeds)} seeds)" if len(row.seeds) > 1 else ""
             body.append([f"{row.variant}{marks}{seeds}", *(cell(c, row.numbers.get(c.key)) for c in columns)])
-        scale = f", downscaled for the fits by {scene.downscale}" if scene.downscale not in (None, 1) else ""
+        scale = f", downscaled for the fits by {by:g}" if (by := scene.downscale or 1) > 1 else ""
         size = " × ".join(map(str, scene.image_size))
         images = f" ({scene.test_views} test views of {size} pixels{scale})" if size else ""
         lines += [f"### {scene.name}{images}", "", *aligned(titles, body), ""]
@@ -170,8 +170,8 @@ def markdown(table: Table) -> str:
     about = table.about
     if about:
         machines = (", ".join(f"{key} {value}" for key, value in one.items()) for one in table.machines)
-        by = f"mi_refgs {about['version']}, preset {about['preset']}, {about['workers']} jobs at once"
-        lines += [f"Made by {'; '.join([by, *machines])}:", "", f"    {about['command']}"]
+        made = f"mi_refgs {about['version']}, preset {about['preset']}, {about['workers']} jobs at once"
+        lines += [f"Made by {'; '.join([made, *machines])}:", "", f"    {about['command']}"]
     return "\n".join(lines).rstrip() + "\n"
 
 

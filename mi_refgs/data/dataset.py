@@ -4,6 +4,7 @@ A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·
 
 import contextlib
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -299,6 +300,9 @@ def read_dataset(
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
     require_few_sizes(found.source or path, "images", sizes, remedy)
+    name, count = Counter(view.name for view in views).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{count} {split} views have this name", found.source or path, name, "rename images")
     # Region and offset are derived from the training cameras for every split.
     training = views
     if split != "train":

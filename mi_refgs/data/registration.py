@@ -19,8 +19,7 @@ Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a vi
 
 
 def registered(view: View, render: Render, distance: float, where: np.ndarray) -> View:
-    """The view with the pose of the least difference in the pixels `where` (H, W) bool; `distance` of what it
-    looks at, scene units."""
+    """The view, posed for least difference in `where` (H, W) bool; `distance` of its target, scene units."""
     view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
     while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
         blocks.insert(0, 2 * blocks[0])

@@ -40,7 +40,7 @@ SCORES = (
     Score("train_seconds", "training", "{:.0f}", " s", compared=True),
     Score("surfels", "surfels", "{:.0f}", compared=True),
     Score("iterations", "iterations", "{}"),
-    Score("downscale", "downscaled for the fit by", "{}"),
+    Score("downscale", "downscaled for the fit by", "{:g}"),
     Score("samples", "samples per pixel", "{}"),
     Score("ms_per_frame", "frame", "{:.1f}", " ms", compared=True),
 )

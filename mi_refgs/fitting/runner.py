@@ -28,7 +28,7 @@ from mi_refgs.registry import plugin_options
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, DECISIONS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import MODEL
-from mi_refgs.runs.views import changed, digests, read_views, sized, with_region
+from mi_refgs.runs.views import as_read, changed, digests, read_views, sized, with_region
 from mi_refgs.shade.light.placed import PlacedLight
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
@@ -96,7 +96,7 @@ def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, pro
             raise InputError("no run to continue", output, "--resume", "leave it out to start one")
         method = run.method()
         views = read_views(method, data, "train", truth=False)
-        _require_same(run, method, choice, views)
+        _require_same(run, method, choice, data, views)
     else:
         run.require_none()
         method, views = chosen(data, choice, progress.say)
@@ -122,7 +122,7 @@ def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> 
     name = _for_images(named, reads, views)
     if name != named:
         say(f"{views.path}: images without alpha: fitted with their background, by --method {name}")
-    return load_method(name, choice.preset, choice.settings).downscaled(views.downscale), views
+    return as_read(load_method(name, choice.preset, choice.settings), data, views), views
 
 
 def _for_images(name: str | None, method: Method, views: Dataset) -> str | None:
@@ -177,14 +177,12 @@ def begin(
     """Create a trainer that writes into `run`, from its newest checkpoint if the folder contains a run.
 
     `tell` is called with what is found and decided, `warn` with steps that failed and what `checks` find.
-    Raises InputError for data that they refuse unless `force`, damaged checkpoints, and a folder that cannot
-    be written."""
+    Raises InputError for data that they refuse unless `force`, damaged checkpoints, an unusable folder."""
     resumed = run.exists()
     if other := changed(views, run.images()):
         count = f"{len(other)} of {len({*run.images(), *other})}"
         what = f"not as when {run.path} began: {count} images or cameras"
         raise InputError(what, views.path, other[0], "restore them, or choose another -o")
-    views = with_region(views, run.region(began=True), tell)
     state, found = run.load_checkpoint() if resumed else None, list[checks.Finding]()
     if resumed and state is None and (run.path / MODEL).is_file():
         what = "none, but a scene that was edited, imported or copied, which a fit would replace"
@@ -208,6 +206,7 @@ def begin(
         views, surfaces = _with_stereo(views, tell)
         if not resumed:
             views = _around_object(views, surfaces, tell, warn)
+    views = with_region(views, run.region(began=True), tell)
     trainer = Trainer(method, views, run if resumed else None, state, tell=tell, warn=warn)
     if resumed:
         run.rewind(trainer.iteration)
@@ -297,7 +296,7 @@ def load_method(method: str | None, preset: str | None, settings: Settings = ())
     return methods.load(path, preset or DEFAULT_PRESET, methods.assignments(settings))
 
 
-def _require_same(run: Run, made: Method, choice: Choice, views: Dataset) -> None:
+def _require_same(run: Run, made: Method, choice: Choice, data: Path | Dataset, views: Dataset) -> None:
     """Raise InputError if what is given for a resumed run would have made another method of it."""
     now, first = choice.method, ["name", "preset"]
     if not isinstance(now, Method):
@@ -310,6 +309,7 @@ def _require_same(run: Run, made: Method, choice: Choice, views: Dataset) -> Non
         first += [text.partition("=")[0] for text in given]
         preset = choice.preset or made.preset or DEFAULT_PRESET
         now = methods.load(name or made.file, preset, [*made.assignments, *given])
+    now = as_read(now, data, views) if isinstance(data, Dataset) else now
     if found := differences(run, now):
         key = min(found, key=lambda key: [not key.startswith(one) for one in first])
         what = "the run was started with {}, and would now have {}".format(*found[key])

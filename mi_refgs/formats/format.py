@@ -80,8 +80,7 @@ def write(
 
     `options` are keywords of the formats; each format gets those that it declares. A file that `output` names
     is replaced; a folder has to be empty, or filled for the same `source`, a run folder. Raises InputError
-    for an unknown format, an option that none of them has, a scene that one cannot represent, and a path
-    that cannot be written."""
+    for unknown formats, an option that none of them has, a scene that one cannot represent, a bad path."""
     chosen, given = [FORMATS.find(name, "--to") for name in names], dict(options or {})
     if not chosen:
         raise InputError("no format", "--to", remedy=f"use one of {', '.join(FORMATS)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from mi_refgs.constants import PATCH_EDGE
@@ -204,7 +204,7 @@ class DataOptions:
     images: Literal["png", "exr"] = "png"  # 8-bit sRGB or linear radiance
     background: Literal["white", "black"] = "white"  # behind images with alpha
     # Pixels of a file per pixel, along a side; absent: as the preset allows.
-    downscale: int | None = field(default=None, metadata=at_least(1))
+    downscale: float | None = field(default=None, metadata=at_least(1))
     coarse: tuple[CoarseImages, ...] = ()  # downscaled images at the start of a fit
     # Pixels that a step renders at most, of a larger image; absent: all of it.
     crop: int | None = field(default=None, metadata=at_least(64 * 64))
@@ -310,10 +310,6 @@ class Method:
     @property
     def has_mesh(self) -> bool:
         return "mesh" in self.event
-
-    def downscaled(self, factor: float) -> Method:
-        """The method with this `data.downscale`, a whole number."""
-        return replace(self, data=replace(self.data, downscale=int(factor)))
 
     def stages(self) -> list[tuple[str, Stage]]:
         """Stages in the order of their `until`."""

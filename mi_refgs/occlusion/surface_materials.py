@@ -45,9 +45,8 @@ class VertexSurfels:
 
     @staticmethod
     def of(mesh: Mesh, surfels: Surfels) -> "VertexSurfels":
-        """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint, which is
-        wider by a voxel along the normal; its normal is that of NORMALS surfels. Detached. Raises InputError
-        without surfels."""
+        """Find the NEIGHBOURS nearest surfels of each vertex, weighted by opacity and footprint, wider by a
+        voxel along the normal; its normal is that of NORMALS surfels. Detached. Raises InputError without."""
         if not surfels.count:
             raise InputError("there are none to take materials from", "occluder", "surfels")
         usable, surfels = np.flatnonzero(surfels.usable().numpy()), surfels.detach().cleaned()

@@ -74,8 +74,7 @@ class Reconstruction:
         arrays or tensors, whose names may begin with "refgs.". mesh: for relighting and exports, as
         `extract_mesh` makes it. shading: of a mapping only, by default the first model that uses all
         attributes, or else some. data: folder of its data set; without one, cameras are around the object.
-        name: of its method. Raises InputError for another object, unknown names, wrong shapes, NaN, or a
-        missing light."""
+        name: of its method. Raises InputError for others, unknown names, wrong shapes, NaN, no light."""
         trained = scene_of(params, mesh, shading)
         if trained.light is not None and (count := trained.light.unusable()):
             raise InputError(f"{count} values are NaN or infinite", "light", remedy="give finite values")

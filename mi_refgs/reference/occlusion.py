@@ -1,8 +1,7 @@
 """Depth fusion, visibility and ambient ratios in float64, of shapes by their distance and of meshes.
 
 A shape is a function from (N, 3) points to (N,) exact or underestimated signed distances, positive outside.
-Cameras are (to_world, focal, size): rigid (4, 4), Mitsuba camera frame; pixels; square image, principal point
-at its centre.
+Cameras are (to_world, focal, size): rigid (4, 4), Mitsuba camera frame; pixels; square image, centred.
 """
 
 from collections.abc import Callable

@@ -33,8 +33,7 @@ def write_scene_xml(
 ) -> None:
     """Write a Mitsuba scene with one `refgs` integrator and a sensor per camera, atomically; `spp` is 1 as in
     training. Names of files are relative to its folder. Pixels are square: where fx ≠ fy, the film has more
-    along one axis. Raises InputError for a mirrored camera, occlusion without mesh, or a path that cannot be
-    written."""
+    along one axis. Raises InputError for a mirrored camera, occlusion without mesh, or an unusable path."""
     if shading.occlusion and mesh is None:
         raise InputError("there is none to trace", path, "mesh", "give one, or shade without occlusion")
     scene = ElementTree.Element("scene", version="3.0.0")

@@ -77,8 +77,7 @@ class Run:
         images: dict[str, str] | None = None,
         offset: Sequence[float] | None = None,
     ) -> None:
-        """Record the folder of the data set and its region; digests of its images and its offset, by default
-        as before."""
+        """Record folder and region of a data set; digests of images and its offset, by default as before."""
         record: dict[str, Any] = {"path": dataset, "images": self.images() if images is None else images}
         record["offset"] = self.offset() if offset is None else [*offset]
         if region is not None:

@@ -78,8 +78,7 @@ class TrainedScene:
 
     @staticmethod
     def read(folder: Path, plugins: Sequence[str] = ()) -> "TrainedScene":
-        """Read the artefacts in a run folder, fitted with these plugins; raises InputError for a file that
-        cannot be used."""
+        """Read the artefacts of a run folder, fitted with these plugins; raises InputError for bad files."""
         note = folder / MODEL
         remedy = f"restore it, or write it again with `refgs export {folder}` if the run has checkpoints"
         try:

@@ -40,7 +40,16 @@ def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> 
             f"{large.height}; preset {method.preset} takes {pixels:,} pixels at most, --set "
             f"data.downscale=1 reads them whole"
         )
-    return method.downscaled(views.downscale), views
+    return as_read(method, path, views), views
+
+
+def as_read(method: Method, path: Path | Dataset, views: Dataset) -> Method:
+    """The method with the options by which these views of `path` were read."""
+    data = replace(method.data, downscale=views.downscale)
+    if isinstance(path, Dataset):
+        data = replace(data, images="exr" if views.is_linear_radiance else "png")
+        data = replace(data, background="white" if views.background.any() else "black")
+    return replace(method, data=data)
 
 
 def read_views(method: Method, path: Path | Dataset, split: str, truth: bool = True, **size: Any) -> Dataset:

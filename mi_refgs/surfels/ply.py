@@ -73,8 +73,7 @@ def _sh_properties(prefix: str, degree: int) -> tuple[str, ...]:
 
 
 def write_ply(path: str | Path, surfels: Surfels) -> None:
-    """Write surfels as binary float32 PLY, atomically and exactly. Raises InputError if that fails, or if a
-    value is not finite."""
+    """Write finite surfels as binary float32 PLY, atomically and exactly. Raises InputError if that fails."""
     surfels.validate()
     tables = surfels.to_numpy()
     columns: dict[str, np.ndarray] = {}

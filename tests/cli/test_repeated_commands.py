@@ -45,10 +45,8 @@ def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path,
     }
     for option, (value, key) in changes.items():
         refused([*argv, option, value], f"config.toml: {key}: the run was started with")
-    refused(
-        [*argv[:4], "--resume", "--light", str(data / "environment.exr")],
-        "config.toml: light.file: the run was started with None",
-    )
+    lit = [*argv[:4], "--resume", "--light", str(data / "environment.exr")]
+    refused(lit, "config.toml: light.file: the run was started with None")
     longer = dataclasses.replace(config, iterations=500)
     again = lambda: reconstruct.fit(data, longer, output=run, resume=True, progress=Progress())  # noqa: E731
     refused(again, "iterations: the run was started with 6", " 500")
@@ -61,12 +59,8 @@ def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path,
 def test_a_data_set_is_completed_or_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, out = tmp_path / "scene.xml", tmp_path / "out"
     scene.write_text(SCENE)
-    argv = [
-        *["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--samples", "1"],
-        "-o",
-        str(out),
-        str(scene),
-    ]
+    argv = ["dataset", "--views", "2", "--test-views", "1", "--size", "4", "--samples", "1"]
+    argv += ["-o", str(out), str(scene)]
     assert main([*argv, "--json"]) == 0 and json.loads(capsys.readouterr().out)["train_views"] == 2
     before = contents(out)
     for option in (["--views", "3"], ["--seed", "1"], ["--fov", "30"]):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -101,11 +102,13 @@ def test_other_pixels_are_the_rest(data: Dataset, found: Stereo) -> None:
 
 def test_fit_of_stereo(data: Dataset, found: Stereo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside the points of the data set; images without texture have those only."""
-    monkeypatch.setattr("mi_refgs.fitting.runner.stereo", lambda *_: found)
-    method = load("photographs", "8:400", ["data.downscale=1"])
-    said: list[str] = []
+    method, said, swept = load("photographs", "8:400", ["data.downscale=1"]), list[str](), Mock()
+    swept.return_value = found
+    monkeypatch.setattr("mi_refgs.fitting.runner.stereo", swept)
     trainer = begin(method, data, Run(tmp_path / "run"), said.append)
     assert any("found by stereo" in text for text in said)
+    begin(method, data, Run(tmp_path / "run"))  # killed before a checkpoint: the same points
+    assert [call.args[1] for call in swept.call_args_list] == [data.region] * 2 != [trainer.data.region] * 2
     assert np.median(off_surface(trainer.surfels.position().numpy().T)) < 0.2
     # Random points of the background: on rays of the other pixels, outside of the region, behind its centre.
     assert trainer.data.region is not None

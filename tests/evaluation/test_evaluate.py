@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -117,7 +118,7 @@ def test_photographs_are_measured_at_one_size(tmp_path: Path, monkeypatch: pytes
     """Whatever size was fitted; cameras belong to it. Images with alpha have the fitted size."""
     monkeypatch.setattr("mi_refgs.runs.views.MEASURED", 16)
     method = load_resolved(write_method(tmp_path))
-    methods = [method.downscaled(factor) for factor in (1, 2)]
+    methods = [replace(method, data=replace(method.data, downscale=factor)) for factor in (1, 2)]
     photographs, masked = write_open_data(tmp_path / "open"), write_data(tmp_path / "alpha")
     first, second = (measured_views(one, photographs).views[0].load() for one in methods)
     whole = read_views(method, photographs, "test").views[0].load()

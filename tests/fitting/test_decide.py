@@ -170,7 +170,7 @@ def test_a_method_is_replaced_with_its_settings(file: str, method: Method) -> No
         "stage.deferred.traced_bounces=1",
     ]
     own = methods.load(file, "quick", [*SETTINGS, *given])
-    own = replace(own.downscaled(3), seed=5)
+    own = replace(own, data=replace(own.data, downscale=3), seed=5)
     (decision,) = (x for name, x in own.event.items() if name == "colour_alone")
     assert isinstance(decision, Decision)
     found = decision.chosen(own, "colour_alone")

@@ -1,5 +1,4 @@
-"""Mutated files of every reader are read or refused: no other exception, no crash, no hang, no code, little
-memory."""
+"""Mutated files of every reader are read or refused: no crash, hang or code, little memory."""
 
 import random
 import re

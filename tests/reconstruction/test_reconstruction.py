@@ -13,6 +13,7 @@ import pytest
 
 import mi_refgs
 from mi_refgs import Camera, InputError, NewLight, Reconstruction
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.data.region import Region
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.exr import read_exr_image
@@ -212,10 +213,11 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
         def step(self, trainer: Trainer) -> None:
             self.steps += 1
 
-    heard = Heard()
-    found = mi_refgs.fit(data, method, preset="quick", settings=SETTINGS, progress=heard)
-    folder = found.folder
+    heard, views = Heard(), read_dataset(data, "train", downscale=1.5, background="black")
+    found = mi_refgs.fit(views, method, preset="quick", settings=SETTINGS, progress=heard)
+    folder, read = found.folder, found.views()
     assert folder is not None and str(folder) in heard.said and heard.steps == 6
+    assert read.views[0].width == views.views[0].width and not read.background.any()
     kept = found.changed(found.trained)
     del found, heard
     gc.collect()

@@ -47,8 +47,7 @@ def test_vertices_mix_surfels_by_opacity_and_footprint() -> None:
 
 
 def test_normals_at_vertices_vary_over_the_surfels() -> None:
-    """Discs on a sphere with its curvature, and one across: the sphere's normals between them, where means of
-    the discs' own are off."""
+    """Discs on a sphere with its curvature, and one across: between them, the sphere's normals."""
     around = [[0.3 * np.cos(a), 0.3 * np.sin(a), 1] for a in range(12)]
     towards = unit(np.array([[0, 0, 1], [0, 0, 1], *around]))
     quaternion = np.stack([-towards[:, 1], towards[:, 0], 0 * towards[:, 0], 1 + towards[:, 2]], 1)

@@ -41,7 +41,8 @@ class ColourAlone(Decision, Trial):
         other = methods.load(self.method, preset, fitting, here)
         kept = "iterations seed checkpoint_every preview_every log_every about name file preset assignments"
         own = {name: getattr(method, name) for name in kept.split()}
-        data = replace(other.data, downscale=method.data.downscale, images=method.data.images)
+        read = method.data
+        data = replace(other.data, downscale=read.downscale, images=read.images, background=read.background)
         surfels = replace(other.surfels, max_count=method.surfels.max_count)
         return replace(other, data=data, surfels=surfels, **own)
 

@@ -32,8 +32,7 @@ CROSSES = {
 def read_radiance(path: str | os.PathLike[str], rows: int = MAX_ROWS) -> np.ndarray:
     """Linear radiance (h, w, 3) float32 ≥ 0 of an EXR, HDR, PNG or JPEG file, averaged to at most `rows` rows
     and 2 · `rows` columns: lat-long, or converted from a cube (EXR's `envmap`; six faces in a row, column or
-    cross) or an angular map (a square around a disc). Raises InputError for other images and above
-    `files.MAX_PIXELS`."""
+    cross) or an angular map (disc in a square). Raises InputError for others and above `files.MAX_PIXELS`."""
     path = Path(path)
     image, layout = read_image(path)
     if below := int(np.count_nonzero((image < 0).any(axis=-1))):
