@@ -13,6 +13,7 @@ from mi_refgs.data.view import View
 from mi_refgs.io.images import blocks_within, box_downscale
 
 STEP = 0.1  # pixels of the averaged image that the image moves by for a difference
+CLOSE = 0.1  # pixels of the image that a pose may move by, each way, with the derivatives of where it began
 COARSEST = 48  # pixels along the shorter side of the image that is averaged most, at least
 
 Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a view's camera
@@ -20,12 +21,14 @@ Render = Callable[[View], np.ndarray]  # display-encoded image (H, W, 3) of a vi
 
 def registered(view: View, render: Render, distance: float, where: np.ndarray) -> View:
     """The view, posed for least difference in `where` (H, W) bool; `distance` of its target, scene units."""
-    view, blocks = view.load(), [1, 1]  # the whole image twice: derivatives of the first time are rough
+    view, blocks = view.load(), [1]
     while min(view.width, view.height) // (2 * blocks[0]) >= COARSEST:
         blocks.insert(0, 2 * blocks[0])
     found = view
     for block in blocks:
-        found = _fitted(found, render, distance, where, block)
+        found, moved = _fitted(found, render, distance, where, block)
+    if moved > CLOSE:  # derivatives of a pose farther away are rough
+        found, _ = _fitted(found, render, distance, where, 1)
     errors = [np.mean(_difference(one, render, where, 1) ** 2) for one in (view, found)]
     return found if errors[1] < errors[0] else view
 
@@ -37,8 +40,8 @@ def _difference(view: View, render: Render, where: np.ndarray, block: int) -> np
     return np.asarray(shown - truth, np.float64)[where].ravel()
 
 
-def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> View:
-    """The view with its pose fitted to the image averaged over block × block pixels."""
+def _fitted(view: View, render: Render, distance: float, where: np.ndarray, block: int) -> tuple[View, float]:
+    """The view, its pose fitted to the image averaged over block × block pixels, and how many it moved by."""
     unit = np.repeat([1.0, distance], 3) * block / view.fx  # moves what the camera looks at by such a pixel
     where = blocks_within(where, block)
 
@@ -49,7 +52,7 @@ def _fitted(view: View, render: Render, distance: float, where: np.ndarray, bloc
     first = error(np.zeros(6))
     slope = np.stack([(error(STEP * axis) - first) / STEP for axis in np.eye(6)], axis=1)
     found = least_squares(error, np.zeros(6), lambda _: slope, method="lm", ftol=1e-3, max_nfev=6)
-    return _moved(view, unit * found.x)
+    return _moved(view, unit * found.x), abs(found.x).max()
 
 
 def _moved(view: View, motion: np.ndarray) -> View:

@@ -130,12 +130,10 @@ def differentiate(
     return gradients | {"features": δfeatures}
 
 
-def sorted_rows(
-    tables: Sequence[Raw], camera: PinholeCamera, pixels: Array, corner: Corner = (0, 0)
-) -> Array:
+def sorted_rows(tables: Sequence[Raw], camera: PinholeCamera, pixel: Array, corner: Corner = (0, 0)) -> Array:
     """Rows (N, P) of all tables from front to back at pixels (raster indices); `corner` as in `sort_key`."""
     camera = dataclasses.replace(camera, fine=any("curvature" in raw for raw in tables))
-    keys = [primitive_of(raw).sort_key(raw, camera, pixels, corner) for raw in tables]
+    keys = [primitive_of(raw).sort_key(raw, camera, pixel, corner) for raw in tables]
     return np.argsort(np.concatenate(keys), axis=0, kind="stable")
 
 

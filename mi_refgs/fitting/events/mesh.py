@@ -36,7 +36,8 @@ class ExtractMesh(Event[Trainer]):
         exchange(trainer.setup, trainer.fit)
         views, method = len(trainer.data.views), trainer.method
         last = self.when.count(trainer.iteration) == self.when.count(method.iterations)
-        cameras = [trainer.camera(i) for i in (range(views) if last else evenly_spread(views, FEW_VIEWS))]
+        seen = range(views) if last else evenly_spread(views, FEW_VIEWS)
+        cameras = [trainer.posed(i).camera() for i in seen]
         trainer.fit.occluder.update(surface_of(trainer.surfels.detach(), cameras, self.resolution))
 
 

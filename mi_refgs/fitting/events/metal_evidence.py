@@ -80,7 +80,8 @@ def moments(trainer: Trainer) -> np.ndarray:
     gains = per_view.gains_of(fit.params)
     sums = np.zeros((16, trainer.surfels.count))
     for index in evenly_spread(len(data.views), FEW_VIEWS):
-        view, camera = data.views[index].load(), trainer.camera(index)
+        view = trainer.posed(index).load()
+        camera = view.camera()
         frames = [trainer.view(camera, surfels=surfels) for surfels in extremes]
         terms, size = [frame.terms or RadianceTerms() for frame in frames], (view.height, view.width)
         dull, mirror = (image_array(one.specular + one.indirect, *size) for one in terms)

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from mi_refgs.data.exposure import told_gains
-from mi_refgs.data.view import View, evenly_spread
+from mi_refgs.data.view import evenly_spread
 from mi_refgs.fitting.decide import Row, record, validates
 from mi_refgs.fitting.image_error import aligned, with_gain
 from mi_refgs.fitting.train import Trainer
@@ -74,7 +74,7 @@ class Cameras(PerView):
         if self.waits(trainer):
             return None
         views = trainer.data.views
-        moved = [_moved(trainer, views[i].load()) for i in evenly_spread(len(views), ALIGNED)]
+        moved = [_moved(trainer, i) for i in evenly_spread(len(views), ALIGNED)]
         off = float(np.median(moved))
         reason = f"{len(moved)} images fit {off:.2f} pixels from where their cameras say"
         return np.zeros((len(views), 6)), off > EXACT and len(views) > 1, reason
@@ -93,19 +93,20 @@ class Exposure(PerView):
         if (log := told_gains(data.views)) is None:
             if self.waits(trainer):
                 return None
-            frames = (trainer.view(trainer.camera(i), aovs=False) for i in range(len(data.views)))
-            fitted = [with_gain(frame, view, data)[0] for frame, view in zip(frames, data.views, strict=True)]
+            views = [trainer.posed(i) for i in range(len(data.views))]
+            frames = (trainer.view(view.camera(), aovs=False) for view in views)
+            fitted = [with_gain(frame, view, data)[0] for frame, view in zip(frames, views, strict=True)]
             log = np.log(fitted) - np.log(fitted).mean(axis=0)
             log = np.sign(log) * np.maximum(abs(log) - DEAD_ZONE, 0)
         least, most = np.exp([log.min(), log.max()])
         return log, bool(log.any()), f"gains of {least:.2f} to {most:.2f} per image"
 
 
-def _moved(trainer: Trainer, view: View) -> float:
-    """Pixels that what a loaded view looks at moves by, if its pose is fitted to its image; the mean."""
-    render = partial(trainer.view, aovs=False)
+def _moved(trainer: Trainer, index: int) -> float:
+    """Pixels that what a view looks at moves by, if its pose is fitted to its image; the mean."""
+    view, render = trainer.posed(index).load(), partial(trainer.view, aovs=False)
     everywhere = np.ones((view.height, view.width), bool)
     fitted = aligned(view, render(view.camera()), render, trainer.data, everywhere)
     points = trainer.setup.focus + trainer.setup.reach * np.array([*itertools.product((-0.5, 0.5), repeat=3)])
     before, after = (np.stack(one.project(points)[:2]) for one in (view, fitted))
-    return float(np.linalg.norm(after - before, axis=0).mean())
+    return float(np.linalg.norm(after - before, axis=0).mean()) * trainer.data.views[index].fx / view.fx

@@ -78,9 +78,7 @@ class MonteCarlo(Reflectance):
         base = dr.fma(points.albedo, BASE_RANGE[1], BASE_RANGE[0])
         roughness = dr.fma(points.roughness, ROUGHNESS_RANGE[1], ROUGHNESS_RANGE[0])
 
-        def body(
-            index: Any, sums: Any, base: Any, roughness: Any, view: Any, incident: Any
-        ) -> tuple[Any, ...]:
+        def body(index: Any, sums: Any, base: Any, roughness: Any, view: Any, incident: Any) -> Any:
             direction, cosine = _direction(index, count, normal)
             weight = 2 * dr.pi * cosine / mi.Float(count)
             scattered, glossy = base * (weight / dr.pi), weight * _ggx(normal, view, direction, roughness)

@@ -133,8 +133,7 @@ class Primitive(ABC):
             raw[name][rows] += np.float32(np.log(factor))
 
     def turn(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, offset: np.ndarray) -> None:
-        """Turn some primitives, in place, to what their parents are at `offset` (n,), standard deviations,
-        along an axis (n,) each."""
+        """Turn primitives, in place, to what parents are at `offset` (n,) deviations along `axis` (n,)."""
         return
 
     def shrink(self, raw: dict[str, np.ndarray], rows: slice, axis: np.ndarray, factor: float) -> None:
@@ -269,8 +268,7 @@ THICKNESS = 0.1  # third standard deviation of a flat primitive as a Gaussian, o
 
 
 def sorted_frame(axes: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions (N, 4) of 2 or 3 axes (N, A, 3), by deviation, longest first; all (N, 3), the third of two
-    THICKNESS."""
+    """Quaternions (N, 4) of 2 or 3 axes (N, A, 3), longest first; deviations (N, 3), a third THICKNESS."""
     order = np.argsort(-deviations, axis=1, kind="stable")
     axes = np.take_along_axis(axes, order[:, :, None], axis=1)
     s = np.take_along_axis(deviations, order, axis=1)

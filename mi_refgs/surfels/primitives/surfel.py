@@ -116,9 +116,7 @@ class Surfel(base.Oriented):
         inverse = dr.rcp(dr.select(visible, qn, 1))
         s = dr.clip(dr.select(visible, s * nearness, 1), 1 / SIZE_RANGE, SIZE_RANGE)
         focal = mi.Vector2f(camera.fx, camera.fy)
-        along_u, along_v = (
-            mi.Vector2f(*(dr.fma(-slope[i], t.z, t[i]) for i in range(2))) for t in (t_u, t_v)
-        )
+        along_u, along_v = (mi.Vector2f(*(dr.fma(-slope[i], t.z, t[i]) for i in (0, 1))) for t in (t_u, t_v))
         turned = -inverse if camera.mirrored else inverse  # t_u × t_v = -n there
         of_u, of_v = turned / s.x, turned / s.y
         centre = focal * slope + mi.Vector2f(camera.cx, camera.cy)
