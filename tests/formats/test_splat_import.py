@@ -155,9 +155,7 @@ def test_compressed_splats_are_converted(
         read_splats(path)
         assert "antialiasing" in capsys.readouterr().err
         path.write_bytes(content[:60])
-        refused(
-            ["import", path, "-o", tmp_path / "run"], path, "compressed splats (spz), which cannot be read"
-        )
+        refused(["import", path, "-o", tmp_path / "r"], path, "compressed splats (spz), which cannot be read")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     path.write_bytes(content)
     refused(["import", path, "-o", tmp_path / "run"], f"({kind}); pip install", "`splat-transform a.")

@@ -18,14 +18,14 @@ from mi_refgs.data.images import Pixels
 from mi_refgs.data.poses import poses_around
 from mi_refgs.data.view import View
 from mi_refgs.fitting import image_error, per_view
-from mi_refgs.fitting.events.per_view import DEAD_ZONE, Cameras, Exposure
+from mi_refgs.fitting.events.per_view import DEAD_ZONE, Cameras, Exposure, _moved
 from mi_refgs.fitting.objective import LossInputs, objective
 from mi_refgs.fitting.runner import begin
 from mi_refgs.fitting.targets import Target
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import srgb_from_linear
 from mi_refgs.kernels.device import upload, upload_tensor
-from mi_refgs.methods.method import GAIN, LOSS_WEIGHTS, POSE, DataOptions, Method
+from mi_refgs.methods.method import GAIN, LOSS_WEIGHTS, POSE, CoarseImages, DataOptions, Method
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.display import displayed, image_array
 from mi_refgs.render.pipeline import Frame, SurfelScene, render
@@ -367,6 +367,10 @@ def test_disturbed_cameras_are_recovered(tmp_path: Path, rng: np.random.Generato
     data, surfels, true = disturbed_discs(rng)
     trainer = Trainer(small_method(tmp_path, RADIANCE), data)
     trainer.fit.tables[0].replace(surfels, tuple(surfels.raw))
+    method, moved = trainer.method, _moved(trainer, 0)
+    trainer.take(trainer, replace(method, data=DataOptions(coarse=(CoarseImages(9),))))
+    assert moved != _moved(trainer, 0) == pytest.approx(moved, rel=0.3)  # of the whole image, not of averages
+    trainer.take(trainer, method)
     before = pose_errors(trainer, true)
     after = pose_errors(step_to(trainer, trainer.method.iterations), true)
     assert before[0] > 0.4 and before[1] > 0.004 and after[0] < 0.05 and after[1] < 5e-4
