@@ -126,8 +126,7 @@ def _run(argv: list[str]) -> int:
 
 @contextlib.contextmanager
 def _standard_output_to_error() -> Iterator[None]:
-    """Redirect what libraries print, C++ included, so that only the result goes to standard output; warnings
-    are sentences there."""
+    """Redirect what libraries print, C++ included: standard output has the result; warnings are told."""
     from mi_refgs.io.progress import warn
 
     sys.stdout.flush()

@@ -145,6 +145,13 @@ def require_few_sizes(file: Path, field: str, sizes: dict[tuple[int, int], str],
         raise InputError(f"{len(sizes)} different sizes, such as {some}", file, field, remedy)
 
 
+def require_own_names(views: Sequence[View], file: Path) -> None:
+    """Raise InputError if two views have one name, by which files of a run know them."""
+    name, count = Counter(view.name for view in views).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{count} views have this name", file, name, "list each image once, or rename some")
+
+
 def make_view(
     image: ImageFile,
     options: ReadOptions,
@@ -300,9 +307,7 @@ def read_dataset(
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
     require_few_sizes(found.source or path, "images", sizes, remedy)
-    name, count = Counter(view.name for view in views).most_common(1)[0]
-    if count > 1:
-        raise InputError(f"{count} {split} views have this name", found.source or path, name, "rename images")
+    require_own_names(views, found.source or path)
     # Region and offset are derived from the training cameras for every split.
     training = views
     if split != "train":

@@ -62,7 +62,7 @@ class ImageFile:
         """The image in a file, of which only the header is read."""
         width, height, _ = io.image_header(path)
         if min(width, height) < downscale:
-            what = f"{width} × {height} pixels are less than a block of {downscale}²"
+            what = f"{width} × {height} pixels are less than a block of {downscale:g}²"
             raise InputError(what, path, "downscale", "give a smaller number")
         return cls(path, width, height, downscale, mask)
 

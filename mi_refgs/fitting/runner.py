@@ -301,14 +301,12 @@ def _require_same(run: Run, made: Method, choice: Choice, data: Path | Dataset, 
     now, first = choice.method, ["name", "preset"]
     if not isinstance(now, Method):
         name = choice.named()
-        if not (name or choice.preset or choice.settings):
-            return
         if choice.purpose is not None:
             name = _for_images(name, load_method(name, None), views)
         given = methods.assignments(choice.settings)  # other keys are the run's
         first += [text.partition("=")[0] for text in given]
-        preset = choice.preset or made.preset or DEFAULT_PRESET
-        now = methods.load(name or made.file, preset, [*made.assignments, *given])
+        preset, asked = choice.preset or made.preset or DEFAULT_PRESET, name or choice.preset or given
+        now = methods.load(name or made.file, preset, [*made.assignments, *given]) if asked else made
     now = as_read(now, data, views) if isinstance(data, Dataset) else now
     if found := differences(run, now):
         key = min(found, key=lambda key: [not key.startswith(one) for one in first])

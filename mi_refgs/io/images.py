@@ -118,8 +118,7 @@ def read_bytes(path: str | Path, shrink: int = 1) -> tuple[np.ndarray, int]:
 def read_grey(path: str | Path) -> tuple[np.ndarray, int]:
     """Brightness (H, W) of a PNG or JPEG, of colours that of the brightest channel as a share of the largest,
     or alpha if it has transparent pixels, or whether a pixel is not black if a palette has colours, as
-    segmentation tools write labels; and white, the smallest of 1, 255 and 65535 that no number exceeds: a
-    mask may contain labels."""
+    segmentation tools write labels; and white, the least of 1, 255, 65535 that no label exceeds."""
     path = Path(path)
     with open_image(path) as image:
         if image.mode.startswith("I"):

@@ -76,8 +76,7 @@ class Initialiser:
 
 @dataclass(frozen=True)
 class Loss(Generic[Inputs]):
-    """A loss, which a method weighs by its name; the same for all of a fit, photometric or not. `Inputs` is
-    `mi_refgs.LossInputs`."""
+    """A loss, which a method weighs by its name; the same for all of a fit. Inputs: `mi_refgs.LossInputs`."""
 
     name: str  # of its weight in `[loss]` of a method file
     value: Callable[[Inputs], Float | None]  # width 1; None: not defined for these inputs

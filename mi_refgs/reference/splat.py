@@ -111,8 +111,7 @@ class Blend:
 def splat(
     raw: Raw, features: Array, camera: PinholeCamera, band: float = 1e-3, turns: Array | None = None
 ) -> Maps:
-    """Render raw channels with features (N, K); `band` is the relative width of the declared band; `turns` as
-    in `Blend.sums`."""
+    """Render raw channels with features (N, K); `band`: its relative width; `turns` as in `Blend.sums`."""
     turns = features[:, :0] if turns is None else turns
     blend, shape = _whole_image(raw, camera), (camera.height, camera.width)
     maps = np.sum(blend.weight * blend.z, 0), blend.weight.sum(0), blend.band(band)
@@ -123,8 +122,7 @@ def splat(
 def differentiate(
     raw: Raw, features: Array, camera: PinholeCamera, weights: Array, turns: Array | None = None
 ) -> dict[str, Array]:
-    """Gradients of Σ weights · maps, for `weights` (K + 2, P): as the raw channels, and "features", then
-    turns (N, K + 2 T)."""
+    """Gradients of Σ weights (K + 2, P) · maps: as raw channels, and "features", turns last (N, K + 2 T)."""
     turns = features[:, :0] if turns is None else turns
     gradients, δfeatures = _whole_image(raw, camera).adjoint(features, turns, weights.T)
     return gradients | {"features": δfeatures}

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.data.dataset import Dataset, read_dataset
+from mi_refgs.data.dataset import Dataset, read_dataset, require_own_names
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.progress import Tell
@@ -32,7 +32,7 @@ def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> 
     pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
     pixels *= 1 if method.data.crop is None else CROPPED
     views = read_views(method, path, "train", truth=False, pixels=pixels)
-    if method.data.downscale is None and views.downscale > 1:
+    if method.data.downscale is None and views.downscale > 1 and not isinstance(path, Dataset):
         large = max(views.views, key=lambda one: one.width * one.height)
         file = large.file or large
         tell(
@@ -47,8 +47,9 @@ def as_read(method: Method, path: Path | Dataset, views: Dataset) -> Method:
     """The method with the options by which these views of `path` were read."""
     data = replace(method.data, downscale=views.downscale)
     if isinstance(path, Dataset):
-        data = replace(data, images="exr" if views.is_linear_radiance else "png")
         data = replace(data, background="white" if views.background.any() else "black")
+        # Commands that follow may be given a folder of other images for those that are in none.
+        data = replace(data, images="exr" if views.is_linear_radiance and views.folder else "png")
     return replace(method, data=data)
 
 
@@ -58,6 +59,7 @@ def read_views(method: Method, path: Path | Dataset, split: str, truth: bool = T
     if isinstance(path, Dataset):
         if path.split != split:
             raise InputError(f"it has {path.split} views", path.path, "split", f"give {split} views")
+        require_own_names(path.views, path.path)
         return path
     options, size = method.data, {"downscale": method.data.downscale, "truth": truth} | size
     return read_dataset(path, split, background=options.background, images=options.images, **size)

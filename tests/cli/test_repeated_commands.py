@@ -16,6 +16,7 @@ import pytest
 
 from mi_refgs import methods
 from mi_refgs.cli import main
+from mi_refgs.data.dataset import read_dataset
 from mi_refgs.errors import InputError
 from mi_refgs.fitting.runner import Progress
 from mi_refgs.fitting.train import Trainer
@@ -50,6 +51,8 @@ def test_a_fit_resumes_with_its_own_options(run: Path, data: Path, method: Path,
     longer = dataclasses.replace(config, iterations=500)
     again = lambda: reconstruct.fit(data, longer, output=run, resume=True, progress=Progress())  # noqa: E731
     refused(again, "iterations: the run was started with 6", " 500")
+    black = read_dataset(data, "train", background="black")
+    refused(lambda: reconstruct.fit(black, output=run, resume=True), "data.background: the run was started")
     assert contents(run / "checkpoints") == state
     moved = shutil.copytree(data, tmp_path / "moved")
     assert main(["train", str(moved), "-o", str(run), "--resume"]) == 0

@@ -190,7 +190,7 @@ def unbounded(folder: Path) -> None:
         (edit(lambda c: c.update(camera_angle_x="wide")), {}, ["camera_angle_x", "'wide'"]),
         (edit(lambda c: c["frames"][1].pop("file_path")), {}, ["frames[1].file_path"]),
         (named("file_path", "train/none"), {}, ["none.png", "missing"]),
-        (named("file_path", "train/r_1.png"), {}, ["train/r_1: 2 train views have this name", "rename"]),
+        (named("file_path", "train/r_1.png"), {}, ["train/r_1: 2 views have this name", "rename"]),
         (lambda f: (f / "train/r_0.png").unlink(), {}, ["images: no EXR file", "alike"]),
         (edit(lambda c: c["frames"][1].pop("transform_matrix")), {}, ["frames[1].transform_matrix", "4 × 4"]),
         (named("transform_matrix", np.diag([1.0, 1, -2, 1]).tolist()), {}, ["mirroring"]),

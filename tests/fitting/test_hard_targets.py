@@ -79,11 +79,7 @@ def test_fit_stays_finite(name: str, tmp_path: Path) -> None:
     assert all(np.all(np.isfinite(plane.numpy())) for plane in [*frame.radiance, frame.alpha])
 
 
-@pytest.mark.parametrize(
-    "data",
-    [changed(alpha=np.zeros(SIZE, np.float32)), changed(views=1)],
-    ids=["nothing but background", "one view"],
-)
+@pytest.mark.parametrize("data", [changed(alpha=np.zeros(SIZE, np.float32)), changed(views=1)])
 def test_what_cannot_be_begun_is_one_sentence(data: Dataset, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^\w+: [^.]*; [^.]*$"):
         Trainer(small_method(tmp_path), data)

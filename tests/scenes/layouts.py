@@ -3,7 +3,7 @@
 import json
 import pickle
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,7 @@ def _pose(shot: Shot) -> list[float]:
     return [w, x, y, z, *shot.translation.tolist()]
 
 
-def write_text(
-    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
-) -> None:
+def write_text(model: Path, shots: list[Shot], camera: str = MODEL, values: Sequence[float] = VALUES) -> None:
     """The dots and these cameras as a COLMAP model; every second image has a point and a free keypoint."""
     size = (shots[0].width, shots[0].height)
     files: dict[str, list[tuple[object, ...]]] = {
@@ -47,7 +45,7 @@ def write_text(
 
 
 def write_binary(
-    model: Path, shots: list[Shot], camera: str = MODEL, values: tuple[float, ...] = VALUES
+    model: Path, shots: list[Shot], camera: str = MODEL, values: Sequence[float] = VALUES
 ) -> None:
     """The same contents in binary records."""
     kind, size = MODELS[camera][0] if camera in MODELS else 7, (shots[0].width, shots[0].height)

@@ -83,8 +83,8 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
 
 def _squared_error(trainer: Trainer, index: int) -> np.ndarray:
     """Squared error (H, W) of a displayed training image, mean over its channels."""
-    view, gains = trainer.data.views[index], gains_of(trainer.fit.params)
-    frame = trainer.view(trainer.camera(index), aovs=False)
+    view, gains = trainer.posed(index), gains_of(trainer.fit.params)
+    frame = trainer.view(view.camera(), aovs=False)
     shown = displayed_image(frame, view, trainer.data, None if gains is None else gains[index])
     return np.asarray(squared_error(shown, view).mean(axis=-1))
 

@@ -117,12 +117,13 @@ def test_images_of_a_fit_decide(
 ) -> None:
     """The fit ends where one with that metallic and the same seed does, if its surfels choose together."""
     monkeypatch.setattr(event, "NEIGHBOURHOOD", 1.0)
-    trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4")
+    coarse = "data.coarse=[{until=6, block=2}]"
+    trainer, said = fitted(views, tmp_path, TRIAL, "iterations=4", coarse)
     sentence = next(one for one in said if "continues as" in one)
     metal, dielectric = (float(part.split(" dB")[0].split()[-1]) for part in sentence.split(",")[:2])
     value = event.METAL if metal >= dielectric + GAIN else event.DIELECTRIC
     held = f"surfels.initial={{metallic={value}}}", "rates.attribute={metallic=0}"
-    again, _ = fitted(views, tmp_path / "again", "iterations=4", *held)
+    again, _ = fitted(views, tmp_path / "again", "iterations=4", coarse, *held)
     assert trainer.iteration == again.iteration == 4
     for name, raw in trainer.surfels.raw.items():
         np.testing.assert_array_equal(raw.numpy(), again.surfels.raw[name].numpy(), name)
