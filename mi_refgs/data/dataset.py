@@ -147,9 +147,9 @@ def require_few_sizes(file: Path, field: str, sizes: dict[tuple[int, int], str],
 
 def require_own_names(views: Sequence[View], file: Path) -> None:
     """Raise InputError if two views have one name, by which files of a run know them."""
-    name, count = Counter(view.name for view in views).most_common(1)[0]
-    if count > 1:
-        raise InputError(f"{count} views have this name", file, name, "list each image once, or rename some")
+    for name, count in Counter(view.name for view in views).items():
+        if count > 1:
+            raise InputError(f"{count} views have this name", file, name, "list images once, or rename some")
 
 
 def make_view(

@@ -57,8 +57,9 @@ def read_views(method: Method, path: Path | Dataset, split: str, truth: bool = T
     """A split of a data set, read as a method says, but for `size`, options of `read_dataset`; one in memory
     as it is. Raises InputError as `read_dataset` does, and for another split."""
     if isinstance(path, Dataset):
-        if path.split != split:
-            raise InputError(f"it has {path.split} views", path.path, "split", f"give {split} views")
+        if path.split != split or not path.views:
+            what = f"it has {len(path.views)} {path.split} views"
+            raise InputError(what, path.path, "split", f"give {split} views")
         require_own_names(path.views, path.path)
         return path
     options, size = method.data, {"downscale": method.data.downscale, "truth": truth} | size

@@ -248,6 +248,7 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
         (lambda r: mi_refgs.fit("x", r.method, preset="quick"), "a Method has its own; change it, or name"),
         (lambda r: mi_refgs.fit("x", settings={"a": None}), "settings: .*; give numbers"),
         (lambda r: mi_refgs.fit(replace(v := r.views("train"), views=v.views * 2)), "2 views have this name"),
+        (lambda r: mi_refgs.fit(replace(r.views("train"), views=())), "it has 0 train views; give train"),
     ],
 )
 def test_reconstruction_refuses_bad_input(balls: Reconstruction, call: Any, message: str) -> None:

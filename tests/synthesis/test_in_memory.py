@@ -73,5 +73,5 @@ def test_a_fit_takes_a_data_set_in_memory(tmp_path: Path) -> None:
     assert run.render(0, size=8).shape == (8, 8, 4)
     assert run.evaluate(test)["test_views"] == 3
     refused(run.evaluate, "the run records no data set; name one with --data")
-    refused(lambda: run.evaluate(train), "it has train views; give test views")
+    refused(lambda: run.evaluate(train), f"it has {len(train.views)} train views; give test views")
     refused(run.views, "its data set is unknown")
