@@ -94,8 +94,7 @@ class Targets:
         if (key := (index, block)) in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key]
-        view = self.data.views[index]
-        target = Target.of(view if block == 1 else view.averaged(block), self.data.background)
+        target = Target.of(self.data.views[index].averaged(block), self.data.background)
         self._kept[key] = target
         self._bytes += PIXEL_BYTES * len(target.image[0])
         while self._bytes > self.budget and len(self._kept) > 1:

@@ -127,11 +127,14 @@ class Trainer:
             return per_view.corrected(self.setup, self.fit.params, index, self.data.views[index].camera())
 
     def posed(self, index: int) -> View:
-        """A training view as the iteration reads it, with the correction of its pose that was fitted."""
+        """A training view, with the correction of its pose that was fitted."""
         view = self.data.views[index]
-        block = self.method.data.block_at(max(self.iteration, 1), view.width * view.height)
-        view = view if block == 1 else view.averaged(block)
         return replace(view, to_world=self.camera(index).pose()) if POSE in self.fit.params else view
+
+    def read(self, index: int) -> View:
+        """The loaded view that is `posed`, averaged as the iteration averages images, without maps."""
+        view = self.posed(index)
+        return view.averaged(self.method.data.block_at(max(self.iteration, 1), view.width * view.height))
 
     def view(self, camera: Camera, aovs: bool = True, surfels: Surfels | None = None) -> Frame:
         """Render the present state, or other `surfels` in it, as its export does, without derivatives."""

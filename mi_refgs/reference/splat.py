@@ -111,7 +111,7 @@ class Blend:
 def splat(
     raw: Raw, features: Array, camera: PinholeCamera, band: float = 1e-3, turns: Array | None = None
 ) -> Maps:
-    """Render raw channels with features (N, K); `band`: its relative width; `turns` as in `Blend.sums`."""
+    """Render raw channels, features (N, K); `band`: relative width of `near`; `turns` as in `Blend.sums`."""
     turns = features[:, :0] if turns is None else turns
     blend, shape = _whole_image(raw, camera), (camera.height, camera.width)
     maps = np.sum(blend.weight * blend.z, 0), blend.weight.sum(0), blend.band(band)

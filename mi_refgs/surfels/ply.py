@@ -1,8 +1,7 @@
 """Surfels and 3D Gaussians in PLY files, with the names and raw encodings of 2DGS and 3DGS (docs/formats.md).
 
-Normals are zeros, as both write them, and ignored when read. Spherical harmonics are colour-major: the
-constant coefficients of r, g, b, then all others of r, of g, of b. The column order of a surfel model is 3
-coefficient + rgb.
+Normals are zeros, as both write them, ignored when read. Spherical harmonics are colour-major: the constant
+coefficients of r, g, b, then all others of r, of g, of b. Columns of a surfel model: 3 coefficient + rgb.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Mutated files of every reader are read or refused: no crash, hang or code, little memory."""
+"""Mutated files of every reader are read or refused: no other exception, crash or hang, little memory."""
 
 import random
 import re

@@ -37,7 +37,7 @@ class ExtractMesh(Event[Trainer]):
         views, method = len(trainer.data.views), trainer.method
         last = self.when.count(trainer.iteration) == self.when.count(method.iterations)
         seen = range(views) if last else evenly_spread(views, FEW_VIEWS)
-        cameras = [trainer.posed(i).camera() for i in seen]
+        cameras = [trainer.read(i).camera() for i in seen]
         trainer.fit.occluder.update(surface_of(trainer.surfels.detach(), cameras, self.resolution))
 
 

@@ -1,7 +1,6 @@
 """Choice between metal and dielectric at the start of a fit, surfel by surfel, by a trial of both.
 
-The fit that explains the training images better continues; each of its surfels starts as what explains the
-images around it better.
+The fit that explains the images better continues; each surfel starts as what explains those around it.
 """
 
 import time
@@ -60,7 +59,7 @@ class Metal(Event[Trainer]):
         # Each surfel starts as what has the smaller error around it.
         excess = [one - 10 ** (gain / 10) * other for one, other in zip(*errors, strict=True)]
         raw = trainer.surfels.to_numpy()
-        attributed = _attributed(trainer.surfels, [*map(trainer.posed, judged)], excess)
+        attributed = _attributed(trainer.surfels, [*map(trainer.read, judged)], excess)
         metals = _sum_around(raw["position"], attributed) > 0
         raw["metallic"] = np.where(metals[:, None], logit(METAL), logit(DIELECTRIC)).astype(np.float32)
         trainer.fit.tables[0].replace(Surfels.from_numpy(raw), cleared=("metallic",))
@@ -83,7 +82,7 @@ def _begun(trainer: Trainer, metallic: float, steps: int) -> Trainer:
 
 def _squared_error(trainer: Trainer, index: int) -> np.ndarray:
     """Squared error (H, W) of a displayed training image, mean over its channels."""
-    view, gains = trainer.posed(index), gains_of(trainer.fit.params)
+    view, gains = trainer.read(index), gains_of(trainer.fit.params)
     frame = trainer.view(view.camera(), aovs=False)
     shown = displayed_image(frame, view, trainer.data, None if gains is None else gains[index])
     return np.asarray(squared_error(shown, view).mean(axis=-1))

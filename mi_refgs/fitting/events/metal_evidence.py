@@ -80,7 +80,7 @@ def moments(trainer: Trainer) -> np.ndarray:
     gains = per_view.gains_of(fit.params)
     sums = np.zeros((16, trainer.surfels.count))
     for index in evenly_spread(len(data.views), FEW_VIEWS):
-        view = trainer.posed(index).load()
+        view = trainer.read(index)
         camera = view.camera()
         frames = [trainer.view(camera, surfels=surfels) for surfels in extremes]
         terms, size = [frame.terms or RadianceTerms() for frame in frames], (view.height, view.width)

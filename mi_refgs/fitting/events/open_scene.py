@@ -41,7 +41,7 @@ class FollowObject(Event[Trainer]):
         assert region is not None and around is not None
         tables = trainer.surfels.detach(), around.surfels.detach()
         points = []
-        for view in map(trainer.posed, evenly_spread(len(views), FEW_VIEWS)):
+        for view in map(trainer.read, evenly_spread(len(views), FEW_VIEWS)):
             depth, alpha = render_depth(tables[0], view.camera(), tables[1])
             points.append(surface_points(view, depth, alpha, region.radius))
         seen, cameras = partial(seen_share, views), camera_positions(views)
@@ -71,7 +71,7 @@ class PhotographLight(Event[Trainer]):
         trainer.check()
         light, around, region = trainer.fit.light, trainer.fit.surroundings, trainer.region
         assert light is not None and around is not None and region is not None
-        posed = [*map(trainer.posed, evenly_spread(len(trainer.data.views), FEW_VIEWS))]
+        posed = [*map(trainer.read, evenly_spread(len(trainer.data.views), FEW_VIEWS))]
         given = (around, region, posed, light.environment().height)
         trainer.fit.photographed = PhotographedLight.of(trainer.surfels.detach(), *given)
 

@@ -93,7 +93,7 @@ class Exposure(PerView):
         if (log := told_gains(data.views)) is None:
             if self.waits(trainer):
                 return None
-            views = [trainer.posed(i) for i in range(len(data.views))]
+            views = [trainer.read(i) for i in range(len(data.views))]
             frames = (trainer.view(view.camera(), aovs=False) for view in views)
             fitted = [with_gain(frame, view, data)[0] for frame, view in zip(frames, views, strict=True)]
             log = np.log(fitted) - np.log(fitted).mean(axis=0)
@@ -104,7 +104,7 @@ class Exposure(PerView):
 
 def _moved(trainer: Trainer, index: int) -> float:
     """Pixels that what a view looks at moves by, if its pose is fitted to its image; the mean."""
-    view, render = trainer.posed(index).load(), partial(trainer.view, aovs=False)
+    view, render = trainer.read(index), partial(trainer.view, aovs=False)
     everywhere = np.ones((view.height, view.width), bool)
     fitted = aligned(view, render(view.camera()), render, trainer.data, everywhere)
     points = trainer.setup.focus + trainer.setup.reach * np.array([*itertools.product((-0.5, 0.5), repeat=3)])

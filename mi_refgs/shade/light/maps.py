@@ -106,7 +106,7 @@ def require_range(rotate: float, exposure: float) -> None:
 def world_light(
     radiance: np.ndarray, world: bool, rotate: float, exposure: float, height: int | None = None
 ) -> EnvironmentLight:
-    """Convert lat-long radiance (h, w, 3) to a light of `height` rows, h up to FIXED_HEIGHT, as `Known`."""
+    """Lat-long radiance (h, w, 3) as a light of `height` rows, or min(h, FIXED_HEIGHT); options: `Known`."""
     require_range(rotate, exposure)
     radiance = np.ascontiguousarray(radiance, dtype=np.float32)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape) < 2:
