@@ -5,8 +5,8 @@ from functools import reduce
 
 from mi_refgs.kernels.timing import phase
 from mi_refgs.splat.camera import Camera as Camera
-from mi_refgs.splat.composite import Composited as Composited, composite
-from mi_refgs.splat.tiles import TileLists as TileLists, list_by_tile
+from mi_refgs.splat.composite import Composited as Composited, composite as composite
+from mi_refgs.splat.tiles import TileLists as TileLists, list_by_tile as list_by_tile
 from mi_refgs.surfels.primitives.primitive import Footprints
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float

@@ -105,7 +105,8 @@ class Lanes:
         lanes = Lanes.of(lists)
         if lists.few is None:
             return [(lanes, lists.features)]
-        whole = _of_patches(dr.gather(mi.UInt32, lists.with_all, lanes.tile, lanes.begin < lanes.end) > 0)
+        shown = dr.gather(mi.UInt32, lists.with_all, lanes.tile, lanes.begin < lanes.end)
+        whole = dr.block_reduce(dr.ReduceOp.Or, shown, PATCH_LANES) > 0
         parts = ((dr.compress(whole), lists.features), (dr.compress(~whole), lists.few))
         return [(Lanes.of(lists, chosen), count) for chosen, count in parts if dr.width(chosen)]
 
@@ -123,11 +124,6 @@ class Lanes:
     def from_raster(self, images: list[Float]) -> list[list[Float]]:
         """Inverse of `to_raster`; 0 outside the image."""
         return [[dr.gather(mi.Float, x, raster, inside) for x in images] for _, raster, inside in self.each()]
-
-
-def _of_patches(flags: Bool) -> Bool:
-    """Whether a flag is set in one of the lanes of each patch."""
-    return dr.block_reduce(dr.ReduceOp.Or, dr.select(flags, mi.UInt32(1), 0), PATCH_LANES) > 0
 
 
 def any_of(flags: list[Bool]) -> Bool:

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refgs.splat import Camera, Composited, list_by_tile, project, splat
+from mi_refgs.splat import Camera, Composited, TileLists, composite, list_by_tile, project
 from mi_refgs.surfels.table import Surfels
 from mi_refgs.types import Float
 
@@ -18,13 +18,21 @@ class BlendedView:
 
     features: list[Float]
     maps: Composited
+    lists: TileLists
 
     @staticmethod
     def of(surfels: Sequence[Surfels], camera: Camera, values: Sequence[Float | float]) -> "BlendedView":
         count = sum(table.count for table in surfels)
         features = [dr.opaque(mi.Float, 0, count) + value for value in values]
         dr.enable_grad(features)
-        return BlendedView(features, splat([table.detach() for table in surfels], features, camera))
+        footprints = project([table.detach() for table in surfels], camera)
+        lists = list_by_tile(footprints, camera, features)
+        return BlendedView(features, composite(footprints, features, lists), lists)
+
+    @property
+    def tiles(self) -> np.ndarray:
+        """Tiles (N,) in whose lists each surfel is: what it costs, wherever it is hidden."""
+        return np.bincount(np.array(self.lists.surfel_from_pair), minlength=len(self.features[0]))
 
     def sums(self, maps: Sequence[Float | float]) -> list[np.ndarray]:
         """Sums Σ w m (N,) float64 of blending weights, for a map m (H·W,) per feature f: gradients of
@@ -34,10 +42,3 @@ class BlendedView:
         if dr.grad_enabled(total):  # unless the view shows nothing
             dr.backward(total)
         return [np.array(dr.grad(feature), dtype=np.float64) for feature in self.features]
-
-
-def listed_tiles(surfels: Sequence[Surfels], camera: Camera) -> np.ndarray:
-    """Tiles (N,) of an image in whose lists each of N surfels is: what it costs, wherever it is hidden."""
-    with dr.suspend_grad():
-        lists = list_by_tile(project(surfels, camera), camera)
-    return np.bincount(np.array(lists.surfel_from_pair), minlength=sum(table.count for table in surfels))

@@ -7,7 +7,7 @@ import pytest
 
 from mi_refgs.splat import splat
 from mi_refgs.splat.camera import Camera
-from mi_refgs.splat.weights import BlendedView, listed_tiles
+from mi_refgs.splat.weights import BlendedView
 from mi_refgs.surfels.table import Surfels
 from tests.scenes.integrator import raw_channels
 
@@ -35,18 +35,18 @@ def test_weights_are_those_of_a_feature_of_one_surfel(rng: np.random.Generator) 
 def test_surfels_behind_the_camera_have_no_weights() -> None:
     surfels = Surfels.from_numpy(raw_channels())
     away = Camera.look_at((0, -4, 1), (0, -8, 1), fov=40, size=24)
-    assert not BlendedView.of([surfels], away, [0]).sums([1])[0].any()
-    assert not listed_tiles([surfels], away).any()
+    seen = BlendedView.of([surfels], away, [0])
+    assert not seen.sums([1])[0].any() and not seen.tiles.any()
 
 
 def test_surfels_are_listed_in_the_tiles_that_they_cover(rng: np.random.Generator) -> None:
     """A surfel contributes to the pixels of no other tile; behind others it costs as much."""
     surfels, view = Surfels.from_numpy(raw_channels()), camera((0, -4, 1))
-    tiles = listed_tiles([surfels], view)
+    tiles = BlendedView.of([surfels], view, [0]).tiles
     width, height = view.tile
     for index in range(surfels.count):
         alone = [surfels.gather(mi.UInt32(index))]
         rows, columns = np.nonzero(splat(alone, [], view).alpha.numpy().reshape(24, 24) > 0)
         shown = {(row // height, column // width) for row, column in zip(rows, columns, strict=True)}
-        assert len(shown) <= tiles[index] == listed_tiles(alone, view)[0]
+        assert len(shown) <= tiles[index] == BlendedView.of(alone, view, [0]).tiles[0]
     assert tiles.max() > tiles.min() >= 1

@@ -17,7 +17,7 @@ from mi_refgs.fitting.state import TableEdit
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.methods.extensions import Event, register_event
 from mi_refgs.methods.fields import Window, at_least, between
-from mi_refgs.splat.weights import BlendedView, listed_tiles
+from mi_refgs.splat.weights import BlendedView
 from mi_refgs.surfels.attributes import logit, sigmoid
 from mi_refgs.surfels.primitives.primitive import primitive_of
 from mi_refgs.surfels.table import Surfels
@@ -89,7 +89,7 @@ class Densify(Event[Trainer]):
             weight += pixels
             for deep in depths:
                 before += pixels * (pixels * seen.depth_of(position) < NEARER * deep)
-            cost += listed_tiles(every, small)
+            cost += view.tiles
         floating = np.flatnonzero(before[own:] > FLOATING * weight[own:])
         tables = zip(np.split(weight, [own]), np.split(cost, [own]), (NO_ROWS, floating), strict=True)
         return [(least_weight(w, c, self.prune_weight), gone) for w, c, gone in tables][: len(every)]
