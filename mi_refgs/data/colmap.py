@@ -3,6 +3,7 @@ Every eighth image by name is a test view, unless `test.txt` beside the reconstr
 reconstructions, the one with most images is read."""
 
 import contextlib
+import unicodedata
 from dataclasses import replace
 from glob import glob
 from pathlib import Path
@@ -67,10 +68,10 @@ class Reconstruction:
         if not is_file(test_list):
             return held_out(images, split, self.source)
         lines = test_list.read_text("utf-8-sig", "replace").splitlines()
-        tests = {line.strip() for line in lines if line.strip()}
-        for name in sorted(tests - {image.name for image in self.images}):
-            self.options.say(f"named in {TEST_LIST}, but not in the model", name, name)
-        chosen = [image for image in images if (image.name in tests) == (split == "test")]
+        tests = {_plain(line): line for line in map(str.strip, lines) if line}
+        for key in sorted({*tests} - {_plain(image.name) for image in self.images}):
+            self.options.say(f"named in {TEST_LIST}, but not in the model", tests[key], tests[key])
+        chosen = [image for image in images if (_plain(image.name) in tests) == (split == "test")]
         if not chosen:
             raise InputError(f"zero {split} views", test_list, remedy="name some of the images, not all")
         return chosen
@@ -119,6 +120,11 @@ class Reconstruction:
             chosen = f"{'/'.join(self.source.parts[-3:-1])}, of {len(self.images)} images, is read"
             notes.append(f"{chosen}; {others} smaller models are left out")
         return tuple(notes)
+
+
+def _plain(name: str) -> str:
+    """A name as others may write it: with composed letters, as not on macOS, and slashes."""
+    return unicodedata.normalize("NFC", name).replace("\\", "/")
 
 
 def _models(folder: Path) -> list[Path]:

@@ -247,7 +247,8 @@ def mask_of(image: Path, root: Path, marks: Sequence[str] = MARKS[1:]) -> Mask |
         return Mask(found)
     name = image.relative_to(root)
     own = name.parts[0] if len(name.parts) > 1 else ""
-    folders = [path for path in sorted(root.iterdir()) if MASK.search(path.name) and path.is_dir()]
+    others = (path for path in sorted(root.iterdir()) if path.name != own)
+    folders = [path for path in others if MASK.search(path.name) and path.is_dir()]
     images = {path: MASK.sub("", path.name) for path in folders}  # the folder whose masks these are, or ""
     folders = [path for path in folders if images[path] in ("", own) or not (root / images[path]).is_dir()]
     if not folders:

@@ -73,7 +73,7 @@ def write_masks(folder: Path) -> None:
                 # COLMAP's are beside its folder of images, such as dense/0/images.
                 deep = len(parts) if data.source and data.source.stem == "images" else 1
                 at = next((i for i, part in enumerate(parts[:deep]) if part in FOLDERS), -1)
-                name = Path(*parts[at + 1 :]).with_suffix(".png")
+                name = Path(*parts[at + 1 : -1], f"{file.name}.png")  # a.jpg and a.png may be two
                 masks[file] = folder.joinpath(*parts[: max(at, 0)], MASKS), name
     if found := [root for root, _ in masks.values() if root.exists()]:
         raise InputError("exists", found[0], "--masks", "remove it")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mi_refgs.data.images import ImageSource, Mask, Pixels
+from mi_refgs.data.images import OVERSHOOT, ImageSource, Mask, Pixels
 from mi_refgs.data.lens import Lens
 from mi_refgs.errors import InputError
 from mi_refgs.io.images import box_downscale, linear_from_srgb, srgb_from_linear
@@ -54,7 +54,8 @@ class View:
     """(K, 5) column and row of keypoints in pixels of that file, 0 at its corner, and their points, world."""
 
     def load(self) -> "View":
-        """The view with its image decoded; raises InputError for an unreadable file or another size."""
+        """The view with its image decoded; raises InputError for an unreadable file, another size, and values
+        of 8 bits."""
         if isinstance(self.pixels, ImageSource):
             return replace(self, pixels=self.pixels.read()).load()
         for name, pixels, channels in (("image", self.pixels.image, (3,)), ("alpha", self.pixels.alpha, ())):
@@ -62,6 +63,9 @@ class View:
             if pixels is not None and np.shape(pixels) != shape:
                 what, remedy = f"{name} has shape {np.shape(pixels)}", f"give {shape}, the size of the view"
                 raise InputError(what, self.name, "pixels", remedy)
+            linear = name == "image" and self.is_linear_radiance
+            if pixels is not None and not linear and (most := np.max(pixels, initial=0)) > 1 + OVERSHOOT:
+                raise InputError(f"{name} has {most:g}", self.name, "pixels", "give 0 … 1, not 0 … 255")
         return self
 
     @property

@@ -167,3 +167,4 @@ def test_masks_are_written_where_they_are_read(tmp_path: Path) -> None:
         write_png(path, image)
     write_masks(tmp_path)
     assert all(view.has_alpha for view in read_dataset(tmp_path, "train").views)
+    assert (tmp_path / "dense/0/masks/a.png.png").is_file()  # not that of a.jpg

@@ -153,12 +153,14 @@ def test_broken_text_files_are_refused(file: str, line: str, said: str, tmp_path
 
 
 def test_region_of_both_splits_is_that_of_the_training_cameras(tmp_path: Path) -> None:
-    """Also a split of one view, whose camera alone looks at no point."""
-    data = write_colmap(tmp_path)
+    """Also a split of one view, whose camera alone looks at no point, and whose name is written otherwise."""
+    data = write_colmap(
+        tmp_path, shots=[replace(one, name=one.name.replace("d", "e\u0301")) for one in SHOTS]
+    )
     for count in (2, 1):
         train, test = read_dataset(data, "train"), read_dataset(data, "test")
         assert len(test.views) == count and test.region == train.region == region_of(train.views)
-        (data / "sparse/0/test.txt").write_text("\ufeffd.png\n\nmistyped.png\n", "utf-8")
+        (data / "sparse/0/test.txt").write_text("\ufeff\u00e9.png\n\nmistyped.png\n", "utf-8")
     assert "1 images: named in test.txt, but not in the model, such as mistyped.png" in train.notes
 
 

@@ -171,23 +171,20 @@ def test_opaque_alpha_is_ignored(images: str, tmp_path: Path) -> None:
         assert read_dataset(data, "train").has_alpha
 
 
-def test_images_without_masks_among_others_are_noted(tmp_path: Path) -> None:
-    """Two of seven images are opaque RGBA without a mask: a fit is told, and doctor says it once."""
+def test_images_without_masks_among_others_are_refused(tmp_path: Path) -> None:
+    """Two of seven images are opaque RGBA without a mask. Doctor says it of splits that differ."""
     data = make_opaque(write_data(tmp_path / "ball", views=7, truth=False))
     for i in range(2, 7):
         path = data / f"train/r_{i}.png"
         write_png(path.with_name(f"{path.stem}_alpha.png"), np.eye(20)[..., None].repeat(3, axis=-1))
         write_png(path, read_png(path)[..., :3])
-    ignored, lacking = read_dataset(data, "train").notes
-    assert ignored == "2 of 7 images have alpha, but no pixel is transparent: alpha is ignored"
-    remedy = "give all images masks, or none"
-    assert lacking == f"no alpha and no mask for 2 of 7 images, such as 'train/r_0'; {remedy}"
-    assert [note for note in survey(data)["notes"] if remedy in note] == [lacking]
+    lacking = "no alpha and no mask for 2 of 7 images, such as 'train/r_0'; give all masks, or none"
+    refused(lambda: read_dataset(data, "train"), lacking)
     for path in data.glob("*/r_?.png"):
         write_png(path, np.ones((20, 20, 3)))
     for i in range(7):
         write_png(data / f"train/r_{i}_alpha.png", np.eye(20)[..., None].repeat(3, axis=-1))
-    assert f"only some images have alpha; {remedy}" in survey(data)["notes"]
+    assert "only some images have alpha; give all images masks, or none" in survey(data)["notes"]
 
 
 @pytest.mark.parametrize("budget", [0, 1 << 20])
@@ -295,6 +292,9 @@ def test_view_is_decoded_only_by_load(tmp_path: Path, decode: Mock) -> None:
     assert decode.call_count == 1
 
 
-def test_pixels_of_another_shape_than_the_view_are_refused() -> None:
+def test_pixels_of_another_shape_or_range_than_a_view_has_are_refused() -> None:
     view = View("a", 3, 2, 3, 3, 1.5, 1, np.eye(4), Pixels(np.ones((3, 2, 3))))
     refused(lambda: Target.of(view, np.ones(3)), "a: pixels: image has shape (3, 2, 3)", "give (2, 3")
+    view = dataclasses.replace(view, pixels=Pixels(np.full((2, 3, 3), 9, np.uint8)))
+    refused(view.load, "a: pixels: image has 9; give 0 … 1, not 0 … 255")
+    dataclasses.replace(view, is_linear_radiance=True).load()
