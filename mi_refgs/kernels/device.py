@@ -48,13 +48,14 @@ def require_supported_variant(what: str) -> None:
         raise InputError(f"'{mi.variant()}' is not supported", what, "variant", remedy)
 
 
-def children_of(parent: Any) -> dict[str, Any]:
-    """What an object of Mitsuba hands to `mi.traverse`: its objects, which that opens, and its values."""
-    found: dict[str, Any] = {}
+def children_of(parent: Any) -> list[tuple[str, Any]]:
+    """What an object of Mitsuba hands to `mi.traverse`, by names: its objects, which that opens, and its
+    values."""
+    found: list[tuple[str, Any]] = []
 
     class Children(mi.TraversalCallback):
         def put(self, name: str, value: Any, *flags: Any) -> None:
-            found[name] = value
+            found.append((name, value))
 
         put_object = put_value = put
 

@@ -90,7 +90,7 @@ class FilmImage:
     @property
     def _sensors(self) -> list[Any]:
         """The sensors of a `batch`, whose images are side by side in its film; else the sensor itself."""
-        inner = [one for one in children_of(self.sensor).values() if isinstance(one, mi.Sensor)]
+        inner = [one for _, one in children_of(self.sensor) if isinstance(one, mi.Sensor)]
         if inner and (*self.film.crop_size(),) != (*self.film.size(),):
             raise InputError("a crop of a `batch`", "refgs", "film", "render its sensors one by one")
         return inner or [self.sensor]

@@ -70,7 +70,7 @@ class _Parameters:
 
     def __init__(self, bsdf: Any, si: Any, active: Bool) -> None:
         self.bsdf, self.si, self.active = bsdf, si, active
-        self.children, self.values = children_of(bsdf), mi.traverse(bsdf)
+        self.children, self.values = dict(children_of(bsdf)), mi.traverse(bsdf)
 
     def __contains__(self, name: str) -> bool:
         return name in self.children
