@@ -1,5 +1,6 @@
 """Load a Mitsuba scene file, with further AOVs of its `refgs` integrator or the object only."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,8 @@ def load_scene(
                     del integrators[0][name]
         for props in (node.props for node in state.nodes):
             if props.plugin_name() in IMAGES and "filename" in props:
-                file = path.parent / str(beside.resolve(props["filename"]))
+                file = Path(str(beside.resolve(props["filename"])))
+                file = file if file.is_file() else path.parent / file
                 if file.suffix.lower() in (".exr", ".hdr"):  # broken, they end the process in Mitsuba
                     props["bitmap"] = mi.Bitmap(IMAGES[props.plugin_name()](file))
                     del props["filename"]
@@ -64,9 +66,8 @@ def reason(error: BaseException) -> str:
         cause = cause.__cause__
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     for line in reversed(lines):
-        _, found, message = line.partition("InputError: ")
-        if found:
-            return message
+        if found := re.search(r"\b(?:Input|UnknownName)Error: (.*)", line):
+            return found[1]
     undefined = "undefined parameter" in str(error)
-    remedy = "`refgs dataset -D NAME=VALUE` gives one" if undefined else "correct the scene"
+    remedy = "add its <default>, or `refgs dataset -D NAME=VALUE`" if undefined else "correct the scene"
     return f"{lines[-1] if lines else error}; {remedy}"

@@ -191,20 +191,23 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
         refused(lambda: read_radiance(path), "EXPOSURE, COLORCORR: no numbers")
 
 
-def test_scenes_read_their_maps_so(tmp_path: Path, capsys: Captured) -> None:
-    """Emitter and texture of a Mitsuba scene; a broken file is named."""
-    OpenEXR.File({"type": OpenEXR.scanlineimage} | WINDOW, PLAIN).write(str(tmp_path / "a.exr"))
+def test_scenes_read_their_maps_so(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Emitter and texture of a Mitsuba scene, in a folder that it names; a broken file is named."""
+    monkeypatch.chdir(tmp_path)
+    path = Path("scenes/a.xml")
+    (image := Path("scenes/maps/a.exr")).parent.mkdir(parents=True)
+    OpenEXR.File({"type": OpenEXR.scanlineimage} | WINDOW, PLAIN).write(str(image))
     file = '<string name="filename" value="a.exr"/>'
     texture = f'<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{file}</texture></bsdf>'
     scene = f'<emitter type="envmap">{file}</emitter><shape type="sphere">{texture}</shape>'
-    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{scene}</scene>')
-    loaded = load_scene(tmp_path / "a.xml")
+    path.write_text(f'<scene version="3.0.0"><path value="maps"/>{scene}</scene>')
+    loaded = load_scene(path)
     assert "a.exr: pixels" in capsys.readouterr().err
     np.testing.assert_allclose(environment_image(loaded, 16)[[0, 8], 0], [(0, 0, 0), GREY], atol=1e-3)
     (reflectance,) = (v for k, v in mi.traverse(loaded).items() if k.endswith("reflectance.data"))
     assert np.array(reflectance).shape[:2] == (32, 32)
-    (tmp_path / "a.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:300])
-    refused(lambda: load_scene(tmp_path / "a.xml"), "a.exr: header: not a readable EXR file")
+    image.write_bytes(image.read_bytes()[:300])
+    refused(lambda: load_scene(path), "a.exr: header: not a readable EXR file")
 
 
 @pytest.mark.parametrize("kind", ["float.exr", "half.exr", "8_bits.png"])
