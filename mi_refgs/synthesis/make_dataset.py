@@ -15,7 +15,7 @@ from mi_refgs.data.images import Pixels, compose
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, pinhole
 from mi_refgs.data.region import Region, read_region, write_region
 from mi_refgs.data.view import View
-from mi_refgs.errors import InputError, within
+from mi_refgs.errors import InputError, require_between, within
 from mi_refgs.io.exr import write_exr
 from mi_refgs.io.files import write_json
 from mi_refgs.io.images import srgb_from_linear, straight_srgb, write_png
@@ -88,6 +88,9 @@ def around_object(
     loaded: Scene, given: DatasetOptions, scene: Path, tell: bool = False
 ) -> tuple[Cameras, list[Any], Region | None]:
     """Cameras around the object of a scene, its shapes, and in an open scene the region around it."""
+    for kind, there in (("shapes", loaded.shapes()), ("emitters", loaded.emitters())):
+        if not there:
+            raise InputError("the scene has none", scene, kind, "add an object and a light")
     named = {shape.id(): shape for shape in loaded.shapes() if shape.id()}
     for name in {*given.objects} - {*named}:
         remedy = f"give one of {', '.join(sorted(named)) or 'none'}"
@@ -170,6 +173,8 @@ def traced(
     loaded = load_scene(path, given.define) if isinstance(scene, str | Path) else scene
     cameras, _, region = around_object(loaded, given, path)
     jobs: list[tuple[Tracer, View, int]] = []
+    sensors = loaded.sensors() if sensors is None else sensors
+    require_between(sensors if isinstance(sensors, int) else len(sensors), "sensors", 1)
     if isinstance(sensors, int):
         tracer, (width, height), focal = Tracer(loaded, cameras), given.resolution, given.focal
         numbered = replace(cameras, options=replace(given, views=sensors, test_views=sensors))
@@ -177,7 +182,7 @@ def traced(
             view = View("", width, height, focal, focal, width / 2, height / 2, pose, BLANK)
             jobs.append((tracer, view, seed))
     else:
-        for index, sensor in enumerate(loaded.sensors() if sensors is None else sensors):
+        for index, sensor in enumerate(sensors):
             camera = sensor if isinstance(sensor, Camera) else Camera.from_sensor(sensor)
             sized = replace(given, size=(camera.width, camera.height))
             tracer = Tracer(loaded, replace(cameras, options=sized), camera)

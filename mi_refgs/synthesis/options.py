@@ -135,5 +135,5 @@ def scene_hash(scene: Path, define: Sequence[str] = ()) -> str:
     for name in [*names, *(e.get("filename") for e in root.iter("include"))]:
         file = scene.parent / (name or "")
         if file.is_file():
-            digest.update(file.read_bytes())
+            digest.update(scene_hash(file).encode() if file.suffix == ".xml" else file.read_bytes())
     return digest.hexdigest()

@@ -42,11 +42,7 @@ def load_scene(scene: Path, define: Sequence[str] = ()) -> Any:
             if value.startswith("$") and value not in used:
                 some = {"type": "path", "boolean": "false"}.get(key if key == "type" else tag, "1")
                 values.setdefault(value[1:], some)
-    loaded = scenes.load_scene(scene, define=values)
-    for kind, there in (("shapes", loaded.shapes()), ("emitters", loaded.emitters())):
-        if not there:
-            raise InputError("the scene has none", scene, kind, "add an object and a light")
-    return loaded
+    return scenes.load_scene(scene, define=values)
 
 
 def under_light(scene: Scene, light: Path, objects: Sequence[Any] = ()) -> Any:
@@ -95,7 +91,8 @@ def prepare_folder(out: Path, wanted: dict[str, Any], overwrite: bool, relight: 
     # Files that do not match the settings or a light, and the options that say so.
     other = [name for name in wanted if found and found.get(name) != wanted[name]]
     changed = [*dict.fromkeys(OPTIONS.get(name) or f"--{name.replace('_', '-')}" for name in other)]
-    stale = [*FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in FILES)] if changed else []
+    views = [*FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in FILES)]
+    stale = views if changed or overwrite else []
     lights = {} if changed else recorded_lights(record)
     for light in relight:
         if lights.get(light.name, light.sha256) != light.sha256:

@@ -61,6 +61,9 @@ def test_sensors_keep_their_lens_and_pose() -> None:
     uneven = Camera.from_pose(9, 9, -9, -12, 4.5, 4.5, camera.pose())
     refused(lambda: Dataset.from_mitsuba(scene(), [uneven]), "square pixels")
     refused(lambda: Dataset.from_mitsuba(scene(), 2, sise=3), "from_mitsuba: sise: unknown option")
+    refused(lambda: Dataset.from_mitsuba(scene(), []), "sensors: 0 is out of range")
+    dark = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+    refused(lambda: Dataset.from_mitsuba(dark, 2), "emitters: the scene has none; add")
 
 
 def test_a_fit_takes_a_data_set_in_memory(tmp_path: Path) -> None:
