@@ -49,6 +49,14 @@ def test_python_blocks_run(code: str, checkout: Path) -> None:
     run_python(code, folder=checkout)
 
 
+def test_methods_of_plugins_load(tmp_path: Path) -> None:
+    (block,) = blocks(ROOT / "docs" / "scripting.md", "toml")
+    (tmp_path / "coat.toml").write_text(block)
+    plugin = str(ROOT / "tests/scenes/coat.py")
+    code = f"import mi_refgs\nmi_refgs.load_plugins([{plugin!r}])\nmi_refgs.load_method('coat.toml')"
+    run_python(code, folder=tmp_path)
+
+
 @pytest.mark.parametrize("page", SHELL)
 def test_commands_exist(page: Path) -> None:
     """Every `refgs` line parses: its command and options are known."""
