@@ -166,11 +166,16 @@ def run_process(
     )
 
 
+def completed(*arguments: object, **options: Any) -> str:
+    """What a program prints in a fresh process, with the options of `run_process`; it has to succeed."""
+    done = run_process(*arguments, **options)
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+    return done.stdout
+
+
 def run_python(code: str, *arguments: object, folder: Path, package: Path = ROOT) -> str:
     """What `code` prints in a fresh process with warnings as errors, which finds mi_refgs below `package`."""
-    done = run_process("-W", "error", "-c", code, *arguments, folder=folder, package=package)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    return completed("-W", "error", "-c", code, *arguments, folder=folder, package=package).strip()
 
 
 def imported_packages(source: str) -> set[str]:

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import pages, plots
 from benchmarks.common.build import read_result
-from tests.helpers import run_process
+from tests.helpers import completed
 
 
 @pytest.fixture(scope="module")
@@ -14,8 +14,7 @@ def result(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     """Its JSON, which has every name that the pages' markers require, and from which its plot is drawn."""
     name = request.module.BENCHMARK
     folder = tmp_path_factory.mktemp(name)
-    done = run_process("-W", "error", "-m", f"benchmarks.{name}", "--small", "--quiet", "-o", folder)
-    assert done.returncode == 0, done.stderr[-3000:]
+    completed("-W", "error", "-m", f"benchmarks.{name}", "--small", "--quiet", "-o", folder)
     path = folder / f"{name}.json"
     assert pages.names_of(name) <= pages.values(path).keys()
     for plot in (plot for plot in plots.PLOTS if plot.startswith(name)):

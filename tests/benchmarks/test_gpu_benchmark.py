@@ -3,12 +3,11 @@
 from pathlib import Path
 
 from benchmarks.common.build import read_result
-from tests.helpers import run_process
+from tests.helpers import completed
 
 
 def test_small_instance(tmp_path: Path) -> None:
-    done = run_process("-m", "benchmarks.gpu", tmp_path, "--small", "gsplat", "splat", "volprim")
-    assert done.returncode == 0, done.stderr[-3000:]
+    completed("-m", "benchmarks.gpu", tmp_path, "--small", "gsplat", "splat", "volprim")
     steps = read_result(tmp_path / "gpu.json")["steps"]
     (ours,), (theirs,) = steps["splat"], steps["volprim"]
     assert 0 < ours["kernels_both"]["ms"] and 0.2 < ours["mean_alpha"] < 0.6

@@ -9,7 +9,7 @@ from urllib.parse import urlparse
 
 import pytest
 
-from tests.helpers import ROOT, command_names, command_options, run_process, run_python
+from tests.helpers import ROOT, command_names, command_options, completed, run_python
 
 REFERENCE = ROOT / "docs" / "reference"
 PAGES = [*ROOT.glob("*.md"), ROOT / "scenes" / "README.md", *(ROOT / "docs").rglob("*.md")]
@@ -80,8 +80,7 @@ def test_links_resolve(page: Path) -> None:
 
 def test_reference_describes_the_code(tmp_path: Path) -> None:
     """In a process of its own, without what other tests register."""
-    done = run_process("-m", "docs.site_pages", tmp_path)
-    assert done.returncode == 0, done.stderr
+    completed("-m", "docs.site_pages", tmp_path)
     for page in REFERENCE.glob("*.md"):
         made = (tmp_path / page.name).read_text(encoding="utf-8")
         assert page.read_text(encoding="utf-8") == made, "run `python -m docs.site_pages`"
@@ -111,8 +110,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site, built with warnings as errors."""
     target = tmp_path_factory.mktemp("site")
     arguments = ("-m", "mkdocs", "build", "--strict", "-f", ROOT / "mkdocs.yml", "-d", target)
-    done = run_process(*arguments, environment={"NO_MKDOCS_2_WARNING": "1"})
-    assert done.returncode == 0, done.stderr[-4000:]
+    completed(*arguments, environment={"NO_MKDOCS_2_WARNING": "1"})
     return target
 
 

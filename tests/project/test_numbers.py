@@ -13,7 +13,7 @@ from benchmarks.common.build import RESULTS, merged, read_result, recorded, writ
 from benchmarks.fits import GROUPS, SOURCES, TIMED, Fit
 from mi_refgs.errors import InputError
 from mi_refgs.evaluation.scores import PIXEL_CLASSES
-from tests.helpers import ROOT, refused, run_process
+from tests.helpers import ROOT, completed, refused
 
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in pages.PAGES}
 FIT_FIELDS = [field.name for field in fields(Fit)]
@@ -103,13 +103,13 @@ def test_data_files_have_the_planned_fits(group: str) -> None:
 def test_small_run_continues(tmp_path: Path) -> None:
     """A fit; a second call repeats neither a finished part nor a finished fit."""
     command = ("-m", "benchmarks.all", "--small", "-o", tmp_path, "--only", "images")
-    first = run_process(*command)
-    assert first.returncode == 0, first.stderr[-3000:]
+    completed(*command)
     found = pages.filled("<!-- images.table --><!-- / -->", tmp_path)
     assert "`mirror_ring`: gold ring" in found and " dB |" in found
-    assert run_process(*command, "--list").stdout.splitlines()[0].endswith("done")
+    assert completed(*command, "--list").splitlines()[0].endswith("done")
     (tmp_path / "images.json").unlink()
     [path] = (tmp_path / "work").glob("*/*/row.json")
     before = path.stat().st_mtime_ns
-    assert run_process(*command).returncode == 0 and (tmp_path / "images.json").is_file()
+    completed(*command)
+    assert (tmp_path / "images.json").is_file()
     assert path.stat().st_mtime_ns == before

@@ -18,7 +18,7 @@ import pytest
 import mi_refgs
 from mi_refgs.cli.doctor import EXTRAS
 from mi_refgs.io.files import resource_dir
-from tests.helpers import ROOT, imported_packages, refused, run_process
+from tests.helpers import ROOT, completed, imported_packages, refused
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 LEFT_OUT = {".git", ".venv", "runs", "data", "site", "build", "dist"}
@@ -36,8 +36,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ignore=lambda folder, names: made(folder, names) | (LEFT_OUT if Path(folder) == ROOT else set()),
     )
     target = tmp_path_factory.mktemp("dist")
-    done = run_process("-m", "build", "--no-isolation", "-o", target, ".", folder=source, package=source)
-    assert done.returncode == 0, done.stdout + done.stderr
+    completed("-m", "build", "--no-isolation", "-o", target, ".", folder=source, package=source)
     return target
 
 
@@ -48,8 +47,7 @@ def environment(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, symlinks=True)
     options = ["--no-index", "--no-deps", "--disable-pip-version-check", "-qq"]
-    done = run_process("-m", "pip", "--python", folder, "install", *options, package, package=folder)
-    assert done.returncode == 0, done.stdout + done.stderr
+    completed("-m", "pip", "--python", folder, "install", *options, package, package=folder)
     [site] = folder.glob("lib/python*/site-packages")
     (site / "others.pth").write_text(f"{sysconfig.get_path('purelib')}\n{sysconfig.get_path('platlib')}")
     return folder
@@ -59,9 +57,7 @@ def run_in(environment: Path, *command: str) -> str:
     """Standard output of a command of an environment, started away from the checkout."""
     program, *arguments = command
     options: dict[str, Any] = {"folder": environment, "environment": {"PYTHONPATH": None}}
-    done = run_process(*arguments, program=environment / "bin" / program, **options)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return completed(*arguments, program=environment / "bin" / program, **options)
 
 
 def test_installed_package_works(environment: Path) -> None:
