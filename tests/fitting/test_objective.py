@@ -13,14 +13,13 @@ from mi_refgs.errors import InputError
 from mi_refgs.fitting import losses
 from mi_refgs.fitting.objective import LossInputs, objective
 from mi_refgs.fitting.targets import Target
-from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.kernels.device import upload
 from mi_refgs.methods.method import LossWeight
 from mi_refgs.reference import losses as reference
 from mi_refgs.render.depth_normals import normals_from_depth
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.shade.light.envmap import EnvironmentLight
-from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, planes, shown, view_of
+from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, picture, planes, shown, view_of
 
 
 def made(linear: bool, radiance: np.ndarray, alpha: np.ndarray) -> tuple[Dataset, Target]:
@@ -36,41 +35,33 @@ def frame_of(radiance: np.ndarray, alpha: np.ndarray) -> Frame:
     return Frame(opacity, upload(flat), normal, colour, object_alpha=opacity)
 
 
-Picture = tuple[np.ndarray, np.ndarray]
-
-
-@pytest.fixture
-def picture(rng: np.random.Generator) -> Picture:
-    """Premultiplied radiance below 1, and alpha with empty and full pixels."""
-    alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
-    return linear_from_srgb(rng.uniform(0.05, 0.9, (HEIGHT, WIDTH, 3))) * alpha[..., None], alpha
-
-
 @pytest.mark.parametrize("linear", [False, True])
-def test_perfect_image_costs_nothing(linear: bool, picture: Picture) -> None:
+def test_perfect_image_costs_nothing(linear: bool, rng: np.random.Generator) -> None:
     """8-bit images are composited as displayed, linear ones before they are encoded; either once."""
-    data, target = made(linear, *picture)
+    radiance, alpha = picture(rng)
+    data, target = made(linear, radiance, alpha)
     weights = {"l1": LossWeight(0.8), "ssim": LossWeight(0.2), "alpha": LossWeight(0.3)}
-    loss, error = objective(LossInputs.of(frame_of(*picture), target, data), weights, 1)
+    loss, error = objective(LossInputs.of(frame_of(radiance, alpha), target, data), weights, 1)
     assert abs(float(loss[0])) < 1e-5 and float(error[0]) < 1e-10
 
 
-def test_losses_are_weighed_as_method_says(picture: Picture, rng: np.random.Generator) -> None:
-    data, target = made(True, *picture)
+def test_losses_are_weighed_as_method_says(rng: np.random.Generator) -> None:
+    true = picture(rng)
+    data, target = made(True, *true)
     radiance, alpha = rng.uniform(0, 0.5, (HEIGHT, WIDTH, 3)), rng.uniform(0, 1, (HEIGHT, WIDTH))
     weights = {"l1": LossWeight(0.7), "ssim": LossWeight(0.3), "alpha": LossWeight(0.4)}
     loss, error = objective(LossInputs.of(frame_of(radiance, alpha), target, data), weights, 1)
-    pair = (radiance, alpha), picture
+    pair = (radiance, alpha), true
     shown, goal = (reference.srgb(x + (1 - a[..., None]) * BACKGROUND) for x, a in pair)
     expected = 0.7 * reference.l1(shown, goal) + 0.3 * (1 - reference.ssim(shown, goal))
-    expected += 0.4 * reference.l1(alpha, picture[1])
+    expected += 0.4 * reference.l1(alpha, true[1])
     assert float(loss[0]) == pytest.approx(expected, abs=2e-5)
     np.testing.assert_allclose(error.numpy(), np.mean((shown - goal) ** 2, axis=-1).ravel(), atol=1e-6)
 
 
-def test_priors_are_weighed_as_method_says(picture: Picture, rng: np.random.Generator) -> None:
-    data, target = made(True, *picture)
-    radiance, alpha = picture
+def test_priors_are_weighed_as_method_says(rng: np.random.Generator) -> None:
+    radiance, alpha = picture(rng)
+    data, target = made(True, radiance, alpha)
     maps = {name: rng.uniform(0, 1, alpha.shape) for name in ("metallic", "roughness")}
     uploaded = {"albedo": mi.Color3f(0, 0.5, 1)}
     uploaded |= {name: upload(x.astype(np.float32)) for name, x in maps.items()}

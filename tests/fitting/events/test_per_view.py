@@ -34,14 +34,13 @@ from mi_refgs.runs.views import with_poses
 from mi_refgs.shade.shading import Shading
 from mi_refgs.splat import Camera
 from mi_refgs.surfels.table import Surfels
-from tests.fitting.image_checks import BACKGROUND, HEIGHT, WIDTH, gradient, planes, shown, view_of
+from tests.fitting.image_checks import BACKGROUND, HEIGHT, gradient, picture, planes, shown, view_of
 from tests.helpers import refused, unit, with_grad, with_pixels
 from tests.scenes.highlight import ball, require_same_state, run_folder, small_method, step_to
 
 GAINS = np.array([1.4, 0.7, 0.9])
 WEIGHTS = {name: LOSS_WEIGHTS[name] for name in ("l1", "gain")}
 AFTER = 8
-Picture = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture
@@ -52,18 +51,11 @@ def method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Method:
     return replace(small_method(tmp_path), iterations=5 * AFTER, event=events, data=DataOptions())
 
 
-@pytest.fixture
-def picture(rng: np.random.Generator) -> Picture:
-    """Premultiplied radiance, some of it beyond white, and alpha with empty and full pixels."""
-    alpha = np.clip(rng.uniform(-0.5, 1.5, (HEIGHT, WIDTH)), 0, 1)
-    return rng.uniform(0.01, 0.9, (HEIGHT, WIDTH, 3)) * alpha[..., None], alpha
-
-
 @pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("has_alpha", [False, True])
-def test_gain_is_found_beside_clipped_pixels(linear: bool, has_alpha: bool, picture: Picture) -> None:
+def test_gain_is_found_beside_clipped_pixels(linear: bool, has_alpha: bool, rng: np.random.Generator) -> None:
     """An 8-bit image clips what the gain makes brighter than white."""
-    radiance, alpha = picture
+    radiance, alpha = picture(rng)
     if not has_alpha:
         radiance, alpha = radiance / np.maximum(alpha, 1e-9)[..., None], np.ones_like(alpha)
     image = shown(radiance, alpha, linear, GAINS)
@@ -81,9 +73,9 @@ def test_gain_is_found_beside_clipped_pixels(linear: bool, has_alpha: bool, pict
 
 
 @pytest.mark.parametrize("linear", [False, True])
-def test_exposure_and_its_derivative(linear: bool, picture: Picture, rng: np.random.Generator) -> None:
+def test_exposure_and_its_derivative(linear: bool, rng: np.random.Generator) -> None:
     """Value, both modes, against differences of the float64 definition; the prior is part of it."""
-    radiance, alpha = (x.astype(np.float32).astype(np.float64) for x in picture)
+    radiance, alpha = (x.astype(np.float32).astype(np.float64) for x in picture(rng))
     goal = shown(rng.uniform(0.01, 0.5, radiance.shape) * alpha[..., None], alpha, linear)
     view = view_of(goal, alpha, linear)
     data = Dataset(Path("a"), "train", (view,), BACKGROUND, linear, None)
@@ -115,9 +107,9 @@ def test_exposure_and_its_derivative(linear: bool, picture: Picture, rng: np.ran
     assert float(dr.grad(moved)[0]) == pytest.approx(expected @ [0.5, -1.0, 2.0], rel=2e-4)
 
 
-def test_gain_of_open_scene_counts_what_lies_behind(picture: Picture) -> None:
+def test_gain_of_open_scene_counts_what_lies_behind(rng: np.random.Generator) -> None:
     """Images without alpha show object, surroundings and background at one exposure."""
-    radiance, alpha = picture
+    radiance, alpha = picture(rng)
     behind = np.array([0.3, 0.2, 0.4])
     seen = radiance + (1 - alpha[..., None]) * behind
     view = view_of(np.vectorize(reference.srgb)(np.minimum(seen * GAINS, 1)), None, False)
@@ -230,22 +222,19 @@ def test_derivative_of_corrected_camera(method: Method, rng: np.random.Generator
     rows, points = 0.05 * rng.normal(size=(6, 6)), mi.Point3f(rng.normal(size=(3, 20)).astype(np.float32))
     weight = mi.Vector3f(rng.normal(size=(3, 20)).astype(np.float32))
 
-    def total(table: np.ndarray, grad: bool = False) -> tuple[float, np.ndarray]:
-        leaf = upload_tensor(table.astype(np.float32))
-        if grad:
-            dr.enable_grad(leaf)
-        eye = per_view.corrected(trainer.setup, {POSE: leaf}, index, trainer.data.views[index].camera())
-        found = dr.sum(dr.dot(weight, eye.to_camera(points)))
-        if grad:
-            dr.backward(found)
-        return float(found[0]), dr.grad(leaf).numpy()
+    def total(table: Any) -> Any:
+        eye = per_view.corrected(trainer.setup, {POSE: table}, index, trainer.data.views[index].camera())
+        return dr.sum(dr.dot(weight, eye.to_camera(points)))
 
-    _, gradient = total(rows, grad=True)
+    leaf = with_grad(upload_tensor(rows))
+    dr.backward(total(leaf))
+    gradient = dr.grad(leaf).numpy()
     assert np.flatnonzero(gradient.any(axis=1)).tolist() == [index]
     expected = np.zeros(6)
     for i in range(6):
-        sides = [total(opposed(trainer, rows, index, i, sign * step))[0] for sign in (1, -1)]
-        expected[i] = (sides[0] - sides[1]) / (2 * step)
+        sides = [opposed(trainer, rows, index, i, sign * step) for sign in (1, -1)]
+        above, below = (float(total(upload_tensor(side))[0]) for side in sides)
+        expected[i] = (above - below) / (2 * step)
     np.testing.assert_allclose(gradient[index], expected, atol=2e-3 * np.abs(expected).max())
 
 
