@@ -8,7 +8,6 @@ import mitsuba as mi
 import psutil
 import pytest
 
-from mi_refgs.cli import main
 from mi_refgs.errors import InputError
 from mi_refgs.io.files import resource_dir
 from mi_refgs.kernels import memory
@@ -31,13 +30,7 @@ BOUNDED = {
 
 @pytest.mark.parametrize("name", BOUNDED)
 def test_a_command_without_memory_is_refused_in_one_sentence(
-    name: str,
-    data: Path,
-    finished: Path,
-    method: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    name: str, data: Path, finished: Path, method: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "available", lambda: 0.0)
     monkeypatch.setattr(memory, "resident", lambda: 1e3)
@@ -45,10 +38,7 @@ def test_a_command_without_memory_is_refused_in_one_sentence(
     arguments = train_command(data, tmp_path / "run", method) if name == "train" else BOUNDED[name]
     for word, place in places.items():
         arguments = [text.replace(word, str(place)) for text in arguments]
-    capsys.readouterr()
-    assert main(arguments) == 2
-    message = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "GB of memory" in message and "1e-06 GB are available; " in message
+    refused(arguments, "GB of memory", "1e-06 GB are available; ")
 
 
 def test_images_are_refused_and_rendered_again_where_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
