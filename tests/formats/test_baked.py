@@ -60,7 +60,6 @@ def trained_scene() -> TrainedScene:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """The balls in both formats."""
-    mi.set_variant("llvm_ad_rgb")  # before that of the tests
     trained = trained_scene()
     around = shots_around(trained.surfels)
     chosen = around[1], around[3], *around[4::4]
