@@ -31,38 +31,28 @@ from tests.scenes.known import CENTRES, RADII, known_mesh, known_surfels, with_b
 SIZE = 48
 METAL_BALL = "x < 0"
 HALF = 3000  # surfels of each ball
-TRACED_LIGHT: dict[str, Any] = {"diffuse": "irradiance", "ambient_rays": 32, "visibility_rays": 4}
-TRACED_LIGHT["traced_bounces"] = 1
-
-
 FRONT = look_at(np.array([0.3, -3.2, 0.7]), np.zeros(3))
-
-
-def random_sh(count: int, degree: int, seed: int, size: float = 0.1) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return rng.normal(scale=size, size=(count, 3 * (degree + 1) ** 2)).astype(np.float32)
 
 
 def balls(light: Any = None, **shading: Any) -> TrainedScene:
     """A metal ball at x < 0 and one of clay, as surfels with their mesh and SH of a few degrees."""
     raw = known_surfels().to_numpy()
-    raw["radiance_sh"] = random_sh(len(raw["position"]), 2, 1)
-    raw["indirect_sh"] = random_sh(len(raw["position"]), 1, 2)
+    for seed, (name, columns) in enumerate({"radiance_sh": 27, "indirect_sh": 12}.items(), 1):
+        raw[name] = np.random.default_rng(seed).normal(0, 0.1, (2 * HALF, columns)).astype(np.float32)
     light = EnvironmentLight.constant(0.8, 16) if light is None else light
     options: dict[str, Any] = {"diffuse": "sh", "occlusion": True} | shading
     return TrainedScene(Surfels.from_numpy(raw), light, known_mesh(), Shading(**options), 7, 1.5)
 
 
-def image(scene: TrainedScene, pose: np.ndarray = FRONT) -> np.ndarray:
+def image(scene: TrainedScene) -> np.ndarray:
     """Premultiplied linear RGBA (H·W, 4)."""
-    camera = Camera.from_pose(SIZE, SIZE, -1.6 * SIZE, -1.6 * SIZE, SIZE / 2, SIZE / 2, pose, 0.01)
+    camera = Camera.from_pose(SIZE, SIZE, -1.6 * SIZE, -1.6 * SIZE, SIZE / 2, SIZE / 2, FRONT, 0.01)
     frame = scene.renderer(aovs=False)(camera)
     return np.stack([np.array(x, np.float64) for x in (*frame.radiance, frame.alpha)], axis=1)
 
 
 @pytest.fixture(scope="module")
 def scene() -> TrainedScene:
-    mi.set_variant("llvm_ad_rgb")
     return balls()
 
 
@@ -190,7 +180,8 @@ def test_bad_options_are_refused(scene: TrainedScene, given: dict[str, Any], mes
 
 def test_cut_removes_a_ball_its_shadow_and_its_reflection() -> None:
     """The rest renders like the other ball without any of the first, mesh included."""
-    whole = balls(EnvironmentLight.from_radiance(sky(16)), **TRACED_LIGHT)
+    options: dict[str, Any] = {"ambient_rays": 32, "visibility_rays": 4, "traced_bounces": 1}
+    whole = balls(EnvironmentLight.from_radiance(sky(16)), diffuse="irradiance", **options)
     left = edit(whole, where=METAL_BALL, cut=True, invert=True)[0]
     assert left.surfels.count == HALF and left.mesh is not None
     mesh = known_mesh()
