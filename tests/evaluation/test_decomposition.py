@@ -25,12 +25,6 @@ from tests.scenes.known import SIZE, write_known_run
 H = W = 8
 
 
-@pytest.fixture
-def data(known: Path) -> Path:
-    """The data set of the two known balls."""
-    return known / "data"
-
-
 def random_view(seed: int) -> tuple[RenderedView, View, np.ndarray]:
     """A view of noise: its render, its ground truth with partly known materials, and concave pixels."""
     rng = np.random.default_rng(seed)
@@ -97,8 +91,8 @@ def test_errors_equal_plain_formulas() -> None:
     np.testing.assert_allclose(found["albedo_scale"], scale, rtol=1e-6)
 
 
-def test_evaluate_scores_a_perfect_run(data: Path, tmp_path: Path) -> None:
-    run = write_known_run(data, tmp_path / "run")
+def test_evaluate_scores_a_perfect_run(known: Path, tmp_path: Path) -> None:
+    run = write_known_run(known / "data", tmp_path / "run")
     result = evaluate(run)
     assert result["albedo_psnr"] > 28 and result["roughness_mae"] < 0.005 and result["metallic_mae"] < 0.02
     np.testing.assert_allclose(result["albedo_scale"], 1, atol=0.02)
@@ -120,26 +114,26 @@ def test_evaluate_scores_a_perfect_run(data: Path, tmp_path: Path) -> None:
     assert sheet.shape[1] > 10 * SIZE and sheet.std() > 0.1
 
 
-def test_evaluate_scores_a_wrong_run(data: Path, tmp_path: Path) -> None:
+def test_evaluate_scores_a_wrong_run(known: Path, tmp_path: Path) -> None:
     """Materials of the other ball, and a surface that is 2 % too small."""
-    run = write_known_run(data, tmp_path / "run")
+    run = write_known_run(known / "data", tmp_path / "run")
     fitted = TrainedScene.read(run.path)
     raw = fitted.surfels.to_numpy()
     raw["metallic"], raw["roughness"] = -raw["metallic"], raw["roughness"] + 1
     assert fitted.mesh is not None
     mesh = replace(fitted.mesh, vertices=fitted.mesh.vertices * np.float32(0.98))
     wrong = replace(fitted, surfels=Surfels.from_numpy(raw), mesh=mesh)
-    export(wrong, run.path, read_dataset(data, "test").views[0].camera())
+    export(wrong, run.path, read_dataset(known / "data", "test").views[0].camera())
     result = evaluate(run)
     assert result["metallic_mae"] > 0.95 and result["roughness_mae"] > 0.15
     assert 0.3 < result["surface_distance"] < 2
 
 
-def test_evaluate_without_ground_truth_gives_reasons(data: Path, tmp_path: Path) -> None:
+def test_evaluate_without_ground_truth_gives_reasons(known: Path, tmp_path: Path) -> None:
     """Every key stays; the maps and the surface of the data set are gone here."""
+    data, bare = known / "data", tmp_path / "bare"
     run = write_known_run(data, tmp_path / "run", occlusion=False)
     (run.path / "mesh.ply").unlink()
-    bare = tmp_path / "bare"
     (bare / "test").mkdir(parents=True)
     content = json.loads((data / "transforms_test.json").read_text())
     frames = []
