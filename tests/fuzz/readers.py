@@ -29,12 +29,12 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.runs.views import views_of_run
 from mi_refgs.shade.light.envmap import EnvironmentLight
 from mi_refgs.shade.light.light_file import read_radiance
-from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import read_loaded
 from tests.scenes import layouts
 from tests.scenes.splat_file import ball_columns
+from tests.scenes.splats import random_raw
 from tests.scenes.tiny import write_data
 
 RGBA = np.random.default_rng(0).random((9, 11, 4))
@@ -66,8 +66,7 @@ def _nerfstudio(folder: Path) -> None:
 
 def _surfels(folder: Path) -> None:
     rng = np.random.default_rng(0)
-    table = {name: rng.normal(size=(7, channel.width(1))) for name, channel in ATTRIBUTES.items()}
-    write_ply(folder / "a.ply", Surfels.from_numpy(table))
+    write_ply(folder / "a.ply", Surfels.from_numpy(random_raw(7, rng, 1)))
     columns = "x y z opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3 metallic".split()
     for kind in ("ascii", "binary_big_endian"):
         content = layouts.ply_bytes({name: rng.normal(size=3) for name in columns}, kind)

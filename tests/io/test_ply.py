@@ -7,19 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.ply import read_ply, write_ply
 from mi_refgs.surfels.table import Surfels
 from tests.helpers import refused
 from tests.scenes.layouts import ply_bytes
+from tests.scenes.splats import random_raw
 
 GEOMETRY = ["x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
 COLOURS = ["nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45))]
-
-
-def table(count: int, rng: np.random.Generator, degree: int = 3) -> Surfels:
-    shape = {name: (count, channel.width(degree)) for name, channel in ATTRIBUTES.items()}
-    return Surfels.from_numpy({name: rng.normal(size=size) for name, size in shape.items()})
 
 
 def write_file(
@@ -36,7 +31,7 @@ def geometry(rng: np.random.Generator, count: int = 4) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("count", [0, 1, 100])
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_round_trip_is_bit_exact(count: int, degree: int, tmp_path: Path, rng: np.random.Generator) -> None:
-    surfels = table(count, rng, degree)
+    surfels = Surfels.from_numpy(random_raw(count, rng, degree))
     write_ply(tmp_path / "a.ply", surfels)
     again = read_ply(tmp_path / "a.ply")
     assert list(again.raw) == list(surfels.raw)
@@ -49,7 +44,7 @@ def test_round_trip_is_bit_exact(count: int, degree: int, tmp_path: Path, rng: n
 
 def test_layout_is_that_of_2dgs(tmp_path: Path, rng: np.random.Generator) -> None:
     """Names, order, w-first quaternion and channel-major spherical harmonics, read by another library."""
-    surfels = table(3, rng)
+    surfels = Surfels.from_numpy(random_raw(3, rng, 3))
     write_ply(tmp_path / "a.ply", surfels)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     names = [line.split()[2] for line in header if line.startswith("property")]
@@ -146,10 +141,9 @@ def test_broken_files_are_refused(tmp_path: Path, rng: np.random.Generator) -> N
 
 
 def test_bad_values_are_not_written(tmp_path: Path, rng: np.random.Generator) -> None:
-    surfels = table(3, rng)
+    surfels = Surfels.from_numpy(random_raw(3, rng, 3))
     write_ply(tmp_path / "a.ply", surfels)
     before = (tmp_path / "a.ply").read_bytes()
-    raw = surfels.to_numpy()
-    raw["albedo"] = np.full((3, 3), np.nan)
+    raw = surfels.to_numpy() | {"albedo": np.full((3, 3), np.nan)}
     refused(lambda: write_ply(tmp_path / "a.ply", Surfels.from_numpy(raw)), "albedo: 9 values are NaN")
     assert (tmp_path / "a.ply").read_bytes() == before

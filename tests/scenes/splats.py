@@ -11,6 +11,7 @@ from mi_refgs.kernels.device import upload
 from mi_refgs.reference import splat as reference
 from mi_refgs.reference.camera import look_at
 from mi_refgs.splat import Camera, Composited, splat
+from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.init import from_points
 from mi_refgs.surfels.table import Surfels
 
@@ -111,6 +112,12 @@ def discs(**channels: Any) -> dict[str, Any]:
         "radiance_sh": np.zeros((count, 3)),
     }
     return raw | channels
+
+
+def random_raw(count: int, rng: np.random.Generator, degree: int) -> dict[str, np.ndarray]:
+    """Random raw values of every attribute, with harmonics of a degree."""
+    widths = {name: attribute.width(degree) for name, attribute in ATTRIBUTES.items()}
+    return {name: rng.normal(size=(count, width)).astype(np.float32) for name, width in widths.items()}
 
 
 def opaque(

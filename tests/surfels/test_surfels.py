@@ -10,16 +10,12 @@ from mi_refgs.constants import MAX_TURN
 from mi_refgs.errors import InputError
 from mi_refgs.surfels.attributes import ATTRIBUTES
 from mi_refgs.surfels.table import Surfels
-
-
-def raw_table(count: int, rng: np.random.Generator, degree: int = 2) -> dict[str, np.ndarray]:
-    widths = {name: channel.width(degree) for name, channel in ATTRIBUTES.items()}
-    return {name: rng.normal(size=(count, width)).astype(np.float32) for name, width in widths.items()}
+from tests.scenes.splats import random_raw
 
 
 @pytest.mark.parametrize("count", [1, 2, 37])
 def test_activations(count: int, rng: np.random.Generator) -> None:
-    raw = raw_table(count, rng)
+    raw = random_raw(count, rng, 2)
     surfels = Surfels.from_numpy(raw)
     surfels.validate()
 
@@ -41,7 +37,7 @@ def test_activations(count: int, rng: np.random.Generator) -> None:
 
 
 def test_quaternion_sign_and_length_do_not_matter(rng: np.random.Generator) -> None:
-    raw = raw_table(5, rng)
+    raw = random_raw(5, rng, 2)
     frames = []
     for factor in (1, -1, 1e-10, 1e30):
         raw["rotation"] = (raw["rotation"] / np.abs(raw["rotation"]).max() * factor).astype(np.float32)
@@ -70,7 +66,7 @@ def test_degenerate_rows_stay_finite() -> None:
 
 def test_turns_are_bounded_however_curved_or_large_a_surfel_is() -> None:
     rng, count = np.random.default_rng(0), 60
-    raw = raw_table(count, rng)
+    raw = random_raw(count, rng, 2)
     raw["curvature"] = np.outer(10.0 ** rng.uniform(-30, 17, count), [1, -1, 1]).astype(np.float32)
     raw["scale"] = rng.uniform(-60, 60, (count, 2)).astype(np.float32)
     surfels = Surfels.from_numpy(raw)
@@ -102,7 +98,7 @@ def everything(surfels: Surfels) -> object:
 
 def test_gradients_of_every_channel(rng: np.random.Generator) -> None:
     """Reverse mode against central differences (step 1e-2, truncation 1e-4), forward mode against reverse."""
-    raw = raw_table(6, rng, degree=1)
+    raw = random_raw(6, rng, 1)
     surfels = Surfels.from_numpy(raw)
     surfels.enable_grad()
     dr.backward(dr.sum(everything(surfels)))
@@ -130,7 +126,7 @@ def test_gradients_of_every_channel(rng: np.random.Generator) -> None:
 
 
 def test_gather_copies_rows_and_detaches(rng: np.random.Generator) -> None:
-    raw = raw_table(5, rng)
+    raw = random_raw(5, rng, 2)
     surfels = Surfels.from_numpy(raw)
     surfels.enable_grad()
     children = surfels.gather(mi.UInt32(4, 0, 0, 2))
@@ -140,8 +136,8 @@ def test_gather_copies_rows_and_detaches(rng: np.random.Generator) -> None:
 
 
 def test_empty_table(rng: np.random.Generator) -> None:
-    gathered = Surfels.from_numpy(raw_table(3, rng)).gather(mi.UInt32())
-    for surfels in (Surfels.from_numpy(raw_table(0, rng)), gathered):
+    gathered = Surfels.from_numpy(random_raw(3, rng, 2)).gather(mi.UInt32())
+    for surfels in (Surfels.from_numpy(random_raw(0, rng, 2)), gathered):
         surfels.validate()
         assert surfels.count == 0
         values = [surfels.position(), surfels.opacity(), surfels.scale()]
@@ -164,6 +160,6 @@ def test_empty_table(rng: np.random.Generator) -> None:
 def test_bad_surfel_models_are_refused(
     change: dict[str, np.ndarray | None], message: str, rng: np.random.Generator
 ) -> None:
-    raw = {name: values for name, values in (raw_table(3, rng) | change).items() if values is not None}
+    raw = {name: values for name, values in (random_raw(3, rng, 2) | change).items() if values is not None}
     with pytest.raises(InputError, match=message):
         Surfels.from_numpy(raw).validate()
