@@ -1,6 +1,5 @@
 """Densification, pruning and propagation: parents of the rows, what changes, and what must not."""
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -30,23 +29,17 @@ def table(count: int = 6, scale: float = 0.005, opacity: float = 0.8) -> Surfels
     return Surfels.from_numpy(raw | {"scale": np.full((count, 2), np.log(scale))})
 
 
-def densify(
-    surfels: Surfels,
-    error: np.ndarray,
-    most: int = 100,
-    largest: float = 0.1,
-    options: Densify = OPTIONS,
-    **rows: np.ndarray,
-) -> TableEdit:
-    given: dict[str, Any] = {"grow": options.grow, "prune_opacity": options.prune_opacity, **rows}
-    return event.densify_and_prune(surfels, error, most, largest=largest, **given)
+def densify(surfels: Surfels, error: np.ndarray, most: int = 100, **given: Any) -> TableEdit:
+    """With the options of the event, unless others are given."""
+    options: dict[str, Any] = {"grow": OPTIONS.grow, "prune_opacity": OPTIONS.prune_opacity, "largest": 0.1}
+    return event.densify_and_prune(surfels, error, most, **options | given)
 
 
 def test_children_of_curved_surfels_turn_as_their_parents_do_there() -> None:
     rng, flat = np.random.default_rng(1), table(200, 0.05)
     raw = flat.to_numpy() | {"curvature": rng.normal(0, 5, (200, 3)).astype(np.float32)}
     raw["scale"] = np.log(rng.uniform(0.01, 0.05, (200, 2))).astype(np.float32)
-    edit = densify(Surfels.from_numpy(raw), np.ones(200), 400, options=replace(OPTIONS, grow=1.0))
+    edit = densify(Surfels.from_numpy(raw), np.ones(200), 400, grow=1.0)
     parents, children = Surfels.from_numpy(raw).gather(mi.UInt32(edit.parent)), edit.surfels
     normal, now, longest = (
         np.array(x) for x in (parents.frame()[2], children.frame()[2], dr.detach(parents.scale()))
@@ -64,7 +57,7 @@ def test_surfels_with_the_largest_error_are_split() -> None:
     assert densify(surfels, error).parent.tolist() == [0, 1, 2, 3, 4, 5, *(6, 7), *(6, 7)]
     assert densify(surfels, error, most=9).parent.tolist() == [0, 1, 2, 3, 4, 5, 7, 6, 6]
     assert densify(surfels, error, most=8).parent.tolist() == [*range(8)]
-    every = densify(surfels, error, options=replace(OPTIONS, grow=1.0))
+    every = densify(surfels, error, grow=1.0)
     assert every.parent.tolist() == [0, 3, 5, *(1, 2, 4, 6, 7), *(1, 2, 4, 6, 7)]
     assert every.fresh.tolist() == [False] * 3 + [True] * 10
     for name in ("metallic", "roughness", "albedo", "rotation"):
@@ -75,7 +68,7 @@ def test_children_lie_on_the_longest_axis_of_their_parent() -> None:
     surfels = table(2).to_numpy()
     surfels["scale"] = np.log([[0.02, 0.01], [0.01, 0.02]])
     whole = Surfels.from_numpy(surfels)
-    children = densify(whole, np.ones(2), options=replace(OPTIONS, grow=1.0)).surfels.to_numpy()
+    children = densify(whole, np.ones(2), grow=1.0).surfels.to_numpy()
     axes = np.array(whole.frame()).transpose(2, 0, 1)
     along = 0.02 * event.SPLIT_OFFSET * np.stack([axes[0, 0], axes[1, 1]])
     moved = children["position"] - surfels["position"][[0, 1, 0, 1]]
@@ -103,16 +96,15 @@ def test_no_child_is_too_transparent_to_stay() -> None:
     """It would be removed at the next event; while removal waits for a reset, it is split."""
     surfels, error = table(opacity=0.06), np.ones(6)
     assert densify(surfels, error).parent.tolist() == [*range(6)]
-    assert len(densify(surfels, error, options=replace(OPTIONS, prune_opacity=0.0)).parent) == 8
+    assert len(densify(surfels, error, prune_opacity=0.0).parent) == 8
     with pytest.raises(InputError, match="prune_opacity"):
         densify(table(opacity=0.02), np.zeros(6))
 
 
 def test_faint_surfels_make_room_for_splits() -> None:
     """As many as splits need, the first ones first."""
-    options = replace(OPTIONS, grow=0.5)  # three of six
     for most, kept in ((9, [0, 1, 2, 3, 4, 5]), (8, [0, 1, 2, 3, 5]), (7, [0, 2, 3, 5]), (6, [0, 2, 3, 5])):
-        edited = densify(table(), np.zeros(6), most, options=options, faint=np.array([4, 1]))
+        edited = densify(table(), np.zeros(6), most, grow=0.5, faint=np.array([4, 1]))  # three of six
         assert edited.parent.tolist() == kept, most
     assert densify(table(), np.zeros(6), 6).parent.tolist() == [*range(6)]
 
