@@ -1,6 +1,5 @@
 """Depth fusion and extraction against shapes whose distance is known, and the float64 specification."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
@@ -31,8 +30,8 @@ def ring_of_views(count: int) -> list[np.ndarray]:
     return [look_at(4.0 * d, np.zeros(3)) for d in np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)]
 
 
-def camera(pose: np.ndarray) -> Camera:
-    return Camera.from_pose(SIZE, SIZE, -FOCAL, -FOCAL, SIZE / 2, SIZE / 2, pose)
+def camera(pose: np.ndarray, size: int = SIZE) -> Camera:
+    return Camera.from_pose(size, size, -FOCAL, -FOCAL, size / 2, size / 2, pose)
 
 
 def fuse(depths: list[np.ndarray], poses: list[np.ndarray], resolution: int = 48) -> tsdf.TSDF:
@@ -136,15 +135,12 @@ def test_nothing_seen_is_an_empty_mesh() -> None:
 
 def test_all_views_share_one_kernel() -> None:
     """Other poses, image sizes, boxes and views compile nothing; generators are read once."""
-    pose = ring_of_views(7)
-
-    def views(size: int, count: int) -> Iterator[Camera]:
-        for p in pose[:count]:
-            yield Camera.from_pose(size, size, -FOCAL, -FOCAL, size / 2, size / 2, p)
+    poses = ring_of_views(7)
 
     def run(size: int, count: int, shift: float) -> None:
         image = dr.full(mi.Float, 4, size * size)
-        tsdf.fuse(((image, image, c) for c in views(size, count)), (BOX[0] + shift, BOX[1] + shift), 24)
+        views = ((image, image, camera(pose, size)) for pose in poses[:count])
+        tsdf.fuse(views, (BOX[0] + shift, BOX[1] + shift), 24)
 
     run(32, 2, 0.0)
     before = dr.detail.launch_stats()

@@ -26,16 +26,10 @@ def sun_and_gradient(h: int, radiance: float = 500.0) -> np.ndarray:
     return sky
 
 
-def random_map(rng: np.random.Generator, h: int) -> np.ndarray:
-    """Noise with one colour at each pole: there Mitsuba's azimuth is atan2(±0, ±0)."""
-    radiance = rng.uniform(0.1, 2, (h, 2 * h, 3)).astype(np.float32)
-    radiance[0], radiance[-1] = radiance[0, 0], radiance[-1, 0]
-    return radiance
-
-
 def test_mirror_is_mitsubas_envmap(rng: np.random.Generator, tmp_path: Path) -> None:
     """Of the same image, and of the file that we write: from the six axes, and from everywhere else."""
-    radiance, path = random_map(rng, 16), tmp_path / "new" / "light.exr"
+    radiance, path = rng.uniform(0.1, 2, (16, 32, 3)).astype(np.float32), tmp_path / "new" / "light.exr"
+    radiance[0], radiance[-1] = radiance[0, 0], radiance[-1, 0]  # there Mitsuba's azimuth is atan2(±0, ±0)
     light = EnvironmentLight.from_radiance(radiance)
     light.write(path)
     assert [p.name for p in path.parent.iterdir()] == ["light.exr"]
