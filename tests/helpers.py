@@ -27,20 +27,18 @@ from mi_refgs.errors import InputError
 ROOT = Path(__file__).parents[1]
 
 
-def refused(
-    action: Sequence[object] | Callable[[], object], *words: object, error: type[Exception] = InputError
-) -> str:
+def refused(action: Sequence[object] | Callable[[], object], *words: object) -> str:
     """Require that a command (its arguments) or a call refuses its input; the message contains all `words`.
 
     A command exits with code 2, prints nothing on stdout, and names the remedy in one sentence. A call raises
-    `error`, or an error of Mitsuba that it caused."""
+    an InputError, or an error of Mitsuba that it caused."""
     if callable(action):
         with pytest.raises(Exception) as info:
             action()
         causes: list[BaseException] = [info.value]
         while causes[-1].__cause__ is not None:
             causes.append(causes[-1].__cause__)
-        assert any(isinstance(cause, error) or error.__name__ in str(cause) for cause in causes), causes
+        assert any(isinstance(cause, InputError) or "InputError" in str(cause) for cause in causes), causes
         assert not any(isinstance(cause, MemoryError) for cause in causes), causes
         message = " ← ".join(map(str, causes))
     else:

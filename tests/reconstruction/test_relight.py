@@ -31,10 +31,9 @@ from tests.scenes.known import SIZE, write_known_run
 SAMPLES = 4
 
 
-def result_of(known: Path, out: str, light: str = "dusk", run: str = "run", **options: Any) -> dict[str, Any]:
-    """The result of relighting a run of `known` into its folder `out`."""
-    new_light = NewLight(known / f"{light}.exr", **options)
-    return relight(Run(known / run), new_light, known / out, samples=SAMPLES)
+def result_of(known: Path, out: str, **options: Any) -> dict[str, Any]:
+    """The result of relighting the known run by the second light, into the folder `out`."""
+    return relight(Run(known / "run"), NewLight(known / "dusk.exr", **options), known / out, samples=SAMPLES)
 
 
 @pytest.fixture(scope="module")

@@ -71,19 +71,17 @@ def channel_surfels(albedo: np.ndarray | None = None) -> Surfels:
 
 
 def floor_points(
-    roughness: float, count: int = 40, copies: int = 1, eye: np.ndarray = EYE
+    roughness: float, count: int = 40, eye: np.ndarray = EYE
 ) -> tuple[np.ndarray, ShadingPoints]:
-    """Points of a metal floor near the wall, seen from `eye`, each `copies` times."""
+    """Points of a metal floor near the wall, seen from `eye`."""
     rng = np.random.default_rng(7)
     place = np.stack([rng.uniform(0.1, 0.9, count), np.zeros(count), rng.uniform(-0.3, 0.6, count)], 1)
-    place = np.repeat(place, copies, 0)
-    n = len(place)
     points = ShadingPoints(
-        normal=vector(np.tile([0, 1.0, 0], (n, 1))),
+        normal=vector(np.tile([0, 1.0, 0], (count, 1))),
         view=vector(unit(eye - place)),
-        albedo=mi.Color3f(0.8, 0.7, 0.6) + dr.zeros(mi.Color3f, n),
-        metallic=dr.full(mi.Float, 1, n),
-        roughness=dr.opaque(mi.Float, roughness, n),
+        albedo=mi.Color3f(0.8, 0.7, 0.6) + dr.zeros(mi.Color3f, count),
+        metallic=dr.full(mi.Float, 1, count),
+        roughness=dr.opaque(mi.Float, roughness, count),
     )
     return place, points
 

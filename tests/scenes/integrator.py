@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -183,10 +182,10 @@ def open_scene(camera: dict | None = None, **changes: Any) -> mi.Scene:
     return scene(camera, **{**around, "background": background_light().raw, **changes})
 
 
-def camera_at(focal: float, offset: tuple[int, int] = (0, 0)) -> Camera:
+def camera_at(focal: float) -> Camera:
     """A view with the tiles of its focal length, from as much farther away."""
     pose = look_at(np.array([1.0, 1.5, 3.0]) * focal / 30, np.zeros(3), up=(0, 1, 0))
-    return replace(Camera.from_pose(45, 38, -focal, -focal, 20.0, 22.0, pose), offset=offset)
+    return Camera.from_pose(45, 38, -focal, -focal, 20.0, 22.0, pose)
 
 
 def two_balls() -> Mesh:
