@@ -24,6 +24,7 @@ from tests.helpers import contents, refused
 from tests.scenes import splat_file
 from tests.scenes.layouts import ply_bytes
 from tests.scenes.splat_file import PRESET, RADIUS, SIZE, VIEWS, ball_columns, write_ball
+from tests.scenes.tiny import METHOD, write_method
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +39,10 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def method(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return splat_file.write_long_method(tmp_path_factory.mktemp("method"))
+    """The tiny method for PRESET, which scales its stages to 6 iterations."""
+    text = METHOD.replace("until = 3\n", "until = 1_000\n")
+    text = text.replace("start = 3, until = 6", "start = 1_000, until = 2_000")
+    return write_method(tmp_path_factory.mktemp("method"), text)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from mi_refgs.methods.read import PRESETS
 from mi_refgs.reconstruction import relightable_import
 from tests.helpers import unit
 from tests.scenes.layouts import ply_bytes
-from tests.scenes.tiny import METHOD, write_method
 
 COUNT, RADIUS = 300, 0.5
 SIZE, VIEWS = 32, {"train": 6, "test": 2}
@@ -33,12 +32,6 @@ def ball_columns(**values: float) -> dict[str, np.ndarray]:
 def write_ball(path: Path, **values: float) -> Path:
     path.write_bytes(ply_bytes(ball_columns(**values)))
     return path
-
-
-def write_long_method(folder: Path) -> Path:
-    """The tiny method for PRESET, which scales its stages to 6 iterations."""
-    text = METHOD.replace("until = 3\n", "until = 1_000\n")
-    return write_method(folder, text.replace("start = 3, until = 6", "start = 1_000, until = 2_000"))
 
 
 def render_few_views(monkeypatch: pytest.MonkeyPatch) -> None:
