@@ -63,19 +63,16 @@ def test_reference_gradients_match_differences() -> None:
     exact = module._gradients(case, scene, oracle.render(scene, weights))
     rng = np.random.default_rng(0)
 
-    def loss(raw: dict[str, np.ndarray], light: np.ndarray) -> float:
-        maps = oracle.render(module.replace(scene, raw=raw, light=module.light_of(light))).maps
+    def loss(values: dict[str, np.ndarray]) -> float:
+        raw, light = {name: values[name] for name in scene.raw}, module.light_of(values["light"])
+        maps = oracle.render(module.replace(scene, raw=raw, light=light)).maps
         return sum(float(np.sum(w * maps[name])) for name, w in weights.items())
 
     for name in GRADIENTS:
         step = 1e-8  # smaller than the way to the next texel of the light, where a slope jumps
         values = {**scene.raw, "light": np.asarray(case.light, np.float64)}
         direction = rng.normal(size=values[name].shape)
-        sides = []
-        for sign in (1, -1):
-            moved = values | {name: values[name] + sign * step * direction}
-            light = moved.pop("light")
-            sides.append(loss(moved, light))
+        sides = [loss(values | {name: values[name] + sign * step * direction}) for sign in (1, -1)]
         expected = (sides[0] - sides[1]) / (2 * step)
         assert np.sum(exact[name] * direction) == pytest.approx(expected, rel=1e-4, abs=1e-6), name
 
