@@ -240,9 +240,8 @@ def test_an_edited_run_is_a_run(finished: Path, tmp_path: Path, capsys: pytest.C
     np.testing.assert_array_equal(raw[1]["roughness"][~chosen], raw[0]["roughness"][~chosen])
     np.testing.assert_array_equal(raw[2]["roughness"], raw[1]["roughness"])
     np.testing.assert_allclose(raw[2]["metallic"], logit(0.25), atol=1e-6)
-    for command in (["eval", str(newer)], ["export", str(newer)]):
-        assert main(command) == 0
-    assert main(["render", str(newer), "-o", str(tmp_path / "out.png")]) == 0
+    for command, *options in (["eval"], ["export"], ["render", "-o", str(tmp_path / "out.png")]):
+        assert main([command, str(newer), *options]) == 0
 
 
 def test_a_reconstruction_is_edited_like_a_run(finished: Path, tmp_path: Path) -> None:

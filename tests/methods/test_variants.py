@@ -18,8 +18,7 @@ from tests.scenes.tiny import SETTINGS, write_data
 
 FULL = "ref_gaussian"
 FOLDER = resource_dir("scenes")
-FILES = sorted(path.relative_to(FOLDER) for path in (FOLDER / "paper").rglob("*.toml"))
-NAMES = [str(path.with_suffix("")) for path in FILES]
+NAMES = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in (FOLDER / "paper").rglob("*.toml"))
 SMOOTH = {"ball": 1.0, "helmet": 1.0, "tbell": 1.0, "gardenspheres": 0.45}
 DOWNSCALE = {"gardenspheres": 4, "toycar": 4, "sedan": 8}
 TABLES = json.loads((ROOT / "benchmarks" / "paper_tables.json").read_text())["data_sets"]
