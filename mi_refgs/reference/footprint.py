@@ -22,9 +22,8 @@ from mi_refgs.reference.camera import (
     rotation_axes,
     sigmoid,
 )
-from mi_refgs.reference.light import clip
+from mi_refgs.reference.light import Array, clip
 
-Array = np.ndarray
 Corner = tuple[int, int]
 Raw = dict[str, Array]  # channels by name
 GEOMETRY = ("position", "rotation", "scale", "opacity")
@@ -77,12 +76,10 @@ class Surfel:
             screen = (x - middle[0]) ** 2 + (y - middle[1]) ** 2
             screen = screen * rules.low_pass if rules.low_pass else np.full_like(screen, np.inf)
             low_pass = ~(t.real > 0) | ~(screen.real >= plane.real)
-            opacity = sigmoid(raw["opacity"])
-            unclamped = opacity * np.exp(-0.5 * np.where(low_pass, screen, plane))
+            unclamped = sigmoid(raw["opacity"]) * np.exp(-0.5 * np.where(low_pass, screen, plane))
+            jump = np.abs(screen.real - plane.real) / screen.real
         alpha = np.where(unclamped.real > rules.alpha_max, rules.alpha_max, unclamped)
         z = np.where(low_pass, p[:, 2:], t)
-        with np.errstate(all="ignore"):
-            jump = np.abs(screen.real - plane.real) / screen.real
         u, v = np.where(low_pass | ~np.isfinite(t), 0, [u, v])
         return Sample(alpha, z, unclamped.real, jump, u, v)
 
@@ -133,9 +130,8 @@ class Gaussian:
         p, axes = camera_frame(raw, camera)
         σ, z = np.exp(raw["scale"]), p[:, 2]
         along = []  # pixels on the screen of one standard deviation along each axis, (N, 3) in x and in y
-        for i, ((focal, middle), (first, last)) in enumerate(
-            zip(intrinsics(camera), camera.borders, strict=True)
-        ):
+        film = zip(intrinsics(camera), camera.borders, strict=True)
+        for i, ((focal, middle), (first, last)) in enumerate(film):
             margin = c.GAUSSIAN_SLOPE_MARGIN * (last - first)
             ends = [(first - margin - middle) / focal, (last + margin - middle) / focal]
             slope = clip(p[:, i] / np.where(z == 0, 1, z), min(ends), max(ends))
@@ -152,10 +148,8 @@ class Gaussian:
             rho = (yy[:, None] * δx**2 - 2 * xy[:, None] * δx * δy + xx[:, None] * δy**2) / determinant
             unclamped = sigmoid(raw["opacity"]) * np.exp(-0.5 * rho)
         alpha = np.where(unclamped.real > rules.alpha_max, rules.alpha_max, unclamped)
-        depth = np.broadcast_to(p[:, 2:], alpha.shape)
-        return Sample(
-            alpha, depth, unclamped.real, np.full(alpha.shape, np.inf), *np.zeros((2, *alpha.shape))
-        )
+        depth, jump, none = (np.broadcast_to(x, alpha.shape) for x in (p[:, 2:], np.inf, 0.0))
+        return Sample(alpha, depth, unclamped.real, jump, none, none)
 
     @staticmethod
     def sort_key(raw: Raw, camera: PinholeCamera, pixels: Array, corner: Corner) -> Array:

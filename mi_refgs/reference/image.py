@@ -46,12 +46,11 @@ class Scene:
 
 @dataclass
 class Image:
-    """Maps (P, …) by name; `taps` of lookups in the light: texels, weights, and what their sum is times."""
+    """Maps (P, …) by name, and their gradients."""
 
     maps: dict[str, Array]
     band: Array  # (P,): a declared discontinuity is near
     shown: Array  # (N, P): surfel contributes
-    taps: Taps = field(default_factory=list)
     gradients: dict[str, Array] = field(default_factory=dict)  # of Σ weights · maps; "light": flat levels
 
 
@@ -82,7 +81,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
         texels = np.log1p(np.exp(np.asarray(scene.background, np.float64)))
         maps["background"] = radiance_of(texels, resolve.ray)
 
-    image = Image(maps, blend.band(band), blend.shown, taps + pixel_taps)
+    image = Image(maps, blend.band(band), blend.shown)
     if weights is None:
         return image
 
@@ -92,7 +91,7 @@ def render(scene: Scene, weights: dict[str, Array] | None = None, band: float = 
     δsums = itemwise_adjoint(lambda v: resolve(v, []), sums, δout)
     gradients, δfeatures = blend.adjoint(features, turns, δsums)
     δraw = itemwise_adjoint(lambda v: features_of(v, []), features_of.columns, δfeatures)
-    for name, values in features_of.split(δraw).items():
+    for name, values in split(δraw, features_of.raw_widths).items():
         gradients[name] = gradients.get(name, np.zeros_like(raw[name])) + values
     gradients["rotation"][np.abs(raw["rotation"]).max(axis=1, initial=0) < QUATERNION_FLOOR] = 0
     if scene.light is not None:
@@ -130,9 +129,9 @@ class Features:
     def __init__(self, scene: Scene, raw: Raw) -> None:
         self.scene, self.normal = scene, primitive_of(raw).normal(raw)
         self.turned = scene.at == "pixel" and "curvature" in raw
-        self.names = [name for name in raw if name != "opacity" and (self.turned or name != "scale")]
-        self.columns = np.concatenate([raw[name] for name in self.names], axis=1)
-        self.widths = [raw[name].shape[1] for name in self.names]
+        unused = {"opacity"} if self.turned else {"opacity", "scale"}
+        self.raw_widths = {name: x.shape[1] for name, x in raw.items() if name not in unused}
+        self.columns = np.concatenate([raw[name] for name in self.raw_widths], axis=1)
         self.has_indirect = scene.visibility is not None and "indirect_sh" in raw
         self.options = replace(scene.options, diffuse=scene.diffuse)
         self.radiance = slice(3, 6)  # of a surfel that is shaded itself
@@ -150,11 +149,8 @@ class Features:
         """Number of features K."""
         return sum(self.layout.values())
 
-    def split(self, columns: Array) -> dict[str, Array]:
-        return split(columns, dict(zip(self.names, self.widths, strict=True)))
-
     def __call__(self, columns: Array, taps: Taps) -> Array:
-        raw, scene = self.split(columns), self.scene
+        raw, scene = split(columns, self.raw_widths), self.scene
         direction = unit(raw["position"] - scene.camera.to_world[:3, 3])
         normal = np.choose(self.normal[:, None], rotation_axes(raw["rotation"]))
         away = np.sum(normal * direction, 1, keepdims=True).real > c.FACING_TOLERANCE

@@ -139,20 +139,17 @@ def traced_fraction(
 
 
 def chain(hit: Hit, outgoing: Outgoing, origin: Array, direction: Array, bounces: int) -> Array | None:
-    """Radiance (3,) of what a ray meets, shaded with what its mirror ray meets, `bounces` surfaces in all;
-    None if it meets nothing. `outgoing` takes normal, view, visibility (0 or 1) of the light along the mirror
-    ray, and the radiance that arrives instead."""
+    """Radiance (3,) of what a ray meets, shaded with what its mirror ray meets, `bounces` surfaces in all and
+    0 beyond; None if it meets nothing. `outgoing` takes normal, view, visibility (0 or 1) of the light along
+    the mirror ray, and the radiance that arrives instead."""
     found = hit(origin, direction)
-    if found is None:
-        return None
+    if found is None or bounces == 0:
+        return None if found is None else np.zeros(3)
     point, normal, surface = found
     mirror = direction - 2 * float(direction @ normal) * normal
-    if bounces == 1:
-        beyond = None if hit(point, mirror) is None else np.zeros(3)
-    else:
-        beyond = chain(hit, outgoing, point, mirror, bounces - 1)
-    free = beyond is None
-    return outgoing(surface, normal, -direction, float(free), np.zeros(3) if beyond is None else beyond)
+    beyond = chain(hit, outgoing, point, mirror, bounces - 1)
+    arrives = np.zeros(3) if beyond is None else beyond
+    return outgoing(surface, normal, -direction, float(beyond is None), arrives)
 
 
 def blocked_mean(radiance: Array, weight: Array, blocked: Array, free: Array, fading: float) -> Array:

@@ -5,9 +5,7 @@ import math
 import numpy as np
 from scipy.ndimage import correlate1d, gaussian_filter
 
-from mi_refgs.reference.light import radiance_of
-
-Array = np.ndarray
+from mi_refgs.reference.light import Array, radiance_of
 
 
 def srgb(linear: Array) -> Array:

@@ -12,9 +12,8 @@ import numpy as np
 
 from mi_refgs import constants as c
 from mi_refgs.reference.light import Light, bilinear, irradiance, seen_from, specular, table_lookup
-from mi_refgs.reference.lobe import normal_reflectance
+from mi_refgs.reference.lobe import Array, normal_reflectance
 
-Array = np.ndarray
 Taps = list[tuple[Array, Array, Array]]
 
 MATERIALS = ("albedo", "metallic", "roughness", "tint")
@@ -96,8 +95,7 @@ def mirror(points: Points, light: Light | None, options: Options, taps: Taps) ->
     n, v = unit(points.normal), unit(points.view)
     share = points.values["metallic"]
     direction = seen_from(light, points.position, 2 * np.sum(n * v, 1, keepdims=True) * n - v)
-    lookup = bilinear(light, direction, np.zeros(len(n), int))
-    reflected = _looked_up(light, lookup, share, taps)
+    reflected = _looked_up(light, bilinear(light, direction, np.zeros(len(n), int)), share, taps)
     return _terms((1 - share) * points.values["radiance"], reflected)
 
 

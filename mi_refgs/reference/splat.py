@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from mi_refgs.reference.camera import PinholeCamera
+from mi_refgs.reference.camera import Array, PinholeCamera
 from mi_refgs.reference.footprint import GEOMETRY, Corner, Gaussian, Raw, Rules, Sample, Surfel
 
-Array = np.ndarray
 STEP = 1e-40
 
 
@@ -102,8 +101,7 @@ class Blend:
                 slope_alpha, slope_z = there.alpha.imag / STEP, there.z.imag / STEP
                 slope_turn = by_u * there.u.imag / STEP + by_v * there.v.imag / STEP
                 slope = δalpha * slope_alpha + δz * slope_z + self.weight * slope_turn
-                slope = np.where(self.shown, slope, 0)
-                gradients[name][:, d] = np.sum(slope, 1)
+                gradients[name][:, d] = np.sum(np.where(self.shown, slope, 0), 1)
         by_turn = [self.weight * place @ δturned for place in (self.u, self.v)]
         return gradients, np.concatenate([self.weight @ δsums[:, :-2], *by_turn], axis=1)
 
