@@ -143,7 +143,6 @@ def _check(name: str, values: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
     if array.shape != (*rows, 3):
         expected = f"expected {(*rows, 3)}; give one row of three per point"
         raise InputError(f"shape {array.shape}, {expected}", "surfels", name)
-    bad = int(np.count_nonzero(~np.isfinite(array)))
-    if bad:
+    if bad := np.count_nonzero(~np.isfinite(array)):
         raise InputError(f"{bad} values are NaN or infinite", "surfels", name, "remove those points")
     return array

@@ -57,7 +57,14 @@ class Surfels:
             attribute(name)
         self.raw = {name: raw[name] for name in ATTRIBUTES if name in raw}
         self.screened = screened
-        self._check_shapes()
+        for name, tensor in self.raw.items():
+            shape, widths = tuple(tensor.shape), attribute(name).widths
+            if len(shape) != 2 or shape[0] != self.count:
+                found = f"shape {shape}, expected ({self.count}, D)"
+                raise InputError(found, "surfels", name, "one row per surfel")
+            if shape[1] not in widths:
+                choices = " or ".join(map(str, widths))
+                raise InputError(f"{shape[1]} columns, expected {choices}", "surfels", name, "fix the array")
 
     @staticmethod
     def from_numpy(arrays: Mapping[str, np.ndarray]) -> Surfels:
@@ -82,17 +89,6 @@ class Surfels:
         """Spherical-harmonic degree of `radiance_sh` or `indirect_sh`, from its number of columns."""
         return math.isqrt(int(self.raw[name].shape[1]) // 3) - 1
 
-    def _check_shapes(self) -> None:
-        rows = self.count
-        for name, tensor in self.raw.items():
-            shape = tuple(tensor.shape)
-            if len(shape) != 2 or shape[0] != rows:
-                found = f"shape {shape}, expected ({rows}, D)"
-                raise InputError(found, "surfels", name, "one row per surfel")
-            if shape[1] not in attribute(name).widths:
-                choices = " or ".join(str(columns) for columns in attribute(name).widths)
-                raise InputError(f"{shape[1]} columns, expected {choices}", "surfels", name, "fix the array")
-
     @property
     def primitive(self) -> Primitive:
         """The primitive; raises InputError if attributes of it are missing."""
@@ -102,8 +98,7 @@ class Surfels:
         """Raise InputError if an attribute is missing, or a value not finite."""
         primitive_of(self.raw)  # raises
         for name, tensor in self.raw.items():
-            bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
-            if bad:
+            if bad := int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0:
                 raise InputError(f"{bad} values are NaN or infinite", "surfels", name, "remove those surfels")
 
     def usable(self) -> Bool:  # (N,)
@@ -133,9 +128,7 @@ class Surfels:
         """Raw columns (N,) of an attribute, under AD."""
         tensor = self.raw[name]
         rows, width = (int(size) for size in tensor.shape)
-        if rows == 0:
-            return [mi.Float() for _ in range(width)]
-        return columns_of(tensor.array, width)
+        return columns_of(tensor.array, width) if rows else [mi.Float() for _ in range(width)]
 
     def value(self, name: str) -> Any:
         """Activated mi.Float of one column, mi.Color3f of three, else a vector (SH: list of mi.Color3f)."""

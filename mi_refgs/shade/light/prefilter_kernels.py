@@ -58,8 +58,7 @@ class Part:
             m, i = np.divmod(np.arange(h * (h + 1)), h)
             analysed.append([texel + 2 * h * i, 1 + 0 * i, 2 * h + 0 * i, unit * m, 2 * unit * m])
             i, j = np.divmod(np.arange(2 * h * h), 2 * h)
-            angle = unit * (2 * j + 1)
-            synthesised.append([first + i, h + 0 * i, h + 1 + 0 * i, 0 * i, angle])
+            synthesised.append([first + i, h + 0 * i, h + 1 + 0 * i, 0 * i, unit * (2 * j + 1)])
             first += h * (h + 1)
         self.to_coefficients, self.to_texels = (
             Terms(*(upload(x, mi.UInt32) for x in np.hstack(part))) for part in (analysed, synthesised)
@@ -129,8 +128,7 @@ class Kernels:
         first = dr.width(radiance) // 3
 
         def write(rgb: list[Float], place: UInt32) -> None:
-            value = mi.ArrayXf([*rgb, mi.Float(0)])
-            dr.scatter(levels, value, place, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(levels, mi.ArrayXf([*rgb, mi.Float(0)]), place, mode=dr.ReduceMode.NoConflicts)
 
         texel = dr.arange(mi.UInt32, first)
         write([dr.gather(mi.Float, radiance, 3 * texel + k) for k in range(3)], texel)

@@ -45,8 +45,7 @@ class Footprints:
             tuple(dr.concat([a, b]) for a, b in zip(mine, theirs, strict=True))
             for mine, theirs in ((self.first, other.first), (self.last, other.last))
         )
-        fine = self.fine or other.fine
-        return Footprints(joined(*rows), (left, top), (right, bottom), primitive, fine)
+        return Footprints(joined(*rows), (left, top), (right, bottom), primitive, self.fine or other.fine)
 
 
 @dataclass(frozen=True)
