@@ -29,7 +29,6 @@ def execute(job: Job, stop: threading.Event | None = None) -> str | None:
     if stop is not None and stop.is_set():
         return None
     job.write()
-    code = DONE
     for _ in range(1 + RETRIES):
         code = _process(job, stop)
         if code == DONE or (stop is not None and stop.is_set()):
@@ -106,15 +105,11 @@ def _process(job: Job, stop: threading.Event | None) -> int:
             start_new_session=True,  # Ctrl-C reaches this process alone, which passes it on
         )
     with process:
-        while True:
-            try:
+        while stop is None or not stop.is_set():
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 return process.wait(POLL)
-            except subprocess.TimeoutExpired:
-                if stop is not None and stop.is_set():
-                    break
         process.terminate()
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             return process.wait(GRACE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            return process.wait()
+        process.kill()
+        return process.wait()

@@ -138,7 +138,7 @@ def _require_test_views(folder: Path, jobs: Iterable[Job]) -> None:
     sizes: dict[str, dict[str, list[int]]] = {}
     for job in jobs_in(folder):
         with contextlib.suppress(InputError):  # a row that says why
-            if finished(job) and (metrics := read_metrics(job.run)) is not None:
+            if (metrics := finished(job)) is not None:
                 sizes.setdefault(job.data, {})[job.title] = metrics["image_size"]
     for job in jobs:
         method = job.method()
@@ -175,15 +175,16 @@ def require_same(job: Job) -> None:
         raise InputError(what, job.data, other[0], f"restore them, {remedy}")
 
 
-def finished(job: Job) -> bool:
-    """Return whether the run is trained to its end and its last checkpoint is evaluated on the job's data."""
+def finished(job: Job) -> dict[str, Any] | None:
+    """Return the metrics of a run that is trained to its end and whose last checkpoint is evaluated on the
+    job's data; None of any other."""
     run = job.run
     if not run.exists() or not (saved := run.checkpoints()):
-        return False
+        return None
     metrics, last = read_metrics(run) or {}, run.method().iterations
     evaluated = metrics.get("iterations") == last == int(saved[-1].stem) and metrics.get("samples") == 1
     same = Path(metrics.get("dataset", "")).resolve() == Path(job.data).resolve()  # either may be a link
-    return evaluated and same and {score.key for score in SCORES} <= metrics.keys()
+    return metrics if evaluated and same and {score.key for score in SCORES} <= metrics.keys() else None
 
 
 def jobs_in(folder: Path) -> list[Job]:

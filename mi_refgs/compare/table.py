@@ -10,7 +10,6 @@ from typing import Any
 
 from mi_refgs.compare.jobs import FAILED, Job, finished, jobs_in, require_one_size, settings_of
 from mi_refgs.errors import InputError
-from mi_refgs.evaluation.evaluate import read_metrics
 from mi_refgs.evaluation.scores import SCORES, Score, caption
 from mi_refgs.io.files import read_json, write_bytes
 
@@ -71,8 +70,7 @@ class Table:
 
     @property
     def complete(self) -> bool:
-        rows = [row for scene in self.scenes for row in scene.rows]
-        return not any(row.failed or row.unfinished for row in rows)
+        return not any(row.failed or row.unfinished for scene in self.scenes for row in scene.rows)
 
 
 def write(folder: Path) -> Table:
@@ -110,18 +108,16 @@ def table_of(folder: Path) -> Table:
                         row.name, row.paper_row = method.name or row.variant, method.paper_row
                         table.footnotes += [x for x in method.deviations if x not in table.footnotes]
                         row.footnotes = [table.footnotes.index(text) + 1 for text in method.deviations]
-                    done = finished(job)
+                    found = finished(job)
                 except InputError as error:  # a config.toml of another version
                     row.failed[job.seed] = str(error)
                     continue
-                if not done:
+                if found is None:
                     if (failure := job.run.path / FAILED).is_file():
                         row.failed[job.seed] = str(read_json(failure).get("reason"))
                     else:
                         row.unfinished.append(job.seed)
                     continue
-                found = read_metrics(job.run)
-                assert found is not None
                 metrics.append(found)
                 row.seeds.append(job.seed)
                 row.runs.append(str(job.run.path.relative_to(folder.resolve())))
@@ -139,10 +135,7 @@ def table_of(folder: Path) -> Table:
 def _fill(row: Row, found: list[dict[str, Any]]) -> None:
     for column in COLUMNS:
         values = [m[column.key] for m in found]
-        if values and all(value is not None for value in values):
-            row.numbers[column.key] = Statistic.of(values)
-            continue
-        row.numbers[column.key] = None
+        row.numbers[column.key] = Statistic.of(values) if values and None not in values else None
         reasons = [m.get(f"{column.reason}_reason") for m in found if m[column.key] is None]
         if reasons and reasons[0]:
             row.missing[column.key] = str(reasons[0])
@@ -167,8 +160,7 @@ def markdown(table: Table) -> str:
     if table.footnotes:
         lines += ["Deviations from the originals:", ""]
         lines += [*(f"{number}. {text}" for number, text in enumerate(table.footnotes, 1)), ""]
-    about = table.about
-    if about:
+    if about := table.about:
         machines = (", ".join(f"{key} {value}" for key, value in one.items()) for one in table.machines)
         made = f"mi_refgs {about['version']}, preset {about['preset']}, {about['workers']} jobs at once"
         lines += [f"Made by {'; '.join([made, *machines])}:", "", f"    {about['command']}"]
