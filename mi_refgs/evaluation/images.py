@@ -145,13 +145,12 @@ def contact_sheet(rows: Sequence[Maps], footer: Maps | None = None) -> np.ndarra
     narrowest = min(image.shape[1] for row in enlarged for image in row.values())
     size = min(max(narrowest // TITLE_PART, TITLE_MIN), TITLE_MAX)
     lines = [_line(row, size) for row in enlarged]
+    width = max(line.shape[1] for line in lines)
     if footer:
-        width = max(line.shape[1] for line in lines)
         part = (width - MARGIN * (len(footer) - 1)) // max(len(footer), 2)
         sizes = {title: (round(len(image) * part / image.shape[1]), part) for title, image in footer.items()}
         shown = {title: resize_local_mean(footer[title], shape) for title, shape in sizes.items()}
-        lines.append(_line(shown, size))
-    width = max(line.shape[1] for line in lines)
+        lines.append(_line(shown, size))  # no wider
     return np.concatenate([_padded(line, MARGIN, width - line.shape[1]) for line in lines])
 
 

@@ -20,7 +20,7 @@ from mi_refgs.io.progress import warn
 from mi_refgs.kernels.device import upload
 from mi_refgs.kernels.memory import BASE, PER_SHOWN_SURFEL, PER_TEXEL, require
 from mi_refgs.occlusion.mesh import Mesh, clean
-from mi_refgs.occlusion.surface_materials import NORMAL_AGREEMENT, VertexSurfels
+from mi_refgs.occlusion.surface_materials import NORMAL_AGREEMENT, VertexSurfels, corners_of
 from mi_refgs.occlusion.visibility import OFFSET_VOXELS, Occluder
 from mi_refgs.render.pipeline import Frame
 from mi_refgs.runs.relightable import relightable
@@ -157,12 +157,9 @@ def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Fra
         return replace(mesh, vertices=(mesh.vertices + voxels * mesh.voxel * normals).astype(np.float32))
 
     def excess(voxels: float) -> float:
-        occluder, total = Occluder(moved(voxels)), 0.0
-        for view in views:
-            directions = view.rays()
-            origins = mi.Point3f(view.origin + dr.zeros(mi.Point3f, dr.width(directions)))
-            total += float(dr.count(occluder.first_hit(origins, directions)[1])[0])
-        return total - covered
+        occluder = Occluder(moved(voxels))
+        hits = (occluder.first_hit(view.origin, view.rays())[1] for view in views)
+        return sum(float(dr.count(hit)[0]) for hit in hits) - covered
 
     low, high = 0.0, GROWTH
     for _ in range(HALVINGS):
@@ -183,11 +180,10 @@ def _points(
     """Positions (V + T,) of the mesh's vertices and T points, their COLUMNS by surfels and mesh normals."""
     nearby = VertexSurfels.of(mesh, scene.surfels)
     vertices = dr.arange(mi.UInt32, len(mesh.vertices))
-    corners = [dr.gather(mi.UInt32, nearby.faces, 3 * triangle + i) for i in range(3)]
-    weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
+    corners = corners_of(nearby.faces, triangle, barycentric, True)
 
     def interpolated(column: Float) -> Float:
-        mixed = sum(w * dr.gather(mi.Float, column, c) for w, c in zip(weights, corners, strict=True))
+        mixed = sum(share * dr.gather(mi.Float, column, vertex) for vertex, share in corners)
         return dr.concat((dr.gather(mi.Float, column, vertices), mixed))
 
     columns = nearby.values(scene.surfels, scene.shading.required_attributes)

@@ -1,6 +1,6 @@
 """Interface of the formats of other programs, their registry, and the function that writes them."""
 
-import importlib
+import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,8 +55,7 @@ class Format:
     def writer(self) -> Callable[..., list[Path]]:
         if not isinstance(self.write, str):
             return self.write
-        module, _, name = self.write.partition(":")
-        return cast(Any, getattr(importlib.import_module(f"mi_refgs.formats.{module}"), name))
+        return cast(Any, pkgutil.resolve_name(f"mi_refgs.formats.{self.write}"))
 
 
 FORMATS: Registry[Format] = Registry("format", of=Format)  # every format by name

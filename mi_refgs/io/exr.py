@@ -190,8 +190,7 @@ def exr_header(path: Path) -> tuple[int, int, bool]:
 def write_exr(path: str | Path, image: np.ndarray, names: str | None = None, half: bool = False) -> None:
     """Write an (H, W, C) or (H, W) array as ZIP-compressed EXR, float32 or float16, atomically. `names` has
     one letter per channel, by default Y, RGB or RGBA. Raises InputError as `replace_file` does."""
-    image = np.asarray(image)
-    planes = image[..., None] if image.ndim == 2 else image
+    planes = np.atleast_3d(image)
     names = names or {1: "Y", 3: "RGB", 4: "RGBA"}[planes.shape[-1]]
     dtype = np.float16 if half else np.float32
     write_exr_layers(path, {name: planes[..., i].astype(dtype) for i, name in enumerate(names)})

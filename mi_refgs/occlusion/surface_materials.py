@@ -72,8 +72,7 @@ class VertexSurfels:
 
         # Normals as they vary over the surfels.
         turned = normal[found]
-        turns = surfels.primitive.turns(surfels, mi.Vector3f(normal.T)).values()
-        for i, turn in enumerate(turns):
+        for i, turn in enumerate(surfels.primitive.turns(surfels, mi.Vector3f(normal.T)).values()):
             turned = turned + (along[..., i] / spread[found][..., i])[..., None] * turn.numpy().T[found]
         mean = _normals(mesh, turned, weight)
 
@@ -136,7 +135,7 @@ class Surface:
         groups = -(-(sum(self.widths.values()) + 3) // GROUP)  # of a vertex
         mixed = [mi.Vector4f(0) for _ in range(groups)]
         closest, largest = mi.UInt32(0), mi.Float(-1)
-        for vertex, share in _corners(self.vertex_surfels.faces, triangle, barycentric, active):
+        for vertex, share in corners_of(self.vertex_surfels.faces, triangle, barycentric, active):
             for i in range(groups):
                 mixed[i] += share * dr.gather(mi.Vector4f, self.rows, groups * vertex + i, active)
             closest = dr.select(share > largest, vertex, closest)
@@ -155,7 +154,7 @@ class Surface:
         """Barycentric coordinates of hits, with derivatives by the directions of their rays (not of those at
         GRAZING angles): where these meet the planes of the triangles."""
         known = self.vertex_surfels
-        corners = _corners(known.faces, triangle, barycentric, active)
+        corners = corners_of(known.faces, triangle, barycentric, active)
         a, b, c = (dr.gather(mi.Point3f, known.corners, vertex, active) for vertex, _ in corners)
         along, beside = b - a, c - a
         normal = dr.cross(along, beside)
@@ -177,7 +176,7 @@ class VertexColours:
     def at(self, triangle: UInt32, barycentric: Point2f, active: Bool) -> Color3f:
         """Colour at barycentric coordinates of the second and third corner; 0 where not `active`."""
         colour = mi.Color3f(0)
-        for vertex, share in _corners(self.faces, triangle, barycentric, active):
+        for vertex, share in corners_of(self.faces, triangle, barycentric, active):
             colour += share * dr.gather(mi.Color3f, self.rows, vertex, active)
         return colour
 
@@ -185,7 +184,7 @@ class VertexColours:
         return np.array(self.rows).reshape(-1, 3)
 
 
-def _corners(
+def corners_of(
     faces: UInt32, triangle: UInt32, barycentric: Point2f, active: Bool
 ) -> list[tuple[UInt32, Float]]:
     """Vertex and barycentric weight of each of the three corners of triangles (N,)."""
