@@ -81,7 +81,6 @@ def _require_object(made: Reconstruction, shots: Sequence[Shot], path: Path) -> 
     seen = [made.render(camera, size=64)[..., 3] for camera in cameras]
     if max(alpha.max() for alpha in seen) < OPAQUE_BORDER:
         raise InputError("views of the surfels show nothing", path, "opacity", "export the file again")
-    border = [border_of(alpha).mean() for alpha in seen]
-    if np.mean(border) > OPAQUE_BORDER:
+    if np.mean([border_of(alpha).mean() for alpha in seen]) > OPAQUE_BORDER:
         what = "views are opaque up to the border, so this is a scene, not a free object"
         raise InputError(what, path, "surfels", "crop the object with --box")

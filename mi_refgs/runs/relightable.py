@@ -49,12 +49,11 @@ def relightable(scene: TrainedScene) -> TrainedScene:
         raise InputError(why, remedy="fit one with materials and a light, as `--for relighting` does")
     shading = scene.shading.relit(scene.mesh is not None)
     assert scene.light is not None and shading is not None  # by `lacking`
-    surfels, mesh = scene.surfels.detach(), scene.mesh
+    surfels = scene.surfels.detach()
     if scene.shading.required_attributes != shading.required_attributes:
-        surfels = albedo_from_radiance(surfels, scene.light.prefilter(), mesh)
-    kept = {name: raw for name, raw in surfels.raw.items() if name not in LIT}
-    dropped: dict[str, Any] = {"surroundings": None, "near": None, "turntable": None}
-    return replace(scene, surfels=Surfels(kept), mesh=mesh, shading=shading, **dropped)
+        surfels = albedo_from_radiance(surfels, scene.light.prefilter(), scene.mesh)
+    surfels = Surfels({name: raw for name, raw in surfels.raw.items() if name not in LIT})
+    return replace(scene, surfels=surfels, shading=shading, surroundings=None, near=None, turntable=None)
 
 
 def albedo_from_radiance(surfels: Surfels, light: Light, mesh: Mesh | None) -> Surfels:

@@ -107,8 +107,7 @@ class Run:
 
     def offset(self) -> Sequence[float] | None:
         """What was subtracted from positions of the data set (`Dataset.offset`), if the run records it."""
-        found: Sequence[float] | None = self.record(DATASET).get("offset")
-        return found
+        return self.record(DATASET).get("offset")
 
     def dataset(self) -> Path | None:
         """Folder of the data set that the run was fitted to, if it records one; raises InputError if not."""

@@ -69,9 +69,8 @@ class Shading(ShadingOptions):
         options = self.model.relit(replace(self, at=at, **UNTRACED))
         if options is None:
             return None
-        given = asdict(options)
         traced = {name: rays for name, rays in RELIT_RAYS.items() if name in self.model.honoured}
-        return Shading.resolve(ShadingOptions(**given | traced), mesh)
+        return Shading.resolve(ShadingOptions(**asdict(options) | traced), mesh)
 
     def untraced(self) -> "Shading":
         """Without visibility, for renders of materials only."""

@@ -51,11 +51,8 @@ def from_points(
     if normals is not None:
         normals = _check("normals", normals, (count,))
     kind = PRIMITIVES.find(primitive, "primitive")
-    raw = {"position": points}
-    spacing = neighbour_scale(points) * scale_factor
-    if largest is not None:
-        spacing = np.minimum(spacing, largest)
-    raw |= kind.start(spacing, quaternions(normals, count, rng))
+    spacing = np.minimum(neighbour_scale(points) * scale_factor, np.inf if largest is None else largest)
+    raw = {"position": points, **kind.start(spacing, quaternions(normals, count, rng))}
     for name, declared in ATTRIBUTES.items():
         chosen = not declared.geometry if attributes is None else name in attributes
         if name not in raw and (name in kind.widths or chosen):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -66,7 +67,7 @@ class ReconstructionView:
         self.turn = 0.0  # rotation of the light about z, degrees, counter-clockwise seen from above
         self.environment = scene.light
         self.change: Change | None = None
-        self._relightable: TrainedScene | None = None
+        self._materials_only = cache(partial(relightable, scene))
         self.set_relit(False)
 
     def set_light(self, light: EnvironmentLight | None) -> None:
@@ -81,9 +82,7 @@ class ReconstructionView:
 
     def set_relit(self, relit: bool) -> None:
         """Display materials only, as `refgs relight` does, or the scene as fitted."""
-        if relit and self._relightable is None:
-            self._relightable = relightable(self.original)
-        self._base = self._relightable if relit and self._relightable is not None else self.original
+        self._base = self._materials_only() if relit else self.original
         self.scene = self._base
         self._occluder = Occluder(self.scene.mesh)
         self._filter()
@@ -121,9 +120,8 @@ class ReconstructionView:
             update_occluder_caches(occluder, scene.surfels, light, shading)
             self._stale = False
         background = scene.surroundings if look.backdrop == BACKGROUND else None
-        own = self.environment is self.original.light and not self.turn
-        given = (light, occluder, background, scene.near if own else None)
-        rendered = SurfelScene(scene.surfels, shading, *given)
+        near = scene.near if self.environment is self.original.light and not self.turn else None
+        rendered = SurfelScene(scene.surfels, shading, light, occluder, background, near)
         return render(rendered, camera, Request(frozenset({look.what} - {IMAGE, "alpha"}), forward_only=True))
 
     def draw(self, camera: Camera, look: DisplayOptions, settled: bool) -> list[Float]:
