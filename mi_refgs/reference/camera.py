@@ -23,11 +23,6 @@ class PinholeCamera:
     film: tuple[tuple[float, float], tuple[float, float]] | None = None  # borders along x and y; None: all
     fine: bool = False
 
-    @property
-    def borders(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """First and last pixel border of the film along x and y."""
-        return self.film or ((0, self.width), (0, self.height))
-
 
 def camera_frame(raw: dict[str, Array], camera: PinholeCamera) -> tuple[Array, Array]:
     """Centres (N, 3) and axes (N, 3, 3) — t_u, t_v, n — in the camera's frame."""

@@ -79,9 +79,8 @@ class Surfel:
             unclamped = sigmoid(raw["opacity"]) * np.exp(-0.5 * np.where(low_pass, screen, plane))
             jump = np.abs(screen.real - plane.real) / screen.real
         alpha = np.where(unclamped.real > rules.alpha_max, rules.alpha_max, unclamped)
-        z = np.where(low_pass, p[:, 2:], t)
         u, v = np.where(low_pass | ~np.isfinite(t), 0, [u, v])
-        return Sample(alpha, z, unclamped.real, jump, u, v)
+        return Sample(alpha, np.where(low_pass, p[:, 2:], t), unclamped.real, jump, u, v)
 
     @staticmethod
     def normal(raw: Raw) -> Array:
@@ -130,20 +129,20 @@ class Gaussian:
         p, axes = camera_frame(raw, camera)
         σ, z = np.exp(raw["scale"]), p[:, 2]
         along = []  # pixels on the screen of one standard deviation along each axis, (N, 3) in x and in y
-        film = zip(intrinsics(camera), camera.borders, strict=True)
-        for i, ((focal, middle), (first, last)) in enumerate(film):
+        offsets = []  # pixels from the centres (N, P), in x and in y
+        film = camera.film or ((0, camera.width), (0, camera.height))
+        sides = zip((x, y), intrinsics(camera), film, strict=True)
+        for i, (at, (focal, middle), (first, last)) in enumerate(sides):
             margin = c.GAUSSIAN_SLOPE_MARGIN * (last - first)
             ends = [(first - margin - middle) / focal, (last + margin - middle) / focal]
             slope = clip(p[:, i] / np.where(z == 0, 1, z), min(ends), max(ends))
             along.append(focal * σ * (axes[:, :, i] - slope[:, None] * axes[:, :, 2]) / z[:, None])
+            offsets.append(at - (focal * p[:, i] / z + middle)[:, None])
         covariance = [[np.sum(a * b, axis=1) for b in along] for a in along]
         low_pass = c.GAUSSIAN_LOW_PASS if rules.low_pass else 0.0
         xx, yy, xy = covariance[0][0] + low_pass, covariance[1][1] + low_pass, covariance[0][1]
         determinant = (xx * yy - xy**2)[:, None]
-        δx, δy = (
-            at - (focal * p[:, i] / z + middle)[:, None]
-            for i, (at, (focal, middle)) in enumerate(zip((x, y), intrinsics(camera), strict=True))
-        )
+        δx, δy = offsets
         with np.errstate(over="ignore"):
             rho = (yy[:, None] * δx**2 - 2 * xy[:, None] * δx * δy + xx[:, None] * δy**2) / determinant
             unclamped = sigmoid(raw["opacity"]) * np.exp(-0.5 * rho)

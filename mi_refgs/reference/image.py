@@ -143,11 +143,7 @@ class Features:
             self.layout = {"normal": 3, **self.materials}
             own = scene.reflectance != "split_sum" or scene.diffuse == "sh"
             self.layout |= ({"radiance": 3} if own else {}) | ({"indirect": 3} if self.has_indirect else {})
-
-    @property
-    def width(self) -> int:
-        """Number of features K."""
-        return sum(self.layout.values())
+        self.width = sum(self.layout.values())  # number of features K
 
     def __call__(self, columns: Array, taps: Taps) -> Array:
         raw, scene = split(columns, self.raw_widths), self.scene

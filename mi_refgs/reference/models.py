@@ -55,9 +55,8 @@ def split_sum(points: Points, light: Light | None, options: Options, taps: Taps)
     n, v, values = unit(points.normal), unit(points.view), points.values
     albedo, metallic, roughness = values["albedo"], values["metallic"], values["roughness"][:, 0]
     n_v = np.sum(n * v, 1)
-    f0 = normal_reflectance(albedo, metallic)
     a, b = table_lookup(light.table, n_v, roughness).T
-    reflectance = f0 * a[:, None] + b[:, None]
+    reflectance = normal_reflectance(albedo, metallic) * a[:, None] + b[:, None]
     free = values.get("visibility", np.ones((len(n), 1)))
     direction = 2 * n_v[:, None] * n - v
     if options.dominant:  # [Lagarde and de Rousiers 2014, §4.9.3]
