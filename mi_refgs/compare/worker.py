@@ -30,6 +30,7 @@ def main(folder: Path) -> int:
             job = Job.read(folder)
             (folder / FAILED).unlink(missing_ok=True)
             fit_and_measure(job)
+        return DONE
     except KeyboardInterrupt:
         return STOPPED
     except InputError as error:
@@ -37,8 +38,6 @@ def main(folder: Path) -> int:
     except Exception as error:
         traceback.print_exc()
         reason = f"{type(error).__name__}: {error} (job.log has the details)"
-    else:
-        return DONE
     say(reason)
     Job.read(folder).run.write_json(FAILED, {"reason": reason})
     return FAILURE

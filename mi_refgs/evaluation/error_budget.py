@@ -37,9 +37,8 @@ def classify(view: View, surface: TrueSurface | None) -> np.ndarray | None:
         smooth = np.where(unblocked, CLASSES.index("mirror_free"), CLASSES.index("mirror_blocked"))
     window = 2 * OUTLINE_PIXELS + 1
     outline = maximum_filter(covered, window) - minimum_filter(covered, window) > FOREGROUND_ALPHA
-    creased = _creased(point.numpy().T.reshape(*shape, 3), view.normal, hit)
     found = np.where(hit, smooth, CLASSES.index("background"))
-    found[creased] = CLASSES.index("crease")
+    found[_creased(point.numpy().T.reshape(*shape, 3), view.normal, hit)] = CLASSES.index("crease")
     found[outline] = CLASSES.index("silhouette")
     return found
 

@@ -44,8 +44,7 @@ class TrueSurface:
     @staticmethod
     def read(folder: Path, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> TrueSurface | None:
         """Read the surface of a data set, relative to `Dataset.offset`; None where there is none."""
-        path = folder / SURFACE
-        if not path.is_file():
+        if not (path := folder / SURFACE).is_file():
             return None
         mesh = read_mesh(path)
         mesh = replace(mesh, vertices=(mesh.vertices - np.array(offset)).astype(np.float32))

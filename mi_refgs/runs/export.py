@@ -66,8 +66,7 @@ def fresh(run: Run, method: Method) -> TrainedScene | None:
         with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
             shown = int(read_json(model)["iteration"])
     if any(int(path.stem) > shown for path in run.checkpoints()):
-        state = run.load_checkpoint()
-        if state is not None and int(state["iteration"]) > shown:
+        if (state := run.load_checkpoint()) is not None and int(state["iteration"]) > shown:
             return TrainedScene.from_state(method, state)
     if not model.is_file():
         first = f"wait for the first of a fit that runs, after {method.checkpoint_every} iterations"

@@ -79,8 +79,7 @@ class RenderLoop:
     def run(self) -> None:
         """Draw until KeyboardInterrupt."""
         while True:
-            wait = self.step()
-            if wait == math.inf:
+            if (wait := self.step()) == math.inf:
                 dr.flush_malloc_cache()  # buffers of other image sizes
             with self._wake:
                 if wait > 0 and not self._tasks:
@@ -113,14 +112,13 @@ class RenderLoop:
         """Whether a task succeeds; a failure is reported in one sentence."""
         try:
             task()
+            return True
         except InputError as error:
             self.report(str(error))
         except Exception as error:
             traceback.print_exc()
             where = "the image stays as it was; the terminal shows where it failed"
             self.report(f"{type(error).__name__}: {where}")
-        else:
-            return True
         return False
 
     def _advance(self, client: Client) -> None:

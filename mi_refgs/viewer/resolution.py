@@ -53,6 +53,5 @@ def due(progress: int, since: float) -> float:
 def offset_of(sample: int) -> tuple[float, float]:
     """Return a sample's offset from the pixel centre, pixels; each four in turn lie in all quarters."""
     (row, column), quarter = divmod(sample // 4, GRID // 2), sample % 4
-    right, down = (0, 1, 1, 0)[quarter], (0, 1, 0, 1)[quarter]
-    x, y = column + GRID // 2 * right, row + GRID // 2 * down
+    x, y = column + GRID // 2 * (0, 1, 1, 0)[quarter], row + GRID // 2 * (0, 1, 0, 1)[quarter]
     return (x + 0.5) / GRID - 0.5, (y + 0.5) / GRID - 0.5

@@ -76,9 +76,8 @@ class SplitSum(Reflectance):
         Finite for every finite input. Raises InputError for "sh" without a radiance."""
         # Directional reflectance, and the light in the specular lobe.
         normal, view = safe_normalize(points.normal), safe_normalize(points.view)
-        f0 = base_reflectance(points)
         scale, bias = split_sum(dr.dot(normal, view), points.roughness)
-        reflectance = dr.fma(f0, scale, bias)
+        reflectance = dr.fma(base_reflectance(points), scale, bias)
         direction = lookup_direction(normal, view, points.roughness, options)
         specular = light.specular(direction, points.roughness) * reflectance
 

@@ -109,8 +109,7 @@ class Gaussian(base.Oriented):
         """The shortest axis, the third of equal ones; which one it is has no derivative. [3DGS-DR, §3.2]"""
         first, second, third = surfels.frame()
         s = dr.detach(surfels.scale())
-        shorter, least = s.x < s.y, dr.minimum(s.x, s.y)
-        return dr.select(s.z <= least, third, dr.select(shorter, first, second))
+        return dr.select(s.z <= dr.minimum(s.x, s.y), third, dr.select(s.x < s.y, first, second))
 
     def overlaps(self, row: list[Float], low: Point2f, high: Point2f) -> Bool:
         """Whether the least ρ of the rectangle, on an edge that faces the centre, is within the contour."""

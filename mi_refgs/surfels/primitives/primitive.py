@@ -173,9 +173,8 @@ class Oriented(Primitive):
 
 
 def _check(primitive: Primitive) -> None:
-    mine = {*primitive.widths.items()}
     for other in PRIMITIVES.values():
-        others = {*other.widths.items()}
+        mine, others = primitive.widths.items(), other.widths.items()
         if mine <= others or others <= mine:
             what = f"primitive '{primitive.name}': '{other.name}' has its attributes"
             raise InputError(what, remedy="give it an attribute, or a number of columns, of its own")
