@@ -227,8 +227,8 @@ class Solved:
         )
 
 
-def adjust(model: Reconstruction) -> None:
-    """Bundle adjustment of everything but the principal points."""
+def adjust(model: Reconstruction) -> Reconstruction:
+    """Bundle adjustment of everything but the principal points, in place; returns the model."""
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
     options.print_summary = False
     for image in model.reg_image_ids():
@@ -237,6 +237,7 @@ def adjust(model: Reconstruction) -> None:
     with quiet():  # `pycolmap.bundle_adjustment` would turn the log on again
         pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
+    return model
 
 
 def best_lens(model: Reconstruction) -> Reconstruction:

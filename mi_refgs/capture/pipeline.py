@@ -162,9 +162,7 @@ def _solve(source: Path, work: Path, copies: dict[str, Photograph], camera: str 
     shutil.rmtree(raw, ignore_errors=True)
     models = colmap.reconstruct(database, images, raw, len(names))
     require_placed(source, len(names), [model.num_reg_images() for model in models])
-    if camera:
-        colmap.adjust(models[0])
-    best = models[0] if camera else colmap.best_lens(models[0])
+    best = (colmap.adjust if camera else colmap.best_lens)(models[0])
     shutil.rmtree(raw)
     raw.mkdir()
     colmap.write(best, raw)

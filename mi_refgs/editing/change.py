@@ -116,13 +116,12 @@ def apply(
     own = {name: table[chosen] for name, table in raw.items()}
     for assignment in made:
         _assign(values, own, assignment)
-    mesh = _mesh(scene, chosen, own["opacity"], cut)
     for name, table in raw.items():
         if cut:
             raw[name] = table[~chosen]
         else:
             table[chosen] = own[name]
-    return replace(scene, surfels=Surfels.from_numpy(raw), mesh=mesh)
+    return replace(scene, surfels=Surfels.from_numpy(raw), mesh=_mesh(scene, chosen, own["opacity"], cut))
 
 
 def _mesh(scene: TrainedScene, chosen: np.ndarray, opacity: np.ndarray, cut: bool) -> Mesh | None:

@@ -143,9 +143,8 @@ def texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, UI
     hit = plane.closest(above, mi.Vector3f(0, 0, -1), None)
     covered = hit.valid.numpy()
     found = np.flatnonzero(covered)
-    triangle = upload(hit.triangle.numpy()[found], mi.UInt32)
     barycentric = mi.Point2f(*(upload(x.numpy()[found]) for x in hit.barycentric))
-    return covered.reshape(size, size), triangle, barycentric
+    return covered.reshape(size, size), upload(hit.triangle.numpy()[found], mi.UInt32), barycentric
 
 
 def _grown(mesh: Mesh, views: Sequence[Camera], renderer: Callable[[Camera], Frame]) -> Mesh:

@@ -21,7 +21,7 @@ from mi_refgs.runs.trained_scene import TrainedScene
 from mi_refgs.surfels.attributes import SH_DC, sigmoid
 from mi_refgs.surfels.table import Surfels
 
-Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))  # glTF's world from ours
+Y_UP = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)))  # glTF's world from ours
 Y_UP_QUATERNION = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)  # the same (x, y, z, w): the turn by -90° about x
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, POINTS, VERTICES = 5126, 0, 34962  # of a component type, of a mode, of a buffer's use
@@ -41,8 +41,7 @@ def write_mesh(
         metallicFactor=1.0,
         roughnessFactor=1.0,
     )
-    turn = np.array(Y_UP)
-    vertices, normals = made.vertices @ turn.T, made.normals @ turn.T
+    vertices, normals = made.vertices @ Y_UP.T, made.normals @ Y_UP.T
     visual = TextureVisuals(uv=made.uv.astype(np.float64), material=material)
     mesh = trimesh.Trimesh(vertices, made.faces, vertex_normals=normals, visual=visual, process=False)
     scene = trimesh.Scene()

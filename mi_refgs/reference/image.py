@@ -247,7 +247,5 @@ def rays(camera: PinholeCamera, x: Array, y: Array) -> Array:
 
 def bilinear_map(values: Array, x: Array, y: Array) -> Array:
     """Values (P, C) at points of the image (P,), in pixels, of a map (H, W, C); the border repeats."""
-    planes = (
-        map_coordinates(v, (y - 0.5, x - 0.5), order=1, mode="nearest") for v in np.moveaxis(values, -1, 0)
-    )
-    return np.stack([*planes], axis=1)
+    at, planes = (y - 0.5, x - 0.5), np.moveaxis(values, -1, 0)
+    return np.stack([map_coordinates(plane, at, order=1, mode="nearest") for plane in planes], axis=1)
