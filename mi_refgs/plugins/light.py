@@ -41,11 +41,10 @@ def emitter_light(emitter: Any, filtered: bool = True, other: Light | None = Non
     under AD by `scale`, `data` and `to_world`, `radiance.value`, or `irradiance.value` and `to_world`. Raises
     InputError for resampled `data` with gradients, and other emitters."""
     params = mi.traverse(emitter)
-    if "irradiance.value" in params:
+    if emitter.class_name() == "DirectionalEmitter":
         towards = -mi.Vector3f(params["to_world"] @ mi.Vector3f(0, 0, 1))
         other = other or ConstantLight(mi.Color3f(0))
-        arriving = mi.Color3f(params["irradiance.value"])
-        return DirectionalLight(other, dr.normalize(towards), bounded(arriving, arriving))
+        return DirectionalLight(other, dr.normalize(towards), _colour(params, emitter, "irradiance"))
     if "data" not in params:
         return ConstantLight(_constant_radiance(params, emitter))
     radiance, resampled = _map_radiance(params)
@@ -159,7 +158,11 @@ def _constant_radiance(params: Any, emitter: Any) -> Any:
     if emitter.class_name() != "ConstantBackgroundEmitter":
         what = f"emitter '{emitter.id()}': type: refgs takes no {emitter.class_name()}"
         raise InputError(what, remedy="use an `envmap` or a `constant` environment")
-    if "radiance.value" not in params:
-        raise InputError(f"emitter '{emitter.id()}': radiance: no colour", remedy="give an `rgb`")
-    colour = mi.Color3f(params["radiance.value"])
+    return _colour(params, emitter, "radiance")
+
+
+def _colour(params: Any, emitter: Any, name: str) -> Color3f:
+    if f"{name}.value" not in params:
+        raise InputError(f"emitter '{emitter.id()}': {name}: no colour", remedy="give an `rgb`")
+    colour = mi.Color3f(params[f"{name}.value"])
     return bounded(colour, colour)

@@ -62,6 +62,8 @@ def test_lights_of_a_scene_add_up_and_the_rest_is_named_once() -> None:
     assert "AreaLight 'bulb', SpotLight 'spot'" in emitters and "'sky'" not in emitters
     assert "Disk 'floor', Rectangle 'lamp'" in shapes
     refused(lambda: scenes.image(lit(spot={"type": "spot"})), "refgs takes none of SpotLight 'spot'")
+    glow = sun | {"irradiance": {"type": "blackbody", "temperature": 5e3}}
+    refused(lambda: scenes.image(lit(sky=sky, sun=glow)), "emitter 'sun': irradiance: no colour; give an")
 
     unlit = scenes.lit_scene(sky, reflectance="radiance")
     with pytest.warns(RuntimeWarning, match="emitters .*'sky'.*if its model has one"):
