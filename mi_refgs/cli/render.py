@@ -36,6 +36,7 @@ class Render:
         from mi_refgs.io.ownership import require_no_run
         from mi_refgs.io.progress import warn
         from mi_refgs.render.scene_xml import has_square_pixels, sensors_of
+        from mi_refgs.runs.run import Run
 
         out = self.output  # refused before the scene is read
         if out.suffix.lower() not in (".exr", ".png"):
@@ -48,7 +49,8 @@ class Render:
         require_no_run(out)
         require_no_data(out)
         require_between(1 if self.samples is None else self.samples, "--samples", 1)
-        cameras = None if self.camera is None else read_cameras(self.camera)
+        offset = Run(self.scene).offset() or (0, 0, 0)
+        cameras = None if self.camera is None else read_cameras(self.camera, offset)
         scene = read(self.scene, separated(self.aov), self.object)
         own = scene.sensors()
         sensors = own if cameras is None else sensors_of(cameras)

@@ -78,16 +78,17 @@ def _file(shot: Shot) -> FileCamera:
     return FileCamera(Path(f"{shot.name}{ending}"), c.width, c.height, intrinsics)
 
 
-def read_cameras(path: Path) -> list[Camera]:
+def read_cameras(path: Path, offset: Sequence[float] = (0, 0, 0)) -> list[Camera]:
     """Read the pinhole cameras of a transforms.json, or of the cameras.json of 3DGS, a list; images are not
-    read. Keys as in `data.transforms`, and near (depth of the near plane, 0 by default). Raises InputError
-    for a file without sizes, focal lengths or poses, and for another lens."""
+    read. Keys as in `data.transforms`, and near (depth of the near plane, 0 by default). Those nearer to the
+    `offset` of a run than to the origin become relative to it, as the run is. Raises InputError for a file
+    without sizes, focal lengths or poses, and for another lens."""
     content = read_any_json(path)
     listed = isinstance(content, list)
     frames = [_listed(path, *pair) for pair in enumerate(content)] if listed else Frame.all_of(path)
     if not frames:
         raise InputError("empty", path, "frames", "add one entry for each camera")
-    return [_camera(frame) for frame in frames]
+    return [_camera(frame, np.array(offset)) for frame in frames]
 
 
 def _listed(path: Path, index: int, entry: Any) -> Frame:
@@ -104,7 +105,7 @@ def _listed(path: Path, index: int, entry: Any) -> Frame:
     return Frame(path, f"[{index}]", own, own)
 
 
-def _camera(frame: Frame) -> Camera:
+def _camera(frame: Frame, offset: np.ndarray) -> Camera:
     if frame.lens() is not None:
         field = next((key for key in (*COEFFICIENTS, "is_fisheye") if frame.given.get(key)), "camera_model")
         raise frame.refuse(field, "no pinhole", "undistort the images, and give those cameras")
@@ -113,4 +114,7 @@ def _camera(frame: Frame) -> Camera:
         raise frame.refuse("w", f"{width:g} × {height:g} is no size of an image", "correct w and h")
     fx, fy, cx, cy = frame.pinhole(width, height)
     near = max(frame.number("near") or 0.0, 0.0)
-    return Camera.from_pose(int(width), int(height), -fx, -fy, cx, cy, frame.to_world(), near)
+    pose = frame.to_world()
+    if np.linalg.norm(pose[:3, 3] - offset) < np.linalg.norm(pose[:3, 3]):
+        pose[:3, 3] -= offset
+    return Camera.from_pose(int(width), int(height), -fx, -fy, cx, cy, pose, near)

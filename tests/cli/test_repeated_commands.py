@@ -83,6 +83,24 @@ def test_eval_and_render_do_not_depend_on_earlier_ones(finished: Path, tmp_path:
     assert results[0] != results[1] == results[2]
 
 
+def test_cameras_far_from_the_origin_see_the_run_that_is_relative_to_them(run: Path, tmp_path: Path) -> None:
+    """A data set at offsets of survey coordinates is fitted near the origin."""
+    offset, own = np.array([5e5, 5.4e6, 300.0]), json.loads((run / "dataset.json").read_text())
+    near, far = tmp_path / "near/transforms.json", tmp_path / "far.json"
+    assert main(["export", str(run), "--to", "cameras", "-o", str(near.parent)]) == 0
+    cameras = json.loads(near.read_text())
+    for frame in cameras["frames"]:
+        for row, x in zip(frame["transform_matrix"], offset, strict=False):
+            row[3] += x
+    far.write_text(json.dumps(cameras))
+    (run / "dataset.json").write_text(json.dumps(own | {"offset": offset.tolist()}))
+    for file in (near, far):
+        assert main(["render", str(run), "-o", str(file.with_suffix(".exr")), "--camera", str(file)]) == 0
+    images = [read_exr(file.with_suffix(".exr"))["R"] for file in (near, far)]
+    np.testing.assert_allclose(*images, atol=1e-3)
+    assert images[0].max() > 0.1
+
+
 HOLD = """
 import fcntl, sys
 file = open(sys.argv[1], "a")

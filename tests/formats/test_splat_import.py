@@ -179,5 +179,8 @@ def test_cameras_of_3dgs_are_read(tmp_path: Path) -> None:
     point = camera.to_camera(mi.Point3f(5, 2.4, 3.8))  # 4 ahead, 0.4 to the right, 0.8 down
     x, y = camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy
     np.testing.assert_allclose([x[0], y[0]], [32 + 70 * 0.1, 24 + 71 * 0.2], rtol=1e-5)
+    place = camera.pose()[:3, 3]
+    for offset, moved in ((0.9 * place, 0.1 * place), (-0.9 * place, place)):  # relative where it is nearer
+        np.testing.assert_allclose(read_cameras(path, offset)[0].pose()[:3, 3], moved, atol=1e-6)
     path.write_text(json.dumps([own]))
     refused(lambda: read_cameras(path), path, "[0]: no camera of 3DGS")
