@@ -36,7 +36,7 @@ MEMORY = 4096  # steps that `report` may come late
 
 @dataclass(frozen=True)
 class LearningRate:
-    """Rate of one tensor: log-linear from `rate` to `final` between the iterations `begin` and `steps`."""
+    """Rate of one tensor: falls from `rate` to `final` between iterations `begin` and `steps`."""
 
     rate: float  # per step, units of the raw tensor
     final: float | None = None  # None: constant
@@ -46,12 +46,15 @@ class LearningRate:
     by_row: RowRate | None = None  # of `fitting.row_rates`: which rows learn faster
     unit: float = 1.0  # of the raw tensor; moments are without unit, as ε is
     begin: int = 0  # iteration until which it is `rate`
+    linear: bool = False  # falls linearly; else log-linearly
 
     def at(self, iteration: int) -> float:
         """Learning rate at this iteration (0-based)."""
         if self.final is None or self.rate <= 0 or self.final <= 0:
             return self.rate
         progress = min(max((iteration - self.begin) / max(self.steps - self.begin, 1), 0.0), 1.0)
+        if self.linear:
+            return (1 - progress) * self.rate + progress * self.final
         return math.exp((1 - progress) * math.log(self.rate) + progress * math.log(self.final))
 
 

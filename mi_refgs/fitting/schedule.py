@@ -139,7 +139,9 @@ class FitSetup:
         cameras: Any = self.method.event.get("cameras")
         if leaf.POSE in groups and cameras is not None:  # whose corrections begin late
             groups[leaf.POSE] = replace(groups[leaf.POSE], begin=cameras.begins(iterations))
-        return groups
+        pixels = max(view.width * view.height for view in self.data.views)
+        linear = rates.linear_from is not None and pixels >= rates.linear_from
+        return {name: replace(group, linear=linear) for name, group in groups.items()}
 
     def require_own(self, state: Mapping[str, np.ndarray], run: Path | None = None) -> None:
         """Raise InputError for a parameter of a state, written to `run`, of another shape than this fit's,
@@ -176,7 +178,8 @@ def learning_rates(
     groups = {}
     for name in names:
         rate, head = rates.of(name), 3 if attribute(name).harmonics else 0
-        groups[name] = LearningRate(rate, rate * rates.decay, iterations, head, rates.rest_of(name))
+        rest = rates.rest.get(name, attribute(name).rest_rate)
+        groups[name] = LearningRate(rate, rate * rates.decay, iterations, head, rest)
     if "radiance_sh" in groups and rates.diffuse_relative:
         groups["radiance_sh"] = replace(groups["radiance_sh"], by_row=row_rates.of_diffuse_colour)
     if "curvature" in groups:  # 1/scene unit

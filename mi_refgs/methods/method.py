@@ -139,14 +139,13 @@ class Rates:
     light: float = field(default=0.01, metadata=at_least(0))  # texels of the environment map
     light_relative: bool = False  # texels brighter than 1: times their radiance, so that lamps can form
     diffuse_relative: bool = False  # SH of the diffuse colour: over 1 - metallic, by which it is displayed
-    # Log-linear factor of all other rates at the last iteration.
+    # Factor of all other rates at the last iteration.
     decay: float = field(default=1.0, metadata=at_least(1e-9))
+    # Pixels of an image from which all rates fall linearly; of smaller ones, and if absent, log-linearly.
+    linear_from: int | None = field(default=None, metadata=at_least(1))
 
     def of(self, name: str) -> float:
         return self.attribute.get(name, attribute(name).rate)
-
-    def rest_of(self, name: str) -> float:
-        return self.rest.get(name, attribute(name).rest_rate)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.row_rates import of_diffuse_colour
 from mi_refgs.fitting.runner import Choice, begin, chosen
-from mi_refgs.fitting.schedule import FitSetup, learning_rates
+from mi_refgs.fitting.schedule import FitSetup
 from mi_refgs.fitting.train import Trainer
 from mi_refgs.io.images import linear_from_srgb
 from mi_refgs.methods.fields import Window
@@ -449,7 +449,11 @@ def test_images_without_alpha_have_a_method_of_their_own(
     monkeypatch.setattr(READERS, "values", read)
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
     assert method.name == own and any(own in text for text in said) == (own != purpose)
-    by_row = learning_rates(method.surfels.names, 1.0, 9, method.rates)["radiance_sh"].by_row
+    large = [replace(view, width=400, height=300) for view in views.views]
+    for seen, linear in ((views.views, False), (large, own == "photographs")):
+        groups = FitSetup(method, replace(views, views=tuple(seen))).groups({})
+        assert {group.linear for group in groups.values()} == {linear}
+    by_row = groups["radiance_sh"].by_row
     assert (by_row is of_diffuse_colour) == method.rates.diffuse_relative == (own == "photographs")
     assert read.call_count == 1 and views.split == "train"
     monkeypatch.undo()

@@ -42,6 +42,7 @@ def test_group_rates() -> None:
     for begin, half in ((0, 50), (50, 75)):
         group, at = LearningRate(1e-2, final=1e-4, steps=100, begin=begin), (-5, begin, half, 100, 10**6)
         assert [group.at(i) for i in at] == pytest.approx([1e-2, 1e-2, 1e-3, 1e-4, 1e-4])
+    assert LearningRate(1e-2, 1e-4, 100, begin=50, linear=True).at(75) == pytest.approx(5.05e-3)
     assert LearningRate(0.05).at(7) == 0.05 and LearningRate(0.0, final=1.0).at(50) == 0.0
 
 

@@ -181,6 +181,6 @@ def test_cameras_of_3dgs_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose([x[0], y[0]], [32 + 70 * 0.1, 24 + 71 * 0.2], rtol=1e-5)
     place = camera.pose()[:3, 3]
     for offset, moved in ((0.9 * place, 0.1 * place), (-0.9 * place, place)):  # relative where it is nearer
-        np.testing.assert_allclose(read_cameras(path, offset)[0].pose()[:3, 3], moved, atol=1e-6)
+        np.testing.assert_allclose(read_cameras(path, offset.tolist())[0].pose()[:3, 3], moved, atol=1e-6)
     path.write_text(json.dumps([own]))
     refused(lambda: read_cameras(path), path, "[0]: no camera of 3DGS")
