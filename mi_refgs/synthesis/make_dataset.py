@@ -173,7 +173,8 @@ def traced(
     loaded = load_scene(path, given.define) if isinstance(scene, str | Path) else scene
     cameras, _, region = around_object(loaded, given, path)
     jobs: list[tuple[Tracer, View, int]] = []
-    sensors = loaded.sensors() if sensors is None else sensors
+    if not isinstance(sensors, int):
+        sensors = [*(loaded.sensors() if sensors is None else sensors)]
     require_between(sensors if isinstance(sensors, int) else len(sensors), "sensors", 1)
     if isinstance(sensors, int):
         tracer, (width, height), focal = Tracer(loaded, cameras), given.resolution, given.focal

@@ -122,18 +122,23 @@ class LightFile:
 
 
 def scene_hash(scene: Path, define: Sequence[str] = ()) -> str:
-    """SHA-256 of a scene's XML, the files in it, and parameters; raises InputError if it is no XML file."""
+    """SHA-256 of a scene's XML, the files in it and in scenes that it includes, and parameters; raises
+    InputError if one is no XML file."""
     if not scene.is_file():
         raise InputError("missing", scene, "scene", "give the path of a Mitsuba XML file")
-    content = scene.read_bytes()
-    try:
-        root = ElementTree.fromstring(content)
-    except ElementTree.ParseError as error:
-        raise InputError(f"not XML ({error})", scene, "scene", "give a Mitsuba scene") from error
-    digest = hashlib.sha256(content + "".join(define).encode())
-    names = [e.get("value") for e in root.iter("string") if e.get("name") == "filename"]
-    for name in [*names, *(e.get("filename") for e in root.iter("include"))]:
-        file = scene.parent / (name or "")
-        if file.is_file():
-            digest.update(scene_hash(file).encode() if file.suffix == ".xml" else file.read_bytes())
+    digest, folders, files = hashlib.sha256(), [scene.parent], [scene]
+    for file in files:  # which grow
+        content = file.read_bytes()
+        digest.update(content + "".join(define if file == scene else ()).encode())
+        if file != scene and file.suffix.lower() != ".xml":
+            continue
+        try:
+            root = ElementTree.fromstring(content)
+        except ElementTree.ParseError as error:
+            raise InputError(f"not XML ({error})", file, "scene", "give a Mitsuba scene") from error
+        folders += [scene.parent / e.get("value", "") for e in root.iter("path")]
+        names = [e.get("value", "") for e in root.iter("string") if e.get("name") == "filename"]
+        names += [e.get("filename", "") for e in root.iter("include")]
+        found = (folder / name for name in names for folder in (*folders, file.parent))
+        files += [path for path in dict.fromkeys(found) if path.is_file() and path not in files]
     return digest.hexdigest()

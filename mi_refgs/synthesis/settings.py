@@ -91,8 +91,7 @@ def prepare_folder(out: Path, wanted: dict[str, Any], overwrite: bool, relight: 
     # Files that do not match the settings or a light, and the options that say so.
     other = [name for name in wanted if found and found.get(name) != wanted[name]]
     changed = [*dict.fromkeys(OPTIONS.get(name) or f"--{name.replace('_', '-')}" for name in other)]
-    views = [*FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in FILES)]
-    stale = views if changed or overwrite else []
+    stale = [*FILES, SURFACE, *(f"{RELIGHT}/*/{pattern}" for pattern in FILES)] if changed else []
     lights = {} if changed else recorded_lights(record)
     for light in relight:
         if lights.get(light.name, light.sha256) != light.sha256:

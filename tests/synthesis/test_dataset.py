@@ -140,9 +140,6 @@ def test_other_settings_need_overwrite(made: Path, tmp_path: Path) -> None:
     refused(lambda: make_dataset(scene, out, **{**tiny, "views": 2}), "dataset.json: the scene file:")
     make_dataset(scene, out, **tiny, overwrite=True)
     assert not (out / "train/r_001.png").exists()
-    (out / "train/r_000.png").write_bytes(b"")
-    make_dataset(scene, out, **tiny, overwrite=True)
-    assert read_loaded(out, "train")
     (out / "dataset.json").write_text("[]")
     refused(lambda: make_dataset(scene, out, **tiny, overwrite=True), "not empty, and no data set")
 
@@ -293,10 +290,19 @@ def test_parameters_of_a_scene_are_given(tmp_path: Path) -> None:
     assert load_scene(file, ["r=2.5"]).bbox().max.x == 2.5
     assert scene_hash(file, ["r=1"]) != scene_hash(file, ["r=2"])
     refused(lambda: load_scene(file), "undefined parameter: $r", "-D NAME=VALUE")
-    (around := tmp_path / "b.xml").write_text('<scene version="3.0.0"><include filename="a.xml"/></scene>')
-    file.write_text('<scene version="3.0.0"><string name="filename" value="sky.exr"/></scene>')
-    hashes = {scene_hash(around) for sky in "ab" if (tmp_path / "sky.exr").write_text(sky)}
-    assert len(hashes) == 2
+
+
+def test_files_of_included_scenes_count(tmp_path: Path) -> None:
+    """Beside the scene, beside what it includes, and in folders that it names; also if they include it."""
+    file, place = tmp_path / "b.xml", '<path value="more"/><include filename="sub/c.XML"/>'
+    file.write_text(f'<scene version="3.0.0">{place}</scene>')
+    maps = [tmp_path / name for name in ("sky.exr", "sub/sky.exr", "more/sky.exr")]
+    for path in maps:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("a")
+    named = '<string name="filename" value="sky.exr"/><include filename="b.xml"/>'
+    (tmp_path / "sub/c.XML").write_text(f'<scene version="3.0.0">{named}</scene>')
+    assert len({scene_hash(file), *(scene_hash(file) for path in maps if path.write_text("b"))}) == 4
     refused(["dataset", file, "-o", tmp_path / "out", "-D", "r=1", "-D", "r"], "give NAME=VALUE")
 
 
