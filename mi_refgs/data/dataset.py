@@ -321,7 +321,10 @@ def read_dataset(
     without = [view.name for view in views if not view.has_alpha]
     if 0 < len(without) < len(views):
         which = f"{len(without)} of {len(views)} images, such as '{without[0]}'"
-        raise InputError(f"no alpha and no mask for {which}", path, "images", "give all masks, or none")
+        what, remedy = f"no alpha and no mask for {which}", "give all images masks, or none"
+        if split == "train":
+            raise InputError(what, path, "images", remedy)
+        notes = (*notes, f"{what}; {remedy}")
     # Positions are shifted near the origin, and clip planes derived.
     offset = _offset(training)
     extent = _extent(views if len(views) > 1 else training)

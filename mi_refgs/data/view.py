@@ -65,7 +65,8 @@ class View:
                 raise InputError(what, self.name, "pixels", remedy)
             linear = name == "image" and self.is_linear_radiance
             if pixels is not None and not linear and (most := np.max(pixels, initial=0)) > 1 + OVERSHOOT:
-                raise InputError(f"{name} has {most:g}", self.name, "pixels", "give 0 … 1, not 0 … 255")
+                remedy = "give 0 … 1, not 0 … 255; radiance with `is_linear_radiance`"
+                raise InputError(f"{name} has {most:g}", self.name, "pixels", remedy)
         return self
 
     @property

@@ -178,7 +178,7 @@ def test_images_without_masks_among_others_are_refused(tmp_path: Path) -> None:
         path = data / f"train/r_{i}.png"
         write_png(path.with_name(f"{path.stem}_alpha.png"), np.eye(20)[..., None].repeat(3, axis=-1))
         write_png(path, read_png(path)[..., :3])
-    lacking = "no alpha and no mask for 2 of 7 images, such as 'train/r_0'; give all masks, or none"
+    lacking = "no alpha and no mask for 2 of 7 images, such as 'train/r_0'; give all images masks, or none"
     refused(lambda: read_dataset(data, "train"), lacking)
     for path in data.glob("*/r_?.png"):
         write_png(path, np.ones((20, 20, 3)))

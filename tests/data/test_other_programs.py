@@ -174,7 +174,7 @@ def test_masks_of_other_images_are_not_used(tmp_path: Path) -> None:
     shutil.copytree(images, masks)
     assert not read_dataset(tmp_path, "train").has_alpha
     change_transforms(tmp_path, lambda made: made["frames"][1].update(mask_path="train_mask\\b.png"))
-    refused(lambda: read_dataset(tmp_path, "train"), "no alpha and no mask for 6 of 7 images")
+    refused(lambda: read_dataset(tmp_path, "train"), "6 of 7 images, such as 'images/c'; give")
     change_transforms(tmp_path, lambda made: made["frames"][1].update(mask_path="images/b.png"))
     refused(lambda: read_dataset(tmp_path, "train"), "frames[1].mask_path: it is the image")
     named("train/{}")(tmp_path)

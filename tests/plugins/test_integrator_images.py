@@ -44,9 +44,9 @@ def test_aovs_follow_mitsubas_names(tmp_path: Path) -> None:
 def test_a_batch_is_its_sensors_side_by_side() -> None:
     """Images, and derivatives in both modes, also by a sensor's own field of view. Mitsuba makes one object
     of the equal ones."""
-    eyes = ([3, 1, 2], [-1, 2.5, 2], [3, 1, 2])
+    eyes = ([3, 1, 2], [-1, 2.5, 2], [0, -2, 1.5], [3, 1, 2])
     poses = [mi.ScalarTransform4f().look_at(eye, [0, 0, 0], [0, 0, 1]) for eye in eyes]
-    whole = sensor(film={"width": 3 * WIDTH})
+    whole = sensor(film={"width": 4 * WIDTH})
     lenses = {f"s{i}": {"type": "perspective", "fov": 45, "to_world": pose} for i, pose in enumerate(poses)}
     batch = {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **lenses}
     alone = [scene(sensor(to_world=pose)) for pose in poses]
@@ -66,7 +66,7 @@ def test_a_batch_is_its_sensors_side_by_side() -> None:
         slopes.append(dr.grad(params[key]).numpy())
     np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-5)
     assert slopes[0] != 0
-    cropped = sensor(film={"width": 3 * WIDTH, "crop_width": WIDTH, "crop_height": 6})["film"]
+    cropped = sensor(film={"width": 4 * WIDTH, "crop_width": WIDTH, "crop_height": 6})["film"]
     refused(lambda: image(scene(batch | {"film": cropped})), "a crop of a `batch`", "one by one")
 
 
