@@ -91,6 +91,8 @@ def fit(data: Path | Dataset, output: Path, choice: Choice, *, resume: bool, pro
     Raises InputError for bad input, BusyError for a run that another process trains, and KeyboardInterrupt or
     TerminatedError with a message that says how to continue."""
     run = Run(output)
+    if isinstance(data, Dataset):
+        _require_read_so(data, choice.settings)
     if resume:
         if not run.exists():
             raise InputError("no run to continue", output, "--resume", "leave it out to start one")
@@ -116,9 +118,8 @@ def chosen(data: Path | Dataset, choice: Choice, say: Tell = lambda _: None) -> 
     if choice.method is not None:
         return sized(load_method(choice.method, choice.preset, choice.settings), data, say)
     # Settings of anything but images may be those of the other method.
-    of_images = [text for text in methods.assignments(choice.settings) if re.match(r"\s*data\s*[.=]", text)]
     named = choice.named()
-    reads, views = sized(load_method(named, choice.preset, of_images), data, say)
+    reads, views = sized(load_method(named, choice.preset, _of_images(choice.settings)), data, say)
     name = _for_images(named, reads, views)
     if name != named:
         say(f"{views.path}: images without alpha: fitted with their background, by --method {name}")
@@ -294,6 +295,23 @@ def load_method(method: str | None, preset: str | None, settings: Settings = ())
     """Load a method by name or path, by default DEFAULT_METHOD at the preset "standard"."""
     path = method or str(resource_dir("variants") / DEFAULT_METHOD)
     return methods.load(path, preset or DEFAULT_PRESET, methods.assignments(settings))
+
+
+def _of_images(settings: Settings) -> list[str]:
+    return [text for text in methods.assignments(settings) if re.match(r"\s*data\s*[.=]", text)]
+
+
+def _require_read_so(views: Dataset, settings: Settings) -> None:
+    """Raise InputError for a setting that views in memory were not read with."""
+    has = {"downscale": views.downscale, "background": "white" if views.background.any() else "black"}
+    has["images"] = "exr" if views.is_linear_radiance else "png"
+    given = _of_images(settings)
+    asked = load_method(None, None, given).data
+    for key, value in has.items():
+        named = any(re.match(rf"\s*data\s*\.\s*{key}\b", text) for text in given)
+        if named and getattr(asked, key) != value:
+            what, remedy = f"the views were read with {value}", "drop it, or read them so"
+            raise InputError(what, views.path, f"data.{key}", remedy)
 
 
 def _require_same(run: Run, made: Method, choice: Choice, data: Path | Dataset, views: Dataset) -> None:

@@ -18,7 +18,7 @@ from mi_refgs.data.dataset import Dataset, read_dataset, require_own_names
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.progress import Tell
-from mi_refgs.methods.method import DataOptions, Method
+from mi_refgs.methods.method import Method
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.runs.run import DATASET, Run
 
@@ -28,8 +28,7 @@ MEASURED = 640  # pixels along the longer side of scored photographs: larger one
 
 def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> tuple[Method, Dataset]:
     """The method with its image size decided, and training views without ground truth: `data.downscale`, or
-    the least for its preset's pixels, which calls `tell`. Raises InputError as `read_dataset` does, and for
-    settings that views in memory were not read with."""
+    the least for its preset's pixels, which calls `tell`. Raises InputError as `read_dataset` does."""
     pixels = PRESETS[method.preset].pixels if method.preset in PRESETS else sys.maxsize
     pixels *= 1 if method.data.crop is None else CROPPED
     views = read_views(method, path, "train", truth=False, pixels=pixels)
@@ -41,13 +40,7 @@ def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> 
             f"{large.height}; preset {method.preset} takes {pixels:,} pixels at most, --set "
             f"data.downscale=1 reads them whole"
         )
-    read = as_read(method, path, views)
-    for key in ("downscale", "background"):  # of views in memory
-        asked, value = (getattr(options, key) for options in (method.data, read.data))
-        if asked not in (value, getattr(DataOptions, key)):
-            what = f"the views were read with {value}"
-            raise InputError(what, views.path, f"data.{key}", "drop it, or read them so")
-    return read, views
+    return as_read(method, path, views), views
 
 
 def as_read(method: Method, path: Path | Dataset, views: Dataset) -> Method:

@@ -214,8 +214,9 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
             self.steps += 1
 
     heard, views = Heard(), read_dataset(data, "train", downscale=1.5, background="black")
-    with pytest.raises(InputError, match=r"data\.downscale: the views were read with 1\.5; drop it"):
-        mi_refgs.fit(views, method, preset="quick", settings=[*SETTINGS, "data.downscale=2"])
+    for setting, has in (("downscale=2", "1.5"), ("background='white'", "black"), ("images='exr'", "png")):
+        with pytest.raises(InputError, match=f"data.*: the views were read with {has}; drop it"):
+            mi_refgs.fit(views, method, preset="quick", settings=[*SETTINGS, f"data.{setting}"])
     found = mi_refgs.fit(views, method, preset="quick", settings=SETTINGS, progress=heard)
     folder, read = found.folder, found.views()
     assert folder is not None and str(folder) in heard.said and heard.steps == 6
