@@ -94,8 +94,8 @@ def test_cameras_far_from_the_origin_see_the_run_that_is_relative_to_them(run: P
             row[3] += x
     far.write_text(json.dumps(cameras))
     (run / "dataset.json").write_text(json.dumps(own | {"offset": offset.tolist()}))
-    for file in (near, far):
-        assert main(["render", str(run), "-o", str(file.with_suffix(".exr")), "--camera", str(file)]) == 0
+    for file, scene in ((near, run), (far, run / "scene.xml")):
+        assert main(["render", str(scene), "-o", str(file.with_suffix(".exr")), "--camera", str(file)]) == 0
     images = [read_exr(file.with_suffix(".exr"))["R"] for file in (near, far)]
     np.testing.assert_allclose(images[0], images[1], atol=1e-3)
     assert images[0].max() > 0.1
