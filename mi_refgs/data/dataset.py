@@ -5,7 +5,7 @@ A)·background. EXR targets are linear and premultiplied: radiance + (1 − A)·
 import contextlib
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -145,9 +145,9 @@ def require_few_sizes(file: Path, field: str, sizes: dict[tuple[int, int], str],
         raise InputError(f"{len(sizes)} different sizes, such as {some}", file, field, remedy)
 
 
-def require_own_names(views: Sequence[View], file: Path) -> None:
+def require_own_names(names: Iterable[str], file: Path) -> None:
     """Raise InputError if two views have one name, by which files of a run know them."""
-    for name, count in Counter(view.name for view in views).items():
+    for name, count in Counter(names).items():
         if count > 1:
             raise InputError(f"{count} views have this name", file, name, "list images once, or rename some")
 
@@ -307,7 +307,7 @@ def read_dataset(
     sizes = {(view.width, view.height): view.name for view in views}
     remedy = f"bring all images to one size, or to {MAX_SIZES} at most"
     require_few_sizes(found.source or path, "images", sizes, remedy)
-    require_own_names(views, found.source or path)
+    require_own_names((view.name for view in views), found.source or path)
     # Region and offset are derived from the training cameras for every split.
     training = views
     if split != "train":

@@ -19,7 +19,7 @@ import numpy as np
 
 from mi_refgs.constants import MAX_NUMBER
 from mi_refgs.data.colmap_model import MODELS
-from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view
+from mi_refgs.data.dataset import PointCloud, ReadOptions, Recording, held_out, make_view, require_own_names
 from mi_refgs.data.images import FOLDERS, MARKS, ImageFile, Mask, block_mean, find_image, mask_of
 from mi_refgs.data.lens import COEFFICIENTS, Lens, Undistortion
 from mi_refgs.data.poses import MITSUBA_FROM_OPENGL, rigid
@@ -166,6 +166,7 @@ def _frames(folder: Path, split: str) -> list[Frame]:
     if not whole and frames:
         names = _split_names(frames, split)
         if names is None:
+            require_own_names((frame.name for frame in frames), file)  # of both splits
             frames = held_out(sorted(frames, key=lambda frame: frame.name), split)
         else:
             frames = [frame for frame in frames if os.path.normpath(frame.name) in names]

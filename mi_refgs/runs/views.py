@@ -60,7 +60,7 @@ def read_views(method: Method, path: Path | Dataset, split: str, truth: bool = T
         if path.split != split or not path.views:
             what = f"it has {len(path.views)} {path.split} views"
             raise InputError(what, path.path, "split", f"give {split} views")
-        require_own_names(path.views, path.path)
+        require_own_names((view.name for view in path.views), path.path)
         return path
     options, size = method.data, {"downscale": method.data.downscale, "truth": truth} | size
     return read_dataset(path, split, background=options.background, images=options.images, **size)

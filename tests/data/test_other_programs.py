@@ -187,6 +187,12 @@ def test_masks_of_other_images_are_not_used(tmp_path: Path) -> None:
     assert not read_dataset(tmp_path, "train").has_alpha
 
 
+def test_an_image_is_in_one_split(tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path)
+    change_transforms(tmp_path, lambda made: made["frames"][1].update(file_path="images/a.png"))
+    refused(lambda: read_dataset(tmp_path, "train"), "images/a.png: 2 views have this name")
+
+
 def test_first_layout_that_is_whole_is_read(tmp_path: Path) -> None:
     write_colmap(write_nerfstudio(tmp_path))
     assert reader_of(tmp_path).name.startswith("Blender")
