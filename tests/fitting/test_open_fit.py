@@ -450,7 +450,7 @@ def test_images_without_alpha_have_a_method_of_their_own(
     method, views = chosen(data.path, Choice(purpose=purpose), said.append)
     assert method.name == own and any(own in text for text in said) == (own != purpose)
     large = [replace(view, width=400, height=300) for view in views.views]
-    for seen, linear in ((views.views, False), (large, own == "photographs")):
+    for seen, linear in ((views.views, False), (large, True)):
         groups = FitSetup(method, replace(views, views=tuple(seen))).groups({})
         assert {group.linear for group in groups.values()} == {linear}
     by_row = groups["radiance_sh"].by_row
