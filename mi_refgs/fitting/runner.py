@@ -28,7 +28,7 @@ from mi_refgs.registry import plugin_options
 from mi_refgs.runs.export import write_if_stale
 from mi_refgs.runs.run import CAMERAS, DECISIONS, EXPOSURE, Run
 from mi_refgs.runs.trained_scene import MODEL
-from mi_refgs.runs.views import as_read, changed, digests, read_views, sized, with_region
+from mi_refgs.runs.views import as_read, changed, digests, options_of, read_views, sized, with_region
 from mi_refgs.shade.light.placed import PlacedLight
 
 DEFAULT_METHOD = "auto.toml"  # of `variants/`, fitted by default: what the scene needs of the full method
@@ -303,11 +303,9 @@ def _of_images(settings: Settings) -> list[str]:
 
 def _require_read_so(views: Dataset, settings: Settings) -> None:
     """Raise InputError for a setting that views in memory were not read with."""
-    has = {"downscale": views.downscale, "background": "white" if views.background.any() else "black"}
-    has["images"] = "exr" if views.is_linear_radiance else "png"
     given = _of_images(settings)
     asked = load_method(None, None, given).data
-    for key, value in has.items():
+    for key, value in options_of(views).items():
         named = any(re.match(rf"\s*data\s*\.\s*{key}\b", text) for text in given)
         if named and getattr(asked, key) != value:
             what, remedy = f"the views were read with {value}", "drop it, or read them so"

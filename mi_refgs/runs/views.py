@@ -43,13 +43,20 @@ def sized(method: Method, path: Path | Dataset, tell: Tell = lambda _: None) -> 
     return as_read(method, path, views), views
 
 
+def options_of(views: Dataset) -> dict[str, Any]:
+    """The options of `[data]` with which views were read."""
+    background = "white" if views.background.any() else "black"
+    images = "exr" if views.is_linear_radiance else "png"
+    return {"downscale": views.downscale, "background": background, "images": images}
+
+
 def as_read(method: Method, path: Path | Dataset, views: Dataset) -> Method:
     """The method with the options by which these views of `path` were read."""
     data = replace(method.data, downscale=views.downscale)
     if isinstance(path, Dataset):
-        data = replace(data, background="white" if views.background.any() else "black")
-        # Commands that follow may be given a folder of other images for those that are in none.
-        data = replace(data, images="exr" if views.is_linear_radiance and views.folder else "png")
+        data = replace(data, **options_of(views))
+        if not views.folder:  # commands that follow may be given a folder of other images
+            data = replace(data, images="png")
     return replace(method, data=data)
 
 
