@@ -41,7 +41,7 @@ def survey(folder: Path) -> dict[str, Any]:
             notes.append("no region of interest: give one in region.json")
         if train.points is None:
             notes.append("no points to start from: the fit searches them in the images")
-    elif with_alpha < len(views) and len({view.has_alpha for view in train.views}) == 1:
+    elif with_alpha < len(views):
         notes.append("only some images have alpha; give all images masks, or none")
     return {
         "data set": str(folder),

@@ -45,7 +45,9 @@ def scene_of(params: Any, mesh: Mesh | None, shading: ShadingOptions | None) -> 
     integrator.surfels.detach().validate()
     with dr.suspend_grad():
         seen = light_of(integrator.shading, integrator.light, integrator.light_to_world, params)
-    light = own_light(lights[0])[0] if integrator.light is None and seen is not None else integrator.light
+    light = integrator.light
+    if light is None and seen is not None:
+        light = own_light(lights[0])[0]
     if isinstance(seen, RotatedLight):
         rows = max(light.height, min(4 * light.height, CONVERTED_ROWS))  # finer, so that little is blurred
         light = EnvironmentLight.from_radiance(lat_long(seen.radiance, rows))

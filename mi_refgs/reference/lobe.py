@@ -143,8 +143,10 @@ def chain(hit: Hit, outgoing: Outgoing, origin: Array, direction: Array, bounces
     0 beyond; None if it meets nothing. `outgoing` takes normal, view, visibility (0 or 1) of the light along
     the mirror ray, and the radiance that arrives instead."""
     found = hit(origin, direction)
-    if found is None or bounces == 0:
-        return None if found is None else np.zeros(3)
+    if found is None:
+        return None
+    if bounces == 0:
+        return np.zeros(3)
     point, normal, surface = found
     mirror = direction - 2 * float(direction @ normal) * normal
     beyond = chain(hit, outgoing, point, mirror, bounces - 1)

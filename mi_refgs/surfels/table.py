@@ -98,7 +98,8 @@ class Surfels:
         """Raise InputError if an attribute is missing, or a value not finite."""
         primitive_of(self.raw)  # raises
         for name, tensor in self.raw.items():
-            if bad := int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0:
+            bad = int(dr.count(~dr.isfinite(dr.detach(tensor.array)))[0]) if self.count else 0
+            if bad:
                 raise InputError(f"{bad} values are NaN or infinite", "surfels", name, "remove those surfels")
 
     def usable(self) -> Bool:  # (N,)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -67,7 +67,6 @@ class ReconstructionView:
         self.turn = 0.0  # rotation of the light about z, degrees, counter-clockwise seen from above
         self.environment = scene.light
         self.change: Change | None = None
-        self._materials_only = cache(partial(relightable, scene))
         self.set_relit(False)
 
     def set_light(self, light: EnvironmentLight | None) -> None:
@@ -80,9 +79,13 @@ class ReconstructionView:
         self.turn = float(degrees)
         self._stale = True
 
+    @cached_property
+    def _relightable(self) -> TrainedScene:
+        return relightable(self.original)
+
     def set_relit(self, relit: bool) -> None:
         """Display materials only, as `refgs relight` does, or the scene as fitted."""
-        self._base = self._materials_only() if relit else self.original
+        self._base = self._relightable if relit else self.original
         self.scene = self._base
         self._occluder = Occluder(self.scene.mesh)
         self._filter()
