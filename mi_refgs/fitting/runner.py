@@ -284,7 +284,8 @@ def finish(trainer: Trainer, run: Run) -> str | None:
     warning, camera = None, trainer.camera(0)
     try:
         if trainer.data.folder is not None:
-            camera = read_views(trainer.method, trainer.data.path, "test").views[0].camera()
+            test = read_views(trainer.method, trainer.data.path, "test")
+            camera = test.relative_to(trainer.data.offset).views[0].camera()
     except InputError as error:
         warning = f"{error} (scene.xml gets a training camera, and `refgs eval` will need test views)"
     write_if_stale(run, trainer.method, lambda _: camera)

@@ -125,7 +125,7 @@ def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     import xatlas
 
     atlas = xatlas.Atlas()
-    atlas.add_mesh(mesh.vertices, mesh.faces)
+    atlas.add_mesh((mesh.vertices - mesh.vertices[0]) / mesh.voxel, mesh.faces)  # it drops tiny triangles
     packing = xatlas.PackOptions()
     packing.resolution, packing.padding = size, PADDING
     atlas.generate(xatlas.ChartOptions(), packing)

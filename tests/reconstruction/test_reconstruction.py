@@ -213,7 +213,8 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
         def step(self, trainer: Trainer) -> None:
             self.steps += 1
 
-    heard, views = Heard(), read_dataset(data, "train", downscale=1.5, background="black")
+    views = read_dataset(data, "train", downscale=1.5, background="black").relative_to([1, 0, 0])
+    heard = Heard()
     for setting, has in (("downscale=2", "1.5"), ("background='white'", "black"), ("images='exr'", "png")):
         with pytest.raises(InputError, match=f"data.*: the views were read with {has}; drop it"):
             mi_refgs.fit(views, method, preset="quick", settings=[*SETTINGS, f"data.{setting}"])
@@ -221,6 +222,9 @@ def test_temporary_folder_is_removed_with_its_last_user(data: Path, method: Path
     folder, read = found.folder, found.views()
     assert folder is not None and str(folder) in heard.said and heard.steps == 6
     assert read.views[0].width == views.views[0].width and not read.background.any()
+    sensor = mi.load_file(str(folder / "scene.xml")).sensors()[0]  # relative to the fit's own origin
+    origin = np.ravel(sensor.world_transform().translation())
+    np.testing.assert_allclose(origin, read.views[0].to_world[:3, 3], atol=1e-6)
     kept = found.changed(found.trained)
     del found, heard
     gc.collect()
