@@ -15,12 +15,12 @@ from mi_refgs.fitting.events.mesh import surface_of as extract_mesh
 from mi_refgs.fitting.losses import (
     alpha_loss as alpha_loss,
     d_ssim as d_ssim,
-    half_metal as half_metal,
     l1 as l1,
     light_colour as light_colour,
     normal_consistency as normal_consistency,
     planes as image_planes,
     smoothness as smoothness,
+    undecided as undecided,
 )
 from mi_refgs.fitting.objective import LossInputs as LossInputs
 from mi_refgs.fitting.optim import Adam as Adam, LearningRate as LearningRate

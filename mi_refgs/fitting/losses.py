@@ -101,9 +101,9 @@ def sobel(plane: Float, width: int, height: int) -> tuple[Float, Float]:
     return along_x / 8, along_y / 8
 
 
-def half_metal(metallic: Float, alpha: Float) -> Float:
-    """Mean over all pixels of A m (1 - m), with A detached: 0 if every surface is metal or dielectric."""
-    return _mean(dr.detach(alpha) * metallic * (1 - metallic))
+def undecided(value: Float, alpha: Float) -> Float:
+    """Mean over all pixels of A x (1 - x), with A detached, of values x: 0 if all are 0 or 1."""
+    return _mean(dr.detach(alpha) * value * (1 - value))
 
 
 def light_colour(light: Light) -> Float:

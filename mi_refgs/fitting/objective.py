@@ -91,7 +91,7 @@ def _smooth(inputs: LossInputs) -> Float:
 
 def _half_metal(inputs: LossInputs) -> Float | None:
     metallic = inputs.frame.maps.get("metallic")
-    return None if metallic is None else losses.half_metal(metallic, inputs.frame.object_alpha)
+    return None if metallic is None else losses.undecided(metallic, inputs.frame.object_alpha)
 
 
 def _materials(inputs: LossInputs) -> Float | None:
@@ -113,6 +113,7 @@ register_loss(Loss("ssim", _ssim))
 register_loss(Loss("normal", _normal, normals=True))
 register_loss(Loss("mirror_normal", lambda of: _normal(of, True), True, True, attributes=MIRROR))
 register_loss(Loss("smooth", _smooth, normals=True))
+register_loss(Loss("half_opaque", lambda of: losses.undecided(of.frame.alpha, mi.Float(1))))
 register_loss(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
 register_loss(Loss("materials", _materials, maps=True, attributes=MATERIALS))
 register_loss(Loss("light_colour", lambda of: of.light and losses.light_colour(of.light), light=True))

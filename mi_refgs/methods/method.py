@@ -153,9 +153,9 @@ class LossWeight:
     """Weight of the loss NAME over the iterations; a number in `[loss]`, `NAME = 0.1`, is its `weight` alone.
     L = `l1` L1 + `ssim` (1 - SSIM) + `normal` L_n + `mirror_normal` a m (1 - r)⁴ L_n, of mean albedo a,
     metallic m and roughness r, + `smooth` L_s + `alpha` L_α, and priors: `gain` prefers equal exposures,
-    `half_metal` metallic near 0 or 1, `materials` equal roughness and metallic of neighbouring pixels of
-    similar colour, `light_colour` a grey light over a grey albedo, `photographed` a light that is the
-    background of the photographs. Any other NAME is one of `register_loss`.
+    `half_opaque` opacity near 0 or 1, `half_metal` metallic of the object, `materials` equal
+    roughness and metallic of neighbouring pixels of similar colour, `light_colour` a grey light over a grey
+    albedo, `photographed` a light that is the background. Other NAMEs are those of `register_loss`.
 
     Losses on material maps apply to deferred stages only: forward shading blends no materials.
     """
@@ -173,7 +173,7 @@ class LossWeight:
 
 
 LOSS_WEIGHTS = dict.fromkeys(
-    ("alpha", "mirror_normal", "half_metal", "materials", "light_colour", "photographed"), LossWeight(0.0)
+    "alpha mirror_normal half_opaque half_metal materials light_colour photographed".split(), LossWeight(0.0)
 ) | {
     "l1": LossWeight(0.8),
     "gain": LossWeight(1e-3),  # two stops cost as much as 0.6 % of brightness

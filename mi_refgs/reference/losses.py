@@ -80,9 +80,9 @@ def smoothness(maps: Array, image: Array, edge: float = 1.0) -> float:
     return float(np.mean(sum(slope(maps, axis) * np.exp(-edge * slope(image, axis)) for axis in (0, 1))))
 
 
-def half_metal(metallic: Array, alpha: Array) -> float:
-    """Mean over pixels of A m (1 - m)."""
-    return float(np.mean(alpha * metallic * (1 - metallic)))
+def undecided(value: Array, alpha: Array) -> float:
+    """Mean over pixels of A x (1 - x)."""
+    return float(np.mean(alpha * value * (1 - value)))
 
 
 def irradiances(level: Array) -> Array:

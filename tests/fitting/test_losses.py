@@ -122,17 +122,17 @@ def test_smoothness(count: int, edge: float, images: Images, rng: np.random.Gene
     )
 
 
-def test_half_metal(rng: np.random.Generator) -> None:
-    """Alpha says what counts and gets no gradient; metals and dielectrics cost nothing."""
+def test_undecided(rng: np.random.Generator) -> None:
+    """Alpha says what counts and gets no gradient; 0 and 1 cost nothing."""
     alpha = rng.random((HEIGHT, WIDTH, 1)).astype(np.float32)
     check(
-        lambda x: losses.half_metal(x[0], planes(alpha)[0]),
-        lambda x: reference.half_metal(x, alpha),
+        lambda x: losses.undecided(x[0], planes(alpha)[0]),
+        lambda x: reference.undecided(x, alpha),
         0.1 + 0.8 * rng.random((HEIGHT, WIDTH, 1)),
     )
     weight = with_grad(mi.Float(1, 1, 0.5))
-    assert float(losses.half_metal(mi.Float(0, 1, 0), weight)[0]) == 0
-    assert not dr.grad_enabled(losses.half_metal(mi.Float(0.5, 0.5, 0.5), weight))
+    assert float(losses.undecided(mi.Float(0, 1, 0), weight)[0]) == 0
+    assert not dr.grad_enabled(losses.undecided(mi.Float(0.5, 0.5, 0.5), weight))
 
 
 def test_colour_of_light(rng: np.random.Generator) -> None:

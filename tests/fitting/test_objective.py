@@ -66,20 +66,23 @@ def test_priors_are_weighed_as_method_says(rng: np.random.Generator) -> None:
     uploaded = {"albedo": mi.Color3f(0, 0.5, 1)}
     uploaded |= {name: upload(x.astype(np.float32)) for name, x in maps.items()}
     depth = upload(rng.uniform(2, 2.1, alpha.size).astype(np.float32))
-    frame = replace(frame_of(radiance, alpha), maps=uploaded, depth=depth)
+    frame, half = replace(frame_of(radiance, alpha), maps=uploaded, depth=depth), alpha / 2
+    frame = replace(frame, object_alpha=frame.alpha / 2)
     light = EnvironmentLight.from_radiance(rng.uniform(0.1, 2, (8, 16, 3))).prefilter()
 
     def loss(iteration: int = 1, **weights: LossWeight) -> float:
         weights = {"l1": LossWeight(0.8)} | weights
         return float(objective(LossInputs.of(frame, target, data, light), weights, iteration)[0][0])
 
-    rest, half = loss(), reference.half_metal(maps["metallic"], alpha)
-    assert loss(half_metal=LossWeight(0.3)) - rest == pytest.approx(0.3 * half, rel=1e-3)
+    rest, expected = loss(), 0.3 * reference.undecided(maps["metallic"], half)
+    assert loss(half_metal=LossWeight(0.3)) - rest == pytest.approx(expected, rel=1e-3)
     rising = LossWeight(0.3, start=10, rise=100)
     for iteration, share in ((10, 0), (11, 0.01), (60, 0.5), (500, 1)):
         added = loss(iteration, half_metal=rising) - rest
-        assert added == pytest.approx(share * 0.3 * half, rel=1e-2, abs=1e-6)
-    smooth = np.stack([alpha * maps["roughness"], alpha * maps["metallic"]], axis=-1)
+        assert added == pytest.approx(share * expected, rel=1e-2, abs=1e-6)
+    expected = 0.3 * reference.undecided(alpha, np.ones(1))
+    assert loss(half_opaque=LossWeight(0.3)) - rest == pytest.approx(expected, rel=1e-3)
+    smooth = np.stack([half * maps["roughness"], half * maps["metallic"]], axis=-1)
     guide = np.stack([np.array(plane).reshape(alpha.shape) for plane in target.image], axis=-1)
     expected = 0.2 * reference.smoothness(smooth, guide, 10.0)
     assert loss(materials=LossWeight(0.2)) - rest == pytest.approx(expected, rel=1e-3)
