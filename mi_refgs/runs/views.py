@@ -109,12 +109,12 @@ def _checksum(path: Path, size: int, modified: int) -> int:
 
 def digests(views: Dataset) -> dict[str, str]:
     """A digest of the camera, the files of image and mask and the presence of alpha of each view, by name."""
-    found, offset = {}, np.pad(np.reshape(views.offset, (3, 1)), ((0, 1), (3, 0)))
-    for view in views.views:
+    found = {}
+    for view in views.relative_to((0, 0, 0)).views:
         paths = [one.path for one in (view.file, view.file and view.file.mask) if one and one.path.is_file()]
         stats = ((path, path.stat()) for path in paths)
         files = [_checksum(path, stat.st_size, stat.st_mtime_ns) for path, stat in stats]
-        camera = np.round([view.fx, view.fy, view.cx, view.cy, *(view.to_world + offset).ravel()], 5)
+        camera = np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 5)
         text = repr((files, view.has_alpha, view.width, view.height, (camera + 0.0).tolist()))
         found[view.name] = hashlib.sha256(text.encode()).hexdigest()[:16]
     return found
