@@ -33,6 +33,8 @@ from mi_refgs.methods.extensions import (
     Event as Event,
     Initialiser as Initialiser,
     Loss as Loss,
+    Start as Start,
+    Wanted as Wanted,
     register_event as register_event,
     register_initialiser as register_initialiser,
     register_loss as register_loss,

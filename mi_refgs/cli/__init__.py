@@ -35,9 +35,7 @@ COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
         "export": ("export:command", "write the files of a run anew, or files of other programs"),
         "import": ("import_splats:Import", "convert a 3DGS or 2DGS PLY to a run folder"),
     },
-    "Set up": {
-        "doctor": ("doctor:Doctor", "examine the installation or a data set: problems and remedies"),
-    },
+    "Set up": {"doctor": ("doctor:Doctor", "examine the installation or a data set: problems and remedies")},
 }
 """Group → command → its class (or a function that returns it) and summary."""
 

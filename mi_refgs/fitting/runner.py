@@ -139,7 +139,7 @@ def _fit(method: Method, views: Dataset, run: Run, progress: Progress, force: bo
         # Commands that follow read the data set of the last fit.
         if (before := run.dataset()) is not None and str(before.resolve()) != views.folder:
             progress.warn(f"{output}: was fitted to {before.resolve()} before, now to {views.path}")
-            run.write_dataset(views.folder, run.region())
+        run.write_dataset(views.folder, run.region())
         progress.say(f"{output}: resumed at iteration {trainer.iteration} of {method.iterations}")
 
     progress.begin(trainer)
@@ -180,6 +180,7 @@ def begin(
     `tell` is called with what is found and decided, `warn` with steps that failed and what `checks` find.
     Raises InputError for data that they refuse unless `force`, damaged checkpoints, an unusable folder."""
     resumed = run.exists()
+    views = views.relative_to(run.offset())
     if other := changed(views, run.images()):
         count = f"{len(other)} of {len({*run.images(), *other})}"
         what = f"not as when {run.path} began: {count} images or cameras"

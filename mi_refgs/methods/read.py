@@ -54,10 +54,7 @@ def preset_of(text: str) -> Preset:
 
 
 def load(
-    name: str,
-    preset: str = DEFAULT_PRESET,
-    assignments: Sequence[str] | None = None,
-    folder: Path = Path(),
+    name: str, preset: str = DEFAULT_PRESET, assignments: Sequence[str] | None = None, folder: Path = Path()
 ) -> Method:
     """Read a method by name or TOML path in `folder`, scaled to a preset; `assignments`, key=value, apply
     unscaled. Raises InputError that names the file and the key for anything unknown or of the wrong type."""

@@ -115,7 +115,9 @@ class Run:
             return None
         try:
             os.path.realpath(path)
-            return Path(path)
+            own = self.path / "data"  # of an import, whose folder may have another name now
+            moved = not os.path.isdir(path) and Path(path).name == own.name and own.is_dir()
+            return own if moved else Path(path)
         except (OSError, TypeError, ValueError) as error:
             remedy = "write the folder of the data set there"
             raise InputError(f"cannot be used ({error})", self.path / DATASET, "path", remedy) from error

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from mi_refgs.data.dataset import Dataset, read_dataset, require_own_names
+from mi_refgs.data.images import Pixels
 from mi_refgs.data.region import Region
 from mi_refgs.errors import InputError
 from mi_refgs.io.progress import Tell
@@ -68,6 +69,12 @@ def read_views(method: Method, path: Path | Dataset, split: str, truth: bool = T
             what = f"it has {len(path.views)} {path.split} views"
             raise InputError(what, path.path, "split", f"give {split} views")
         require_own_names((view.name for view in path.views), path.path)
+        for view in path.views:
+            numbers = (view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel())
+            if not (min(numbers[:2]) > 0 and np.isfinite(numbers).all()):
+                raise InputError("not finite, or not positive", view.name, "fx … to_world", "correct it")
+            if (view.has_alpha, view.is_linear_radiance) != (path.has_alpha, path.is_linear_radiance):
+                raise InputError("not as in others", view.name, "alpha, radiance", "make all views alike")
         return path
     options, size = method.data, {"downscale": method.data.downscale, "truth": truth} | size
     return read_dataset(path, split, background=options.background, images=options.images, **size)
@@ -110,11 +117,13 @@ def _checksum(path: Path, size: int, modified: int) -> int:
 def digests(views: Dataset) -> dict[str, str]:
     """A digest of the camera, the files of image and mask and the presence of alpha of each view, by name."""
     found = {}
-    for view in views.relative_to((0, 0, 0)).views:
+    for view in views.relative_to((0, 0, 0)).views:  # rounded twice, since files end with ties of a digit
         paths = [one.path for one in (view.file, view.file and view.file.mask) if one and one.path.is_file()]
         stats = ((path, path.stat()) for path in paths)
-        files = [_checksum(path, stat.st_size, stat.st_mtime_ns) for path, stat in stats]
-        camera = np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 5)
+        files: list[Any] = [_checksum(path, stat.st_size, stat.st_mtime_ns) for path, stat in stats]
+        if isinstance(view.pixels, Pixels):  # in memory: as far as paths traced again are the same
+            files.append(np.round(view.image.mean(axis=(0, 1)), 3).tolist())
+        camera = np.round(np.round([view.fx, view.fy, view.cx, view.cy, *view.to_world.ravel()], 8), 5)
         text = repr((files, view.has_alpha, view.width, view.height, (camera + 0.0).tolist()))
         found[view.name] = hashlib.sha256(text.encode()).hexdigest()[:16]
     return found

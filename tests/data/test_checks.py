@@ -158,6 +158,14 @@ def test_constant_background_becomes_masks(tmp_path: Path, capsys: pytest.Captur
     assert len(changed(read_dataset(data, "train"), known)) == 1
 
 
+def test_digests_do_not_depend_on_the_origin(tmp_path: Path) -> None:
+    """Nor on the last bits of positions, which end with a 5 after the digits that are compared."""
+    data = read_dataset(write_data(tmp_path, views=12, truth=False), "train")
+    for view in data.views:
+        view.to_world[:3, 3] = np.floor(1e3 * view.to_world[:3, 3]) / 1e3 + 5e-6
+    assert not changed(data.relative_to([1e3, -5, 0.1]), digests(data))
+
+
 def test_masks_are_written_where_they_are_read(tmp_path: Path) -> None:
     """Beside the images, of which COLMAP's may lie deeper in the data set."""
     write_colmap(tmp_path / "dense/0", place="sparse")

@@ -25,13 +25,8 @@ from tests.scenes.tiny import METHOD, train_command, write_data
 
 ALONE = """
 iterations = 2_000
-[surfels]
-attributes = ["radiance_sh"]
-degree = { radiance_sh = 2 }
-[stage.radiance]
-until = 2_000
-at = "surfel"
-reflectance = "radiance"
+surfels = { attributes = ["radiance_sh"], degree = { radiance_sh = 2 } }
+stage.radiance = { until = 2_000, at = "surfel", reflectance = "radiance" }
 """
 SURFELS = """
 [event.densify]

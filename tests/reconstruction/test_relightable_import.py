@@ -119,6 +119,9 @@ def test_import_is_fitted_measured_and_relit(imported: Path, tmp_path: Path) -> 
     assert made.relight(np.ones((8, 16, 3), np.float32)).render(0)[..., 3].max() > 0.5
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["psnr"] > 5
+    record = run / "dataset.json"
+    record.write_text(record.read_text().replace(str(imported), "/gone"))  # under another name before
+    assert mi_refgs.load(run).provenance.data == (run / "data").resolve()
 
 
 def test_command_writes_the_same_views_and_fits_the_method_for_relighting(

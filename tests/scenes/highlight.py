@@ -21,31 +21,20 @@ METHOD = """
 iterations = 30
 checkpoint_every = 5
 log_every = 3
+light = { height = 8, every = 3 }
 [surfels]
 count = 150
 max_count = 220
 degree = { radiance_sh = 1 }
 sh_raise = { start = 2, until = 4, every = 2 }
 initial = { opacity = 0.6, metallic = 0.3, roughness = 0.3 }
-[light]
-height = 8
-every = 3
-[stage.initial]
-until = 8
-at = "surfel"
-diffuse = "irradiance"
-[stage.deferred]
-until = 30
-restart = ["albedo", "metallic", "roughness", "light"]
-[event.mesh]
-when = { start = 9, until = 30, every = 10 }
-resolution = 24
-[event.densify]
-when = { start = 3, until = 24, every = 6 }
-prune_extent = 1.0
-[event.reset_opacity]
-when = { start = 0, until = 24, every = 14 }
-raise_to_start = ["metallic"]
+[stage]
+initial = { until = 8, at = "surfel", diffuse = "irradiance" }
+deferred = { until = 30, restart = ["albedo", "metallic", "roughness", "light"] }
+[event]
+mesh = { when = { start = 9, until = 30, every = 10 }, resolution = 24 }
+densify = { when = { start = 3, until = 24, every = 6 }, prune_extent = 1.0 }
+reset_opacity = { when = { start = 0, until = 24, every = 14 }, raise_to_start = ["metallic"] }
 [event.propagate]
 when = { start = 0, until = 24, every = 5 }
 hold = 4

@@ -1,5 +1,6 @@
 """Data sets in memory: the views that `make_dataset` writes, and those of sensors; fits that take them."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,10 @@ import numpy as np
 import pytest
 
 import mi_refgs
-from mi_refgs import Camera, Dataset
+from mi_refgs import Camera, Dataset, Pixels
 from tests.helpers import read_loaded, refused
 from tests.scenes.sphere import CENTRE, SCENE
-from tests.scenes.tiny import SETTINGS, write_method
+from tests.scenes.tiny import SETTINGS, write_data, write_method
 
 OPTIONS: dict[str, Any] = {"size": 16, "spp": 16}
 
@@ -76,5 +77,19 @@ def test_a_fit_takes_a_data_set_in_memory(tmp_path: Path) -> None:
     assert run.render(0, size=8).shape == (8, 8, 4)
     assert run.evaluate(test)["test_views"] == 3
     refused(run.evaluate, "the run records no data set; name one with --data")
+    first, *rest = train.views
+    for change, folder, said in (
+        ({"pixels": Pixels(first.image / 2, first.alpha)}, "run", "1 of 3 images"),
+        ({"pixels": Pixels(first.image)}, "new", "alpha, radiance"),
+        ({"is_linear_radiance": False}, "new", "alpha, radiance"),
+        ({"fx": 0.0}, "new", "fx … to_world"),
+        ({"to_world": first.to_world * np.nan}, "new", "fx … to_world"),
+    ):
+        views, out = replace(train, views=(replace(first, **change), *rest)), tmp_path / folder
+        refused(lambda: mi_refgs.fit(views, output=out, resume=out.exists()), said)  # noqa: B023
+    data, out = mi_refgs.read_dataset(write_data(tmp_path / "data"), "train"), tmp_path / "own"
+    mi_refgs.fit(replace(data, path=Path("none")), write_method(tmp_path), output=out, **options)
+    again = mi_refgs.fit(data.path, output=out, resume=True, progress=mi_refgs.Progress())
+    assert again.provenance.data == data.path  # now that a folder has the views
     refused(lambda: run.evaluate(train), f"it has {len(train.views)} train views; give test views")
     refused(run.views, "its data set is unknown")

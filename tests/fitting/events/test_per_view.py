@@ -291,22 +291,11 @@ def test_warm_step_compiles_nothing(method: Method, rng: np.random.Generator) ->
 RADIANCE = """
 iterations = 480
 log_every = 20
-[surfels]
-attributes = ["radiance_sh"]
-count = 300
-max_count = 300
-degree = { radiance_sh = 1 }
-[stage.radiance]
-until = 480
-at = "surfel"
-reflectance = "radiance"
-[loss]
-l1 = 1.0
-normal = 0
-[rates]
-attribute = { position = 2e-5, radiance_sh = 2e-4, scale = 2e-4, rotation = 2e-4, opacity = 2e-4 }
-[event.cameras]
-after = 1
+surfels = { attributes = ["radiance_sh"], count = 300, max_count = 300, degree = { radiance_sh = 1 } }
+stage.radiance = { until = 480, at = "surfel", reflectance = "radiance" }
+loss = { l1 = 1.0, normal = 0 }
+rates.attribute = { position = 2e-5, radiance_sh = 2e-4, scale = 2e-4, rotation = 2e-4, opacity = 2e-4 }
+event.cameras.after = 1
 """
 
 
