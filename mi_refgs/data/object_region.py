@@ -158,11 +158,16 @@ def object_points(region: Region, points: np.ndarray, seen: Seen, scatter: Scatt
         points = points[KDTree(points).query_ball_point(points, link, return_length=True) >= LINK_COUNT]
     if not len(points):
         return points
-    pairs = KDTree(points).query_pairs(link, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
-    label = connected_components(graph, directed=False)[1]
+    label = linked(points, link)
     within = np.bincount(label, region.contains(points))
     return np.asarray(points[(label == np.argmax(within)) & (within.max() >= FEWEST)])
+
+
+def linked(points: np.ndarray, link: float) -> np.ndarray:
+    """The number (N,) of each point's group: a chain of points (N, 3) not more than `link` apart."""
+    pairs = KDTree(points).query_pairs(link, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), (len(points), len(points)))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def enclosing_ball(points: np.ndarray) -> tuple[np.ndarray, float]:

@@ -3,11 +3,12 @@
 One of the object whose centre is more than MARGIN radii outside becomes one of the background, with its
 geometry and SH; one of the background that is inside, and through no plane, becomes one of the object, whose
 other attributes start as the method says. Neither has a history. A table keeps one surfel at least, and may
-exceed what its method allows.
+exceed what its method allows. Once the region follows the object, small parts apart from it are background.
 """
 
 import numpy as np
 
+from mi_refgs.data.object_region import linked
 from mi_refgs.data.region import Region
 from mi_refgs.fitting.initial import converted
 from mi_refgs.fitting.schedule import FitSetup
@@ -18,6 +19,8 @@ from mi_refgs.surfels.table import Surfels
 
 REACH = 1.0  # deviations to which a surfel extends: one through the plane below the object stays the table's
 MARGIN = 0.02  # distance beyond the border of the region, in radii, from which a surfel leaves the object
+LINK = 6.0  # distance of neighbours in a part, in radii over the root of their number; 3 sizes on *fox*
+FEWEST, MOST = 20, 0.05  # surfels of a part that is background, and share; fewer may be inside of the object
 
 
 def exchange(setup: FitSetup, fit: FitState) -> None:
@@ -26,19 +29,27 @@ def exchange(setup: FitSetup, fit: FitState) -> None:
     if not setup.open_scene or region is None:
         return
     inner, outer = (table.surfels for table in fit.tables)
-    edits = exchanged(inner, outer, setup.method, region, setup.rng(fit.iteration, "densify"))
+    rng, whole = setup.rng(fit.iteration, "densify"), fit.region is None
+    edits = exchanged(inner, outer, setup.method, region, rng, whole)
     for table, edit in zip(fit.tables, edits, strict=True):
         table.apply(edit)
 
 
 def exchanged(
-    inner: Surfels, outer: Surfels, method: Method, region: Region, rng: np.random.Generator
+    inner: Surfels, outer: Surfels, method: Method, region: Region, rng: np.random.Generator, whole: bool
 ) -> list[TableEdit]:
-    """Both tables after the exchange; what changes its primitive keeps axes and sizes, as far as possible."""
+    """Both tables afterwards, with axes and sizes as far as possible; small parts stay in the `whole` one."""
     tables = [inner.to_numpy(), outer.to_numpy()]
     own_depth = depth_outside(tables[0]["position"], region)
     other_depth = depth_outside(tables[1]["position"], region, reach_of(tables[1], region))
     leaves = [own_depth > MARGIN, other_depth < 0]
+    if not whole:
+        inside = np.concatenate([~leaves[0], leaves[1]])
+        position = np.concatenate([table["position"] for table in tables])[inside]
+        part = linked(position, LINK * region.radius / len(position) ** 0.5)
+        count = np.bincount(part)
+        inside[inside] = ((count >= FEWEST) & (count < MOST * len(part)))[part]
+        leaves = [gone ^ x for gone, x in zip(leaves, np.split(inside, [inner.count]), strict=True)]
     for gone in leaves:  # one surfel stays
         gone &= np.cumsum(gone) < len(gone)
     edits = []

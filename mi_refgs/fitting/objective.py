@@ -68,11 +68,6 @@ def _gain(inputs: LossInputs) -> Float | None:
     return squares[0] + squares[1] + squares[2] if squares else None
 
 
-def _ssim(inputs: LossInputs) -> Float:
-    camera = inputs.target.camera
-    return losses.d_ssim(inputs.image, inputs.target.image, camera.width, camera.height)
-
-
 def _normal(inputs: LossInputs, mirrors: bool = False) -> Float | None:
     frame, weight, maps = inputs.frame, inputs.frame.alpha, inputs.frame.maps
     if mirrors:
@@ -84,35 +79,31 @@ def _normal(inputs: LossInputs, mirrors: bool = False) -> Float | None:
     return losses.normal_consistency(frame.normal, depth_normal, valid, weight, covered)
 
 
-def _smooth(inputs: LossInputs) -> Float:
-    camera = inputs.target.camera
-    return losses.smoothness(list(inputs.frame.normal), inputs.target.image, camera.width, camera.height)
-
-
 def _half_metal(inputs: LossInputs) -> Float | None:
     metallic = inputs.frame.maps.get("metallic")
     return None if metallic is None else losses.undecided(metallic, inputs.frame.object_alpha)
 
 
 def _materials(inputs: LossInputs) -> Float | None:
-    frame, camera = inputs.frame, inputs.target.camera
+    frame, target = inputs.frame, inputs.target
     if not {*MATERIALS} <= {*frame.maps}:
         return None
     maps = [dr.detach(frame.object_alpha) * frame.maps[name] for name in MATERIALS]
-    return losses.smoothness(maps, inputs.target.image, camera.width, camera.height, MATERIAL_EDGE)
+    return losses.smoothness(maps, target.image, *target.size, MATERIAL_EDGE)
 
 
 def _photographed(inputs: LossInputs) -> Float | None:
-    known, light = inputs.photographed, inputs.light
-    return None if known is None or light is None else known.difference(light)
+    return inputs.light and inputs.photographed and inputs.photographed.difference(inputs.light)
 
 
 register_loss(Loss("l1", lambda of: losses.l1(of.image, of.target.image)))
 register_loss(Loss("gain", _gain))
-register_loss(Loss("ssim", _ssim))
+register_loss(Loss("ssim", lambda of: losses.d_ssim(of.image, of.target.image, *of.target.size)))
 register_loss(Loss("normal", _normal, normals=True))
 register_loss(Loss("mirror_normal", lambda of: _normal(of, True), True, True, attributes=MIRROR))
-register_loss(Loss("smooth", _smooth, normals=True))
+register_loss(
+    Loss("smooth", lambda of: losses.smoothness(of.frame.normal, of.target.image, *of.target.size), True)
+)
 register_loss(Loss("half_opaque", lambda of: losses.undecided(of.frame.alpha, mi.Float(1))))
 register_loss(Loss("half_metal", _half_metal, maps=True, attributes=("metallic",)))
 register_loss(Loss("materials", _materials, maps=True, attributes=MATERIALS))

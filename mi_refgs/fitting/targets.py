@@ -45,6 +45,10 @@ class Target:
     clipped: list[Bool] | None  # where an 8-bit value only means "at least this bright"
     alpha: Float | None  # (H*W,)
 
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.camera.width, self.camera.height
+
     @staticmethod
     def of(view: View, background: np.ndarray) -> "Target":
         """Upload a view; `background` (3,) is in the colour space of its image."""

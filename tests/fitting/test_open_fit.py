@@ -19,7 +19,7 @@ from mi_refgs.data.view import View
 from mi_refgs.fitting.events import densify as densify_event, open_scene
 from mi_refgs.fitting.events.densify import Densify
 from mi_refgs.fitting.events.resets import ResetOpacity
-from mi_refgs.fitting.exchange import depth_outside, exchanged
+from mi_refgs.fitting.exchange import depth_outside, exchange, exchanged
 from mi_refgs.fitting.initial import initial_parameters
 from mi_refgs.fitting.photographed_light import PhotographedLight
 from mi_refgs.fitting.row_rates import of_diffuse_colour
@@ -114,26 +114,32 @@ def test_points_keep_to_their_side(data: Dataset, method: Method, monkeypatch: p
     assert np.mean(np.abs(np.linalg.norm(mixed, axis=1) - 0.4) < 1e-5) == pytest.approx(0.5)
 
 
+RNG = np.random.default_rng(0)
+BEHIND = SurroundingsOptions("surfel", degree=0).names  # columns of a background of surfels
+
+
+def table(method: Method, places: Any, size: float = 0, degree: int = 0, behind: bool = False) -> Surfels:
+    """Random surfels at places (N, 3), or (N,) radii along x; with a size upright and of this one."""
+    rng, names = np.random.default_rng(0), BEHIND if behind else method.surfels.names
+    raw = {n: rng.normal(size=(len(places), method.surfels.columns(n))) for n in names}
+    raw["radiance_sh"] = rng.normal(size=(len(places), 3 * (degree + 1) ** 2))
+    raw["position"] = np.array(places) if np.ndim(places) > 1 else np.outer(places, [REGION.radius, 0, 0])
+    if size:
+        raw |= {"scale": np.full((len(places), 2), np.log(size)), "rotation": np.eye(4)[[0] * len(places)]}
+    return Surfels.from_numpy(raw)
+
+
 def test_surfels_beyond_border_change_tables(method: Method) -> None:
     """Beyond the margin; with their geometry and SH, and without history; one stays."""
-    rng = np.random.default_rng(0)
-
-    def table(names: tuple[str, ...], distance: list[float], degree: int) -> Surfels:
-        raw = {n: rng.normal(size=(len(distance), method.surfels.columns(n))) for n in names}
-        raw["radiance_sh"] = rng.normal(size=(len(distance), 3 * (degree + 1) ** 2))
-        raw["position"] = np.array(distance)[:, None] * REGION.radius * [1.0, 0, 0]
-        return Surfels.from_numpy(raw)
-
-    inner = table(method.surfels.names, [0.2, 0.9, 1.01, 1.2, 5.0], 1)
-    around = SurroundingsOptions("surfel", degree=0).names
-    outer = table(around, [2.0, 0.5, 0.99, 1.5], 0)
-    own, other = exchanged(inner, outer, method, REGION, rng)
+    inner = table(method, [0.2, 0.9, 1.01, 1.2, 5.0], degree=1)
+    outer = table(method, [2.0, 0.5, 0.99, 1.5], behind=True)
+    own, other = exchanged(inner, outer, method, REGION, RNG, True)
     distance = own.surfels.to_numpy()["position"][:, 0] / REGION.radius
     np.testing.assert_allclose(distance, [0.2, 0.9, 1.01, 0.5, 0.99], rtol=1e-5)
     beyond = other.surfels.to_numpy()["position"][:, 0] / REGION.radius
     np.testing.assert_allclose(beyond, [2.0, 1.5, 1.2, 5.0], rtol=1e-5)
     assert own.parent[:3].tolist() == [0, 1, 2] and own.fresh.tolist() == [False] * 3 + [True] * 2
-    assert {*other.surfels.raw} == {*around} and other.fresh.tolist() == [False] * 2 + [True] * 2
+    assert {*other.surfels.raw} == {*BEHIND} and other.fresh.tolist() == [False] * 2 + [True] * 2
     before, after = inner.to_numpy(), other.surfels.to_numpy()
     np.testing.assert_array_equal(after["scale"][2:], before["scale"][3:])
     np.testing.assert_array_equal(after["radiance_sh"][2:], before["radiance_sh"][3:, :3])
@@ -143,9 +149,9 @@ def test_surfels_beyond_border_change_tables(method: Method) -> None:
     assert sigmoid(entered["metallic"][3, 0]) == pytest.approx(method.surfels.first("metallic"))
 
     full = replace(method, surfels=replace(method.surfels, max_count=3))
-    assert exchanged(inner, outer, full, REGION, rng)[0].surfels.count == 5  # for two came and two left
-    gone = table(method.surfels.names, [2.0, 3.0], 1)
-    assert exchanged(gone, outer, method, REGION, rng)[0].surfels.count == 3  # one left, two came
+    assert exchanged(inner, outer, full, REGION, RNG, True)[0].surfels.count == 5  # for two came and two left
+    gone = table(method, [2.0, 3.0], degree=1)
+    assert exchanged(gone, outer, method, REGION, RNG, True)[0].surfels.count == 3  # one left, two came
 
 
 def test_surfels_become_thin_gaussians_and_back(method: Method) -> None:
@@ -158,7 +164,7 @@ def test_surfels_become_thin_gaussians_and_back(method: Method) -> None:
     around["position"] = np.array([[9.0, 0, 0], [0.1, 0, 0]])
     around["scale"][1] = np.log([0.01, 0.3, 0.2])
     inner, outer = Surfels.from_numpy(raw), Surfels.from_numpy(around)
-    own, other = (edit.surfels for edit in exchanged(inner, outer, method, REGION, rng))
+    own, other = (edit.surfels for edit in exchanged(inner, outer, method, REGION, RNG, True))
     assert (own.primitive.name, other.primitive.name) == ("surfel", "gaussian")
 
     def spread(surfels: Surfels, row: int) -> tuple[np.ndarray, np.ndarray]:
@@ -175,28 +181,36 @@ def test_surfels_become_thin_gaussians_and_back(method: Method) -> None:
     np.testing.assert_allclose(np.abs(axes[2] @ np.cross(*before)), 1, atol=1e-5)
 
 
+def test_small_parts_are_background(method: Method) -> None:
+    """Once the region follows the object: those apart from it leave, or do not come; but for single ones."""
+    ball, bit = 0.2 * unit(RNG.normal(size=(300, 3))), RNG.normal([0.6, 0, 0], 0.01, size=(24, 3))
+    sheet = [[x / 80, y / 80, -0.5] for x in range(-7, 8) for y in range(-7, 8)]
+    inner = table(method, [*ball, *sheet, *bit, [0, 0, 0.6]], 0.01)
+    outer = table(method, [*-bit, *ball[:5] / 2], 0.01, behind=True)
+    setup = Mock(method=method, data=Mock(region=REGION), rng=lambda *_: RNG)
+    for found, counts in ((None, [578, 1]), (REGION, [531, 48])):
+        tables = [Mock(surfels=inner), Mock(surfels=outer)]
+        exchange(setup, Mock(region=found, tables=tables))
+        own, other = (one.apply.call_args.args[0].surfels for one in tables)
+        assert [own.count, other.count] == counts
+    assert abs(other.to_numpy()["position"][:, 0]).min() > 0.5
+
+
 def test_surfels_below_planes_change_tables(method: Method) -> None:
     """Those of the object with centres below a plane of the region; of the background, what is above all."""
-    rng = np.random.default_rng(0)
     region = replace(REGION, planes=((0.0, 0.0, 1.0, 0.1), (1.0, 0.0, 0.0, -0.5)))
-
-    def table(names: tuple[str, ...], places: list[list[float]], size: float = 1e-4) -> Surfels:
-        raw = {n: rng.normal(size=(len(places), method.surfels.columns(n))) for n in names}
-        raw["radiance_sh"] = rng.normal(size=(len(places), 3))
-        raw |= {"position": np.array(places), "scale": np.full((len(places), 2), np.log(size))}
-        raw["rotation"] = np.tile([1.0, 0, 0, 0], (len(places), 1))
-        return Surfels.from_numpy(raw)
-
-    inner = table(method.surfels.names, [[0, 0, 0.4], [0, 0, 0.05], [-0.6, 0, 0.2], [0, 0, 0.095]])
-    outer = table(SurroundingsOptions("surfel", degree=0).names, [[0, 0, 0], [0, 0.1, 0.3], [0, 0, 0.105]])
-    own, other = (x.surfels.to_numpy()["position"] for x in exchanged(inner, outer, method, region, rng))
+    inner = table(method, [[0, 0, 0.4], [0, 0, 0.05], [-0.6, 0, 0.2], [0, 0, 0.095]], 1e-4)
+    outer = table(method, [[0, 0, 0], [0, 0.1, 0.3], [0, 0, 0.105]], 1e-4, behind=True)
+    edits = exchanged(inner, outer, method, region, RNG, True)
+    own, other = (edit.surfels.to_numpy()["position"] for edit in edits)
     inside = [[0.0, 0.0, 0.4], [0.0, 0.0, 0.095], [0.0, 0.1, 0.3], [0.0, 0.0, 0.105]]
     np.testing.assert_allclose(own, inside, atol=1e-6)
     np.testing.assert_allclose(other, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.05], [-0.6, 0.0, 0.2]], atol=1e-6)
     # Tangents along x and y, deviations of 0.1: some extend through the second plane, none through the first.
     through = [[0.0, 0.0, 0.2], [-0.45, 0.0, 0.2], [0.0, 0.0, -1.0]]
-    wide, others = table(method.surfels.names, through[:2], 0.1), table((*outer.raw,), through, 0.1)
-    own, other = (x.surfels.to_numpy()["position"] for x in exchanged(wide, others, method, region, rng))
+    wide, others = table(method, through[:2], 0.1), table(method, through, 0.1, behind=True)
+    edits = exchanged(wide, others, method, region, RNG, True)
+    own, other = (edit.surfels.to_numpy()["position"] for edit in edits)
     np.testing.assert_allclose(own, [*through[:2], through[0]], atol=1e-6)
     np.testing.assert_allclose(other, through[1:], atol=1e-6)
 
@@ -333,6 +347,7 @@ def test_run_keeps_region_that_it_was_started_with(data: Dataset, method: Method
     assert run.region() == REGION
     begin(method, read_dataset(folder, "train"), run, said.append)
     assert not any("changed" in text for text in said) and views_of_run(run, method, "test").region == REGION
+    assert begin(method, read_dataset(folder, "train").relative_to([5, 0, 0]), run).data.offset == (0, 0, 0)
     smaller = replace(REGION, radius=0.3)
     run.write_dataset(str(folder), smaller)  # it followed the object: cameras turn about the first one
     assert begin(method, read_dataset(folder, "train"), run).setup.data.region == REGION
@@ -388,25 +403,21 @@ def test_fit_of_open_scene_improves(data: Dataset, method: Method) -> None:
 
 def test_light_follows_photographs(data: Dataset, method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where views show the background, but not behind them; rendered in the iterations of the window."""
-    rendered: list[int] = []
+    rendered: dict[int, PhotographedLight] = {}
     first = PhotographedLight.of
-
-    def counted(*arguments: Any) -> PhotographedLight:
-        rendered.append(trainer.iteration)
-        return first(*arguments)
-
-    monkeypatch.setattr(PhotographedLight, "of", staticmethod(counted))
+    counted = staticmethod(lambda *given: rendered.setdefault(trainer.iteration, first(*given)))
+    monkeypatch.setattr(PhotographedLight, "of", counted)
     loss, rates = method.loss | {"photographed": LossWeight(100.0)}, replace(method.rates, light=0.3)
     trainer = Trainer(replace(method, loss=loss, rates=rates), data)
     step_to(trainer, 4)
     known = trainer.fit.photographed
-    assert known is not None and rendered == [4]
+    assert known is not None and [*rendered] == [4]
     off = []
     for iteration in (4, 8):
         light = step_to(trainer, iteration).fit.light
         assert light is not None
         off.append(float(known.difference(light.prefilter())[0]))
-    assert rendered == [4, 8] and off[1] < 0.8 * off[0]
+    assert [*rendered] == [4, 8] and off[1] < 0.8 * off[0]
     assert known.weight.max() == 1 and known.weight.min() == 0
     assert step_to(Trainer(without(method, "photograph_light"), data), 5).fit.photographed is None
 
@@ -416,13 +427,10 @@ def test_hidden_background_does_not_count(data: Dataset, method: Method) -> None
     assert data.region is not None
     centre = np.array(data.region.centre)
     towards = unit(centre - data.views[0].to_world[:3, 3])
-
-    def wall(distance: float) -> Surfels:
-        return opaque((centre + distance * towards)[None], -towards[None], None, [3.0])
-
-    far = Surroundings(wall(3.0), EnvironmentLight.constant(0.5, 8))
+    walls = [opaque((centre + d * towards)[None], -towards[None], None, [3.0]) for d in (3.0, 30.0, 0.5)]
+    far = Surroundings(walls[0], EnvironmentLight.constant(0.5, 8))
     behind = map_directions(8) @ towards > 0.95
-    for nearer, share in ((wall(30.0), 1.0), (wall(0.5), 0.0)):
+    for nearer, share in zip(walls[1:], (1.0, 0.0), strict=True):
         assert np.all(PhotographedLight.of(nearer, far, data.region, data.views, 8).weight[behind] == share)
 
 

@@ -98,8 +98,7 @@ class Densify(Event[Trainer]):
 def fill(trainer: Trainer) -> None:
     """Split the object's surfels with the largest error, as many as there is room for; prune none."""
     table = trainer.fit.tables[0]
-    most = table.max_count
-    table.apply(densify_and_prune(table.surfels, table.error_sum, most, grow=1.0, prune_opacity=0.0))
+    table.apply(densify_and_prune(table.surfels, table.error_sum, table.max_count, grow=1, prune_opacity=0))
     table.clear()
 
 
