@@ -46,7 +46,7 @@ def exchanged(
     if not whole:
         inside = np.concatenate([~leaves[0], leaves[1]])
         position = np.concatenate([table["position"] for table in tables])[inside]
-        part = linked(position, LINK * region.radius / len(position) ** 0.5)
+        part = linked(position, LINK * region.radius / max(len(position), 1) ** 0.5)
         count = np.bincount(part)
         inside[inside] = ((count >= FEWEST) & (count < MOST * len(part)))[part]
         leaves = [gone ^ x for gone, x in zip(leaves, np.split(inside, [inner.count]), strict=True)]
