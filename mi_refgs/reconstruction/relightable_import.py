@@ -22,10 +22,9 @@ from mi_refgs.io.progress import with_bar
 from mi_refgs.methods.read import PRESETS
 from mi_refgs.reconstruction.fit import fit
 from mi_refgs.reconstruction.reconstruction import Reconstruction, import_splats
-from mi_refgs.runs.run import Run
+from mi_refgs.runs.run import DATA, Run
 from mi_refgs.splat import Camera
 
-DATA = "data"  # folder of the rendered views, in the run folder
 PURPOSE = "relighting"  # of the default method: `auto` would keep colours alone, which are those of the file
 VIEWS = {"train": 100, "test": 12}
 ELEVATION = (-90.0, 90.0)  # degrees: files of other programs have any side up

@@ -25,6 +25,7 @@ from mi_refgs.registry import load_again
 from mi_refgs.runs import checkpoint
 
 DATASET = "dataset.json"  # the folder of the data set, and its region of interest
+DATA = "data"  # folder of the views that an import rendered
 CAMERAS = "cameras.json"  # corrected poses of the training views, where they were corrected
 DECISIONS = "decisions.json"  # about components of the method
 EXPOSURE = "exposure.json"  # gains of the training views
@@ -115,8 +116,8 @@ class Run:
             return None
         try:
             os.path.realpath(path)
-            own = self.path / "data"  # of an import, whose folder may have another name now
-            moved = not os.path.isdir(path) and Path(path).name == own.name and own.is_dir()
+            own = self.path / DATA  # of an import, whose folder may have another name now
+            moved = not os.path.isdir(path) and Path(path).name == DATA and own.is_dir()
             return own if moved else Path(path)
         except (OSError, TypeError, ValueError) as error:
             remedy = "write the folder of the data set there"

@@ -115,7 +115,7 @@ def _checksum(path: Path, size: int, modified: int) -> int:
 
 
 def digests(views: Dataset) -> dict[str, str]:
-    """A digest of the camera, the files of image and mask and the presence of alpha of each view, by name."""
+    """A digest of each view by name: camera, files of image and mask, presence of alpha, mean in memory."""
     found = {}
     for view in views.relative_to((0, 0, 0)).views:  # rounded twice, since files end with ties of a digit
         paths = [one.path for one in (view.file, view.file and view.file.mask) if one and one.path.is_file()]

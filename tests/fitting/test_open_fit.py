@@ -120,7 +120,7 @@ BEHIND = SurroundingsOptions("surfel", degree=0).names  # columns of a backgroun
 
 def table(method: Method, places: Any, size: float = 0, degree: int = 0, behind: bool = False) -> Surfels:
     """Random surfels at places (N, 3), or (N,) radii along x; with a size upright and of this one."""
-    rng, names = np.random.default_rng(0), BEHIND if behind else method.surfels.names
+    rng, names = np.random.default_rng(behind), BEHIND if behind else method.surfels.names
     raw = {n: rng.normal(size=(len(places), method.surfels.columns(n))) for n in names}
     raw["radiance_sh"] = rng.normal(size=(len(places), 3 * (degree + 1) ** 2))
     raw["position"] = np.array(places) if np.ndim(places) > 1 else np.outer(places, [REGION.radius, 0, 0])
